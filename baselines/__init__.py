@@ -1,0 +1,1 @@
+"""Baseline agents, one per file."""

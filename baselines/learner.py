@@ -1,0 +1,61 @@
+"""What all learners share: an optimiser, the gradient step, and a state dict with both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+
+
+class Learner(nn.Module):
+    """A module with an optimiser. Agents derive from it; the defaults are those of an agent without memory.
+
+    Args:
+        num_envs: rows that it learns from.
+        num_steps: steps of each row in a batch.
+        max_grad_norm: gradients are scaled down to this norm.
+    """
+
+    optimiser: torch.optim.Optimizer
+
+    def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float) -> None:
+        super().__init__()
+        self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """No recurrent state."""
+        return TensorDict(batch_size=[num_envs])
+
+    def start_task(self) -> None:
+        """Nothing to do."""
+
+    def end_task(self) -> None:
+        """Nothing to do."""
+
+    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+        """The losses of a batch; see `ctgraph_rl.agent.Agent`."""
+        raise NotImplementedError
+
+    def gradient_step(self, batch: TensorDictBase) -> TensorDict:
+        """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
+        losses = self.loss(batch)
+        self.optimiser.zero_grad()
+        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
+        self.optimiser.step()
+        return losses.detach().set("grad_norm", norm)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The optimiser's state, so that `state_dict` is complete."""
+        return {"optimiser": self.optimiser.state_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` gave."""
+        self.optimiser.load_state_dict(state["optimiser"])
+
+
+def mean_measurements(steps: list[TensorDict]) -> dict[str, float]:
+    """The mean of each measurement over gradient steps."""
+    return {key: value.item() for key, value in torch.stack(steps).mean(0).items()} if steps else {}

@@ -1,0 +1,61 @@
+"""CT-graphs as batched TorchRL environments, with lifelong-learning curricula and metrics.
+
+Names are imported when they are first used: torch and torchrl cost seconds.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ctgraph_rl import metrics as metrics
+    from ctgraph_rl.agent import Agent as Agent
+    from ctgraph_rl.curriculum import Block as Block
+    from ctgraph_rl.curriculum import Curriculum as Curriculum
+    from ctgraph_rl.curriculum import Evaluation as Evaluation
+    from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
+    from ctgraph_rl.graph import CTGraph as CTGraph
+    from ctgraph_rl.graph import StateType as StateType
+    from ctgraph_rl.lifelong import evaluate as evaluate
+    from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
+    from ctgraph_rl.log import RunLog as RunLog
+    from ctgraph_rl.observations import Observations as Observations
+    from ctgraph_rl.observations import OneHot as OneHot
+    from ctgraph_rl.observations import PaperImages as PaperImages
+    from ctgraph_rl.rewards import Needle as Needle
+    from ctgraph_rl.task import Task as Task
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Agent": "agent",
+    "Block": "curriculum",
+    "CTGraph": "graph",
+    "CTGraphEnv": "env",
+    "Curriculum": "curriculum",
+    "Evaluation": "curriculum",
+    "Needle": "rewards",
+    "Observations": "observations",
+    "OneHot": "observations",
+    "PaperImages": "observations",
+    "RunLog": "log",
+    "StateType": "graph",
+    "Task": "task",
+    "evaluate": "lifelong",
+    "learn_curriculum": "lifelong",
+}
+
+__all__ = [*_HOMES, "metrics"]
+
+
+def __getattr__(name: str) -> object:
+    if name == "metrics":
+        return import_module("ctgraph_rl.metrics")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"ctgraph_rl.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

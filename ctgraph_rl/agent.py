@@ -1,0 +1,56 @@
+"""The Agent protocol: what `learn_curriculum` asks of a learner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+
+class Agent(Protocol):
+    """A learner. One module acts and learns, one method gives the loss; any class with these members is an agent.
+
+    Exploration and sampling draw from torch's global generator, which the run seeds.
+    """
+
+    num_envs: int
+    """Rows that it learns from."""
+
+    num_steps: int
+    """Steps of each row in a batch; the last batch of a block may be shorter."""
+
+    policy: TensorDictModuleBase
+    """Reads ``observation`` and ``is_init``, writes ``action``; explores unless TorchRL's exploration type forbids it.
+
+    A recurrent policy reads its state under its own keys and writes the new one under ``("next", key)``.
+    """
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """The recurrent state of ``num_envs`` rows before their first observation; empty without memory."""
+        ...
+
+    def start_task(self) -> None:
+        """Called before the first batch of a block whose start is announced."""
+        ...
+
+    def end_task(self) -> None:
+        """Called after the last batch of such a block."""
+        ...
+
+    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+        """The losses of a batch as scalars named ``loss_*``; their sum is what is minimised."""
+        ...
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from a batch of shape [num_envs, num_steps] in time order; returns what is worth logging."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the agent needs to go on as if never stopped, as tensors and plain Python values."""
+        ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
+        """Restore what `state_dict` gave."""
+        ...

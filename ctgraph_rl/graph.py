@@ -1,0 +1,114 @@
+"""The shape of a CT-graph and what is known about it in closed form.
+
+Soltoggio et al. 2023 (arXiv 2302.10887), sections 2 and 3, with the misprints that README lists corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from ctgraph_rl.checks import is_int, is_real, require
+
+WAIT_ACTION = 0
+"""The action A^0 that leaves a wait state; decisions are the actions 1..b."""
+
+MAX_STATES = 2**63 - 1
+"""Positions are int64 heap indices."""
+
+
+class StateType(IntEnum):
+    """The five kinds of states: S^H, S^W, S^D, S^E and S^F of the paper."""
+
+    HOME = 0
+    WAIT = 1
+    DECISION = 2
+    END = 3
+    FAIL = 4
+
+
+@dataclass(frozen=True)
+class CTGraph:
+    """A b-ary tree of decision states with a wait state before every decision and end state.
+
+    Args:
+        branching_factor: b >= 2, the number of decisions at a decision state.
+        depth: d >= 1, the number of decisions on the way to an end state.
+        wait_prob: p in [0, 1), the probability to stay in a wait state when waiting.
+
+    Raises:
+        ValueError: for values out of range and for a tree whose states do not fit int64.
+    """
+
+    branching_factor: int
+    depth: int
+    wait_prob: float = 0.0
+
+    def __post_init__(self) -> None:
+        b, d, p = self.branching_factor, self.depth, self.wait_prob
+        require(
+            (is_int(b, 2), f"branching_factor must be an integer >= 2, got {b!r}"),
+            (is_int(d, 1), f"depth must be an integer >= 1, got {d!r}"),
+            (is_real(p, 0) and p < 1, f"wait_prob must be in [0, 1), got {p!r}"),
+        )
+        # 3**64 > 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
+        fits = d < 64 and self.num_states <= MAX_STATES
+        require(
+            (fits, f"depth={d} with branching_factor={b} gives more than 2**63 - 1 states; use a smaller depth")
+        )
+        object.__setattr__(self, "wait_prob", float(p))
+
+    @property
+    def num_end_states(self) -> int:
+        """b^d end states, the leaves."""
+        return self.branching_factor**self.depth
+
+    @property
+    def num_decision_states(self) -> int:
+        """1 + b + ... + b^(d-1) decision states."""
+        return (self.num_end_states - 1) // (self.branching_factor - 1)
+
+    @property
+    def num_wait_states(self) -> int:
+        """One wait state before each decision and each end state."""
+        return self.num_decision_states + self.num_end_states
+
+    @property
+    def num_states(self) -> int:
+        """|S|, home and fail included."""
+        return self.num_wait_states + self.num_decision_states + self.num_end_states + 2
+
+    @property
+    def _wait_passed_at_random(self) -> float:
+        """Probability that a uniformly random policy gets through one wait state."""
+        b, p = self.branching_factor, self.wait_prob
+        return (1 - p) / (b + 1 - p)
+
+    @property
+    def reward_prob_random(self) -> float:
+        """P_R: the probability that a uniformly random policy reaches one given end state.
+
+        (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form.
+        """
+        b = self.branching_factor
+        return (b + 1) * (self._wait_passed_at_random / (b + 1)) ** (self.depth + 1)
+
+    @property
+    def end_prob_random(self) -> float:
+        """P_E: the probability that a uniformly random policy reaches any end state, b^d P_R."""
+        return self.num_end_states * self.reward_prob_random
+
+    @property
+    def reward_prob_navigation(self) -> float:
+        """P_RNP: the same for a policy that waits when it must and decides at random, b^-d."""
+        return 1 / self.num_end_states
+
+    @property
+    def expected_episode_length(self) -> float:
+        """E[rho]: mean steps of an episode that reaches an end state, (d + 1) / (1 - p) + d + 1."""
+        return (self.depth + 1) / (1 - self.wait_prob) + self.depth + 1
+
+    @property
+    def expected_search_episodes(self) -> float:
+        """E[kappa]: mean episodes to the goal when end states are tried without replacement, (b^d + 1) / 2."""
+        return (self.num_end_states + 1) / 2

@@ -1,0 +1,225 @@
+"""The only loop of the project: learn the blocks of a curriculum in order, evaluate all tasks at every boundary."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.env import OUTCOME_GOAL, CTGraphEnv
+from ctgraph_rl.log import RunLog
+from ctgraph_rl.task import Task
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+InitialState = Callable[[int], TensorDict]
+
+
+class Progress(Protocol):
+    """What `learn_curriculum` tells while it runs."""
+
+    def update(self, block: int, frames: int, episode_return: float) -> None:
+        """A batch is done: block counted from 1, frames of the run so far, mean return of its finished episodes."""
+        ...
+
+
+def learn_curriculum(
+    curriculum: Curriculum,
+    agent: Agent,
+    seed: int = 0,
+    log: RunLog | None = None,
+    progress: Progress | None = None,
+    device: torch.device | str = "cpu",
+) -> RunLog:
+    """Let an agent learn a curriculum block by block, with all tasks evaluated before, between and after.
+
+    Training randomness of the environment comes from ``seed``; the agent draws from torch's global generator, which
+    is the caller's to seed. Evaluation disturbs neither.
+
+    Args:
+        curriculum: what to learn.
+        agent: who learns.
+        seed: the environment's seed, in [0, 2**63).
+        log: where measurements go; default: a new one in memory.
+        progress: is told after every batch.
+        device: where the environment lives.
+
+    Returns:
+        The log; ``log.performance()`` is the performance matrix.
+
+    Raises:
+        ValueError: before any work, if a block's frames are not a multiple of the agent's rows.
+        FloatingPointError: if a loss is not finite; names block, frames and loss.
+    """
+    log = RunLog() if log is None else log
+    check_frames(curriculum, agent.num_envs)
+    rows = [block.rows(agent.num_envs) for block in curriculum.blocks]
+    env = CTGraphEnv(rows[0], seed=seed, task_pool=curriculum.tasks, device=device)
+    frames = 0
+    _evaluate_all(curriculum, agent, 0, frames, seed, log, device)
+    for number, block in enumerate(curriculum.blocks, 1):
+        env.set_tasks(rows[number - 1])
+        agent.start_task()
+        for batch in collect(env, agent.policy, block.num_frames, agent.num_steps, agent.initial_state):
+            measurements = agent.learn(batch)
+            frames += batch.numel()
+            episodes = episode_means(batch["next"][batch["next", "done"].squeeze(-1)])
+            log.append("training", block=number, frames=frames, **episodes, **measurements)
+            _require_finite(measurements, number, frames)
+            if progress is not None:
+                progress.update(number, frames, episodes["return_mean"])
+        agent.end_task()
+        _evaluate_all(curriculum, agent, number, frames, seed, log, device)
+    return log
+
+
+def check_frames(curriculum: Curriculum, num_envs: int) -> None:
+    """Refuse a curriculum whose blocks cannot be learned in whole steps of ``num_envs`` rows.
+
+    Raises:
+        ValueError: names the block and the nearest possible numbers of frames.
+    """
+    require(*(block.frame_rule(num_envs, f"block {i}") for i, block in enumerate(curriculum.blocks, 1)))
+
+
+@torch.no_grad()
+def collect(
+    env: CTGraphEnv,
+    policy: Policy,
+    num_frames: int,
+    num_steps: int,
+    initial_state: InitialState | None = None,
+) -> Iterator[TensorDictBase]:
+    """Batches of [rows, num_steps] in time order, from a reset on; the last one may be shorter.
+
+    Args:
+        env: where to act.
+        policy: writes ``action`` and, if recurrent, its state under ``("next", key)``.
+        num_frames: frames in all, a multiple of the rows.
+        num_steps: steps in a batch.
+        initial_state: gives the recurrent state that the rows start with.
+    """
+    carried, state_keys = _start(env, initial_state)
+    steps_left = num_frames // env.numel()
+    while steps_left:
+        steps = []
+        with set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(min(num_steps, steps_left)):
+                step, carried = _act(env, policy, carried, state_keys)
+                steps.append(step)
+        steps_left -= len(steps)
+        yield torch.stack(steps, dim=1)
+
+
+@torch.no_grad()
+def evaluate(
+    policy: Policy,
+    tasks: Sequence[Task],
+    num_episodes: int = 100,
+    seed: int = 0,
+    greedy: bool = True,
+    initial_state: InitialState | None = None,
+    device: torch.device | str = "cpu",
+) -> TensorDict:
+    """Play the same number of episodes on every task, all in one batch: a row for each episode.
+
+    The environment is its own, and torch's global generator is left as it was found.
+
+    Args:
+        policy: who plays.
+        tasks: what is played.
+        num_episodes: episodes per task.
+        seed: decides the environment and, if not greedy, the policy's draws.
+        greedy: most likely actions; False samples and explores as in training.
+        initial_state: gives a recurrent policy's state for a number of rows.
+        device: where the environment lives.
+
+    Returns:
+        ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
+        [tasks, num_episodes, 1], as they are at the end of the episodes.
+    """
+    require((is_int(num_episodes, 1), f"num_episodes must be an integer >= 1, got {num_episodes!r}"))
+    env = CTGraphEnv([task for task in tasks for _ in range(num_episodes)], seed=seed, device=device)
+    exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
+    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        with set_exploration_type(exploration):
+            result = _first_episodes(env, policy, initial_state)
+    return result.view(len(tasks), num_episodes)
+
+
+def _first_episodes(env: CTGraphEnv, policy: Policy, initial_state: InitialState | None) -> TensorDict:
+    """The end of each row's first episode."""
+    carried, state_keys = _start(env, initial_state)
+    keys = ("episode_reward", "step_count", "outcome", "leaf")
+    running, result = torch.ones(env.batch_size, dtype=torch.bool, device=env.device), None
+    while running.any():
+        step, carried = _act(env, policy, carried, state_keys)
+        now = step["next"].select(*keys)
+        result = now if result is None else torch.where(running, now, result)
+        running &= ~step["next", "done"].squeeze(-1)
+    return result
+
+
+def _start(env: CTGraphEnv, initial_state: InitialState | None) -> tuple[TensorDictBase, list[str]]:
+    """The first observations with the policy's recurrent state, and the keys of that state."""
+    state = TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
+    return env.reset().update(state), list(state.keys())
+
+
+def _act(
+    env: CTGraphEnv, policy: Policy, carried: TensorDictBase, state_keys: list[str]
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """One step of every row, and what the next one starts from. The policy forgets where ``is_init`` is set."""
+    step, following = env.step_and_maybe_reset(policy(carried))
+    return step, following.update(step["next"].select(*state_keys))
+
+
+def episode_means(ends: TensorDictBase) -> dict[str, Any]:
+    """Number of finished episodes and their mean return, success rate and length; NaN for none.
+
+    Args:
+        ends: the data of the last step of each episode.
+    """
+    return {
+        "episodes": ends.numel(),
+        "return_mean": ends["episode_reward"].double().mean().item(),
+        "success_rate": (ends["outcome"] == OUTCOME_GOAL).double().mean().item(),
+        "length_mean": ends["step_count"].double().mean().item(),
+    }
+
+
+def derive_seed(seed: int, *purpose: str | int) -> int:
+    """A seed in [0, 2**63) for a purpose, unrelated to the run's own and to other purposes'."""
+    text = "/".join(map(str, (seed, *purpose)))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def _evaluate_all(
+    curriculum: Curriculum, agent: Agent, block: int, frames: int, seed: int, log: RunLog, device: torch.device | str
+) -> None:
+    how = curriculum.evaluation
+    result = evaluate(
+        agent.policy,
+        curriculum.tasks,
+        how.num_episodes,
+        derive_seed(seed, "evaluation", block),
+        how.greedy,
+        agent.initial_state,
+        device,
+    )
+    for number, (label, episodes) in enumerate(zip(curriculum.labels, result, strict=True), 1):
+        log.append("evaluation", block=block, frames=frames, task=number, label=label, **episode_means(episodes))
+
+
+def _require_finite(measurements: Mapping[str, float], block: int, frames: int) -> None:
+    for name, value in measurements.items():
+        if not math.isfinite(value):
+            raise FloatingPointError(f"{name} is {value} in block {block} after {frames} frames; the run stops here")

@@ -1,0 +1,238 @@
+"""The main job: a configuration becomes a curriculum and an agent, which learns it; results are files.
+
+``python -m ctgraph_rl.run curriculum=su_b1_4tasks agent=lstm_ppo seed=0``
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import sys
+from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ctgraph_rl.checks import is_int, require
+
+if TYPE_CHECKING:
+    from ctgraph_rl.curriculum import Curriculum
+
+RESULTS = ("run.jsonl", "performance.csv", "metrics.json", "agent.pt")
+"""What a run writes into its directory, beside Hydra's ``.hydra``; ``metrics.json`` is complete when the run is."""
+
+NOT_HASHED = ("overwrite",)
+"""Keys of the configuration that do not change results."""
+
+
+def conf_dir() -> str:
+    """The folder with the configuration: in the package when installed from a wheel, beside it in a checkout."""
+    here = Path(__file__).resolve().parent
+    for candidate in (here / "conf", here.parent / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return str(candidate)
+    raise FileNotFoundError(f"no conf/config.yaml in {here} or {here.parent}; reinstall ctgraph_rl")
+
+
+def check_packages() -> None:
+    """Refuse to run with a ``curricula`` or ``baselines`` that is not ours.
+
+    Raises:
+        ValueError: if a folder, usually in the working directory, shadows one of them; names it.
+    """
+    ours = Path(__file__).resolve().parent.parent
+    for name in ("curricula", "baselines"):
+        spec = find_spec(name)
+        found = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent
+        message = f"package {name!r} was found in {found} instead of {ours / name}; rename or move the folder found"
+        require((found == ours / name, message))
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as plain values, without Hydra's own and what does not change results."""
+    content = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [k for k in cfg if k != "hydra"]), resolve=True)
+    return {str(k): v for k, v in content.items() if k not in NOT_HASHED}  # type: ignore[union-attr]
+
+
+def run_name(*, _root_: DictConfig) -> str:
+    """Name of a run's directory: curriculum, agent, seed and a hash of the configuration."""
+    text = json.dumps(plain(_root_), sort_keys=True)
+    choices = _root_.hydra.runtime.choices
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return f"{choices.curriculum}/{choices.agent}-seed{_root_.seed}-{digest}"
+
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+@hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
+def _job(cfg: DictConfig) -> None:
+    run(cfg, Path(HydraConfig.get().runtime.output_dir))
+
+
+def run(cfg: DictConfig, run_dir: Path) -> None:
+    """Learn the configured curriculum with the configured agent and write the results to a directory.
+
+    Args:
+        cfg: the composed configuration.
+        run_dir: an existing directory.
+
+    Raises:
+        ValueError: before any work, for a value out of range.
+        FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
+    """
+    check_packages()
+    require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
+    require((is_int(cfg.num_threads, 1), f"num_threads must be an integer >= 1, got {cfg.num_threads!r}"))
+    require((isinstance(cfg.overwrite, bool), f"overwrite must be true or false, got {cfg.overwrite!r}"))
+    if not is_finished(cfg, run_dir):
+        learn(cfg, run_dir)
+    from ctgraph_rl.report import print_summary
+
+    print_summary(run_dir)
+    print(f"results: {run_dir}")
+
+
+def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
+    """Whether the directory already holds the results of this configuration.
+
+    Raises:
+        FileExistsError: if it holds an unfinished run, or one of another configuration.
+    """
+    log_file = run_dir / "run.jsonl"
+    if cfg.overwrite or not log_file.exists():
+        return False
+    from ctgraph_rl.log import RunLog
+
+    advice = "choose another hydra.run.dir, or overwrite=true to replace it"
+    runs = RunLog.read(log_file).of_kind("run")
+    if not (runs and (run_dir / "metrics.json").exists()):
+        raise FileExistsError(f"{run_dir} holds an unfinished run; {advice}")
+    config = plain(cfg)
+    different = [key for key in config if runs[0]["config"].get(key) != config[key]]
+    if different:
+        raise FileExistsError(f"{run_dir} holds a run with another {', '.join(different)}; {advice}")
+    print("this run is complete; overwrite=true runs it again")
+    return True
+
+
+def learn(cfg: DictConfig, run_dir: Path) -> None:
+    """The run itself: build, learn, measure, write."""
+    import torch
+
+    from ctgraph_rl import metrics
+    from ctgraph_rl.env import CTGraphEnv
+    from ctgraph_rl.lifelong import check_frames, learn_curriculum
+    from ctgraph_rl.log import RunLog, write_metrics, write_performance
+    from ctgraph_rl.progress import ProgressBar
+
+    device = checked_device(cfg.device)
+    torch.set_num_threads(cfg.num_threads)
+    torch.set_flush_denormal(True)
+    torch.manual_seed(cfg.seed)
+    curriculum = named(hydra.utils.instantiate(cfg.curriculum, _convert_="all"))
+    env = CTGraphEnv(curriculum.tasks)
+    make_agent = hydra.utils.instantiate(cfg.agent, _partial_=True, _convert_="all")
+    agent = make_agent(observation_spec=env.observation_spec_unbatched, action_spec=env.action_spec_unbatched)
+    agent = agent.to(device)
+    check_frames(curriculum, agent.num_envs)
+    for name in RESULTS:
+        (run_dir / name).unlink(missing_ok=True)
+    log = RunLog(run_dir / "run.jsonl")
+    log.append("run", **about(cfg, curriculum))
+    with ProgressBar(len(curriculum.blocks), curriculum.num_frames) as progress:
+        learn_curriculum(curriculum, agent, cfg.seed, log, progress, device)
+    log.close()
+    torch.save(agent.state_dict(), run_dir / "agent.pt")
+    write_performance(run_dir / "performance.csv", log, curriculum.labels)
+    write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), curriculum.trained))
+
+
+def checked_device(name: str) -> Any:
+    """The torch device of a name.
+
+    Raises:
+        ValueError: if there is no such device on this machine; lists the choices.
+    """
+    import torch
+
+    choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    require((name in choices, f"device must be one of {', '.join(choices)} on this machine, got {name!r}"))
+    return torch.device(name)
+
+
+def named(curriculum: Curriculum) -> Curriculum:
+    """The curriculum, with ``(modified)`` behind its name if it is not what is published under that name."""
+    published = import_module("curricula")
+    known = curriculum.name in published.names()
+    if not known or published.load(curriculum.name).fingerprint == curriculum.fingerprint:
+        return curriculum
+    return replace(curriculum, name=f"{curriculum.name} (modified)")
+
+
+def about(cfg: DictConfig, curriculum: Curriculum) -> dict[str, Any]:
+    """What the first line of the log says: all that the numbers depend on."""
+    import tensordict
+    import torch
+    import torchrl
+
+    from ctgraph_rl import __version__
+    from ctgraph_rl.log import SCHEMA
+
+    return {
+        "schema": SCHEMA,
+        "curriculum": curriculum.name,
+        "version": curriculum.version,
+        "fingerprint": curriculum.fingerprint,
+        "source": curriculum.source,
+        "config": plain(cfg),
+        "versions": {
+            "ctgraph_rl": __version__,
+            "torch": torch.__version__,
+            "torchrl": torchrl.__version__,
+            "tensordict": tensordict.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
+        "num_threads": torch.get_num_threads(),
+    }
+
+
+def explain(error: BaseException) -> str:
+    """One message for a user's error: the first cause, and the choices where a key is unknown."""
+    causes = [error]
+    while causes[-1].__cause__ is not None:
+        causes.append(causes[-1].__cause__)
+    cause = causes[-1]
+    message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
+    node = getattr(cause, "parent_node", None)
+    if isinstance(node, DictConfig):
+        message += f"\nChoices: {', '.join(sorted(map(str, node)))}"
+    return message
+
+
+def main() -> None:
+    """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
+    full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
+    try:
+        _job()
+    except (HydraException, OmegaConfBaseException, ValueError, FileExistsError, FloatingPointError) as error:
+        if full_error:
+            raise
+        print(f"error: {explain(error)}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
