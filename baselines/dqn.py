@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
 from torchrl.data.postprocs import MultiStep
 from torchrl.modules import MLP, EGreedyModule, QValueActor
@@ -19,7 +19,7 @@ from torchrl.objectives import DQNLoss, HardUpdate, ValueEstimators
 
 from baselines.learner import Learner, mean_measurements
 from baselines.networks import encoder
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import at_least_one, fraction, positive, require
 
 REPLAY_KEYS = (
     "observation",
@@ -78,8 +78,18 @@ class DQN(Learner):
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
         choices = ("clear", "keep")
-        known = replay_on_task_change in choices
-        require((known, f"replay_on_task_change must be one of {choices}, got {replay_on_task_change!r}"))
+        counts = {"hidden_size": hidden_size, "n_steps": n_steps, "buffer_size": buffer_size, "batch_size": batch_size}
+        require(
+            *at_least_one(**counts, num_updates=num_updates, target_update_interval=target_update_interval),
+            *at_least_one(annealing_num_steps=annealing_num_steps),
+            *positive(learning_rate=learning_rate, gamma=gamma),
+            *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end),
+            (eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"),
+            (
+                replay_on_task_change in choices,
+                f"replay_on_task_change must be one of {', '.join(choices)}, got {replay_on_task_change!r}",
+            ),
+        )
         self.num_updates, self.replay_on_task_change = num_updates, replay_on_task_change
         head = MLP(
             in_features=hidden_size, out_features=action_spec.space.n, num_cells=[hidden_size], activation_class=nn.ReLU
@@ -114,7 +124,7 @@ class DQN(Learner):
         self.exploration.step()
         return {**mean_measurements(steps), "exploration": self.exploration.eps.item()}
 
-    def _update(self) -> TensorDict:
+    def _update(self) -> dict[str, Tensor]:
         measured = self.gradient_step(self.replay.sample())
         self.target_update.step()
         return measured

@@ -6,7 +6,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
+
+from ctgraph_rl.checks import at_least_one, positive, require
 
 
 class Learner(nn.Module):
@@ -22,6 +24,7 @@ class Learner(nn.Module):
 
     def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float) -> None:
         super().__init__()
+        require(*at_least_one(num_envs=num_envs, num_steps=num_steps), *positive(max_grad_norm=max_grad_norm))
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -38,14 +41,14 @@ class Learner(nn.Module):
         """The losses of a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
-    def gradient_step(self, batch: TensorDictBase) -> TensorDict:
+    def gradient_step(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
         losses = self.loss(batch)
         self.optimiser.zero_grad()
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
         norm = nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
         self.optimiser.step()
-        return losses.detach().set("grad_norm", norm)
+        return {**losses.detach(), "grad_norm": norm}
 
     def get_extra_state(self) -> dict[str, Any]:
         """The optimiser's state, so that `state_dict` is complete."""
@@ -56,6 +59,6 @@ class Learner(nn.Module):
         self.optimiser.load_state_dict(state["optimiser"])
 
 
-def mean_measurements(steps: list[TensorDict]) -> dict[str, float]:
+def mean_measurements(steps: list[dict[str, Tensor]]) -> dict[str, float]:
     """The mean of each measurement over gradient steps."""
-    return {key: value.item() for key, value in torch.stack(steps).mean(0).items()} if steps else {}
+    return {key: torch.stack([step[key] for step in steps]).mean().item() for key in steps[0]}

@@ -17,6 +17,7 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from baselines.learner import Learner, mean_measurements
 from baselines.networks import encoder
+from ctgraph_rl.checks import at_least_one, fraction, is_int, is_real, positive, require
 
 STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")
 ACTED_KEYS = ("action", "action_log_prob", "state_value")
@@ -61,6 +62,15 @@ class LSTMPPO(Learner):
         max_grad_norm: float,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
+        splits = is_int(num_envs, 1) and is_int(num_minibatches, 1) and num_envs % num_minibatches == 0
+        require(
+            *at_least_one(hidden_size=hidden_size, num_epochs=num_epochs, num_minibatches=num_minibatches),
+            *positive(learning_rate=learning_rate, clip_epsilon=clip_epsilon),
+            *fraction(gamma=gamma, gae_lambda=gae_lambda),
+            (is_real(entropy_coeff, 0), f"entropy_coeff must be a number >= 0, got {entropy_coeff!r}"),
+            (is_real(critic_coeff, 0), f"critic_coeff must be a number >= 0, got {critic_coeff!r}"),
+            (splits, f"num_envs={num_envs} must be a multiple of num_minibatches={num_minibatches}"),
+        )
         self.gamma, self.gae_lambda = gamma, gae_lambda
         self.num_epochs, self.num_minibatches = num_epochs, num_minibatches
         num_actions = action_spec.space.n

@@ -27,8 +27,27 @@ def is_int(value: object, low: float = -math.inf, high: float = math.inf) -> boo
 
 def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bool:
     """True for a finite ``int`` or ``float`` (not a ``bool``) in [low, high]."""
-    real = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return real and math.isfinite(value) and low <= value <= high  # type: ignore[arg-type]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return math.isfinite(value) and low <= value <= high
+
+
+def at_least_one(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is an integer >= 1."""
+    return [(is_int(value, 1), f"{name} must be an integer >= 1, got {value!r}") for name, value in values.items()]
+
+
+def positive(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is a number > 0."""
+    return [
+        (is_real(value, 0) and value != 0, f"{name} must be a number > 0, got {value!r}")
+        for name, value in values.items()
+    ]
+
+
+def fraction(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is a number in [0, 1]."""
+    return [(is_real(value, 0, 1), f"{name} must be in [0, 1], got {value!r}") for name, value in values.items()]
 
 
 def as_tuple(value: object) -> object:

@@ -121,13 +121,12 @@ class Curriculum:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A different short name for each of ``tasks``."""
-        seen: dict[str, int] = {}
-        labels = []
-        for task in self.tasks:
-            seen[task.label] = seen.get(task.label, 0) + 1
-            labels.append(task.label if seen[task.label] == 1 else f"{task.label}#{seen[task.label]}")
-        return tuple(labels)
+        """A different short name for each of ``tasks``: the goal, and what else differs between them."""
+        parts = [task.label_parts for task in self.tasks]
+        differing = [name for name in parts[0] if name == "goal" or len({part[name] for part in parts}) > 1]
+        labels = ["-".join(part[name] for name in differing) for part in parts]
+        counts = [labels[:i].count(label) for i, label in enumerate(labels)]
+        return tuple(f"{label}#{count + 1}" if count else label for label, count in zip(labels, counts, strict=True))
 
     @property
     def trained(self) -> tuple[tuple[int, ...], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,6 +24,16 @@ OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)
 
 NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
+
+
+class RewardParams(NamedTuple):
+    """What the reward needs to know of each row's task; [N]."""
+
+    goal_leaf: Tensor  # int64
+    depth: Tensor  # int64
+    goal_reward: Tensor  # float32
+    fail_reward: Tensor  # float32
+    reward_fn: Tensor  # int64: which of the environment's different reward functions
 
 
 class CTGraphEnv(EnvBase):
@@ -62,6 +72,17 @@ class CTGraphEnv(EnvBase):
 
     batch_locked = True
 
+    state_type: Tensor
+    node: Tensor
+    observation_id: Tensor
+    _seed_key: Tensor
+    _row: Tensor
+    _tick: Tensor
+    _step_count: Tensor
+    _episode_reward: Tensor
+    _zeros: Tensor
+    _bank: Tensor
+
     def __init__(
         self,
         tasks: Iterable[Task],
@@ -76,7 +97,7 @@ class CTGraphEnv(EnvBase):
         num_rows = len(tasks)
         require(
             (num_rows > 0, "tasks must hold at least one task, got none"),
-            (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
+            _seed_rule(seed),
             (is_int(first_row, 0, 2**32 - num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
         )
         super().__init__(device=device, batch_size=torch.Size([num_rows]))
@@ -150,7 +171,6 @@ class CTGraphEnv(EnvBase):
 
     def _fill_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> None:
         graphs, observations = [task.graph for task in tasks], [task.observations for task in tasks]
-        self._depth = rows([graph.depth for graph in graphs])
         self._tree = TreeParams(
             branching_factor=rows([graph.branching_factor for graph in graphs]),
             first_leaf=rows([graph.num_decision_states for graph in graphs]),
@@ -167,15 +187,24 @@ class CTGraphEnv(EnvBase):
             num_angles=rows([x.read_rotation + 1 for x in observations]),
             read_noise=rows([x.read_noise for x in observations]),
         )
-        self._draws = any(graph.wait_prob > 0 for graph in graphs) or any(
-            x.draws_ids or x.read_rotation for x in observations
-        )
-        self._noisy = any(x.read_noise for x in observations)
-        self._goal_leaf = rows([task.goal_leaf for task in tasks])
-        self._goal_reward = rows([task.goal_reward for task in tasks], torch.float32)
-        self._fail_reward = rows([task.fail_reward for task in tasks], torch.float32)
         self._reward_fns: tuple[RewardFn, ...] = tuple(dict.fromkeys(task.reward_fn for task in tasks))
-        self._reward_index = rows([self._reward_fns.index(task.reward_fn) for task in tasks])
+        self._g = RewardParams(
+            goal_leaf=rows([task.goal_leaf for task in tasks]),
+            depth=rows([graph.depth for graph in graphs]),
+            goal_reward=rows([task.goal_reward for task in tasks], torch.float32),
+            fail_reward=rows([task.fail_reward for task in tasks], torch.float32),
+            reward_fn=rows([self._reward_fns.index(task.reward_fn) for task in tasks]),
+        )
+        waits = any(graph.wait_prob > 0 for graph in graphs)
+        self._draws = waits or any(x.draws_ids or x.read_rotation for x in observations)
+        self._noisy = any(x.read_noise for x in observations)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CTGraphEnv:
+        """Move the rows' parameters along with the buffers."""
+        super()._apply(fn, recurse)
+        self._tree, self._x = TreeParams(*map(fn, self._tree)), ObservationParams(*map(fn, self._x))
+        self._g = RewardParams(*map(fn, self._g))
+        return self
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -210,21 +239,21 @@ class CTGraphEnv(EnvBase):
 
     def _reward(self, before: Tensor, after: State) -> Tensor:
         """float32 [N]: what is paid on entering an end or a fail state."""
-        leaf, tree = after.node - self._tree.first_leaf, self._tree
-        share = torch.zeros_like(self._goal_reward)
+        leaf, tree, g = after.node - self._tree.first_leaf, self._tree, self._g
+        share = torch.zeros_like(g.goal_reward)
         for i, reward_fn in enumerate(self._reward_fns):
-            paid = reward_fn(leaf, self._goal_leaf, tree.branching_factor, self._depth)
-            share = torch.where(self._reward_index == i, paid, share)
+            paid = reward_fn(leaf, g.goal_leaf, tree.branching_factor, g.depth)
+            share = torch.where(g.reward_fn == i, paid, share)
         entered = after.state_type != before
         at_end = entered & (after.state_type == StateType.END)
         failed = entered & (after.state_type == StateType.FAIL)
-        return torch.where(at_end, share * self._goal_reward, torch.where(failed, self._fail_reward, 0.0))
+        return torch.where(at_end, share * g.goal_reward, torch.where(failed, g.fail_reward, 0.0))
 
     def _data(self, words: tuple[Tensor, ...], is_init: Tensor) -> TensorDict:
         """What the rows show now: observation, book-keeping and done flags."""
         at_end, failed = self.state_type == StateType.END, self.state_type == StateType.FAIL
         leaf = torch.where(at_end, self.node - self._tree.first_leaf, NO_LEAF)
-        arrived = torch.where(leaf == self._goal_leaf, OUTCOME_GOAL, OUTCOME_OTHER_END)
+        arrived = torch.where(leaf == self._g.goal_leaf, OUTCOME_GOAL, OUTCOME_OTHER_END)
         outcome = torch.where(at_end, arrived, torch.where(failed, OUTCOME_FAIL, OUTCOME_RUNNING))
         done = (at_end | failed).unsqueeze(-1)
         return TensorDict(
@@ -267,9 +296,13 @@ class CTGraphEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Start all rows anew with another seed; the next `reset` gives their first episodes."""
-        require((is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"))
-        self._seed_key.fill_(seed)
+        require(_seed_rule(seed))
+        self._seed_key.fill_(seed or 0)
         self._tick.zero_()
+
+
+def _seed_rule(seed: object) -> tuple[bool, str]:
+    return is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"
 
 
 def _bank_key(task: Task) -> tuple[ImageSet, int]:

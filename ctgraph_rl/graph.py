@@ -53,9 +53,7 @@ class CTGraph:
         )
         # 3**64 > 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
         fits = d < 64 and self.num_states <= MAX_STATES
-        require(
-            (fits, f"depth={d} with branching_factor={b} gives more than 2**63 - 1 states; use a smaller depth")
-        )
+        require((fits, f"depth={d} with branching_factor={b} gives more than 2**63 - 1 states; use a smaller depth"))
         object.__setattr__(self, "wait_prob", float(p))
 
     @property

@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from torch import Tensor
@@ -38,7 +38,9 @@ class RunLog:
     def __init__(self, path: Path | str | None = None) -> None:
         self.measurements: list[dict[str, Any]] = []
         self._start = time.perf_counter()
-        self._file = None if path is None else open(path, "x", buffering=1, encoding="utf-8")
+        self._file: TextIO | None = None
+        if path is not None:
+            self._file = Path(path).open("x", buffering=1, encoding="utf-8")  # noqa: SIM115, open until `close`
 
     def append(self, kind: str, **values: Any) -> None:
         """Add one measurement; NaN and infinity become null, as JSON has neither."""

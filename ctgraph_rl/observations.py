@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from itertools import pairwise
 from typing import Protocol
 
 import torch
@@ -131,7 +132,7 @@ def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:
     ordered = sorted(ranges.items(), key=lambda item: item[1])
     return [
         (high[0] > low[1], f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later")
-        for (low_name, low), (high_name, high) in zip(ordered, ordered[1:], strict=False)
+        for (low_name, low), (high_name, high) in pairwise(ordered)
     ]
 
 

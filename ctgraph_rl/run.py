@@ -10,9 +10,11 @@ import json
 import os
 import platform
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +61,8 @@ def check_packages() -> None:
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as plain values, without Hydra's own and what does not change results."""
-    content = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [k for k in cfg if k != "hydra"]), resolve=True)
-    return {str(k): v for k, v in content.items() if k not in NOT_HASHED}  # type: ignore[union-attr]
+    kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
+    return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
 
 
 def run_name(*, _root_: DictConfig) -> str:
@@ -139,11 +141,9 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)
     torch.manual_seed(cfg.seed)
-    curriculum = named(hydra.utils.instantiate(cfg.curriculum, _convert_="all"))
+    curriculum = named(target(cfg, "curriculum")())
     env = CTGraphEnv(curriculum.tasks)
-    make_agent = hydra.utils.instantiate(cfg.agent, _partial_=True, _convert_="all")
-    agent = make_agent(observation_spec=env.observation_spec_unbatched, action_spec=env.action_spec_unbatched)
-    agent = agent.to(device)
+    agent = target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched).to(device)
     check_frames(curriculum, agent.num_envs)
     for name in RESULTS:
         (run_dir / name).unlink(missing_ok=True)
@@ -155,6 +155,18 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     torch.save(agent.state_dict(), run_dir / "agent.pt")
     write_performance(run_dir / "performance.csv", log, curriculum.labels)
     write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), curriculum.trained))
+
+
+def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
+    """What a group of the configuration builds, with its arguments bound.
+
+    Raises:
+        ValueError: for an argument that the target does not take; lists the choices.
+    """
+    choices = signature(hydra.utils.get_object(cfg[group]["_target_"])).parameters
+    unknown = [key for key in cfg[group] if not str(key).startswith("_") and key not in choices]
+    require((not unknown, f"{group} has no {', '.join(unknown)}. Choices: {', '.join(choices)}"))
+    return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
 
 
 def checked_device(name: str) -> Any:

@@ -74,7 +74,13 @@ class Task:
         return self.images.seed if isinstance(self.images, PaperImages) else None
 
     @property
-    def label(self) -> str:
-        """A short name for tables, such as ``d2-goal1.2-img1``; not unique among all tasks."""
+    def label_parts(self) -> dict[str, str]:
+        """What tells tasks apart in tables: goal, depth, branching factor, wait probability and images."""
         images = type(self.images).__name__.lower() if self.image_seed is None else f"img{self.image_seed}"
-        return f"d{self.graph.depth}-goal{'.'.join(map(str, self.goal))}-{images}"
+        return {
+            "goal": f"goal{'.'.join(map(str, self.goal))}",
+            "depth": f"d{self.graph.depth}",
+            "branching_factor": f"b{self.graph.branching_factor}",
+            "wait_prob": f"p{self.graph.wait_prob:g}",
+            "images": images,
+        }
