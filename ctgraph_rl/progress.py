@@ -25,7 +25,7 @@ class ProgressBar:
     def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None) -> None:
         self.num_blocks, self.num_frames = num_blocks, num_frames
         self.console = Console(stderr=True) if console is None else console
-        self._bar = Progress(BarColumn(), TextColumn("{task.description}"), console=self.console)
+        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._live = self.console.is_terminal
         self._task = self._bar.add_task("evaluating before training", total=num_frames)
         self._start = self._last_line = time.perf_counter()
@@ -57,6 +57,14 @@ class ProgressBar:
         left = timedelta(seconds=round((self.num_frames - frames) / rate))
         shown = "-" if math.isnan(episode_return) else f"{episode_return:.2f}"
         return (
-            f"block {block}/{self.num_blocks}  {frames:,}/{self.num_frames:,} frames  {rate:,.0f} frames/s  "
+            f"block {block}/{self.num_blocks}  {_short(frames)}/{_short(self.num_frames)} frames  {_short(rate)}/s  "
             f"return {shown}  {left} left"
         )
+
+
+def _short(number: float) -> str:
+    """A count with at most four digits: 960, 20.48k, 819.2k, 1.638M."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.4g}{unit}"
+    return f"{number:.0f}"

@@ -82,11 +82,13 @@ def draw_figure(run_dir: Path | str, path: Path | str) -> None:
 def _draw_curve(axes: Any, log: RunLog) -> None:
     """Return while training over frames; dashed lines where the task changes."""
     training = [m for m in log.of_kind("training") if m["return_mean"] is not None]
-    axes.plot([m["frames"] for m in training], [m["return_mean"] for m in training], color="black", linewidth=1)
-    ends = {m["block"]: m["frames"] for m in training}
-    for frames in list(ends.values())[:-1]:
-        axes.axvline(frames, color="grey", linestyle="--", linewidth=0.8)
+    for block in dict.fromkeys(m["block"] for m in training):
+        curve = [(m["frames"], m["return_mean"]) for m in training if m["block"] == block]
+        axes.plot(*zip(*curve, strict=True), color="black", linewidth=1)
+        axes.axvline(curve[-1][0], color="grey", linestyle="--", linewidth=0.8)
     axes.set(xlabel="frames", ylabel="return while training", ylim=(-0.03, 1.03))
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.tick_params(axis="x", labelsize=7)
     axes.set_title("Learning, task after task", fontsize=9)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import platform
 import sys
@@ -137,6 +138,7 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     from ctgraph_rl.log import RunLog, write_metrics, write_performance
     from ctgraph_rl.progress import ProgressBar
 
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)

@@ -1,0 +1,28 @@
+"""README shows only what runs: CI executes its two commands, this test its Python."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+
+
+def test_the_python_in_readme_runs_and_prints_what_it_says(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+    exec(compile(code, str(README), "exec"), {})
+
+    closed_forms, goals = capsys.readouterr().out.splitlines()
+    assert closed_forms == f"32 {1 / 16875} 12.0"
+    assert goals.endswith("goals reached at random in 51200 frames")
+
+
+@pytest.mark.parametrize("name", ["run-command", "test-command"])
+def test_each_of_the_two_commands_is_one_line_behind_its_marker(name):
+    text = README.read_text(encoding="utf-8")
+
+    blocks = re.findall(rf"<!-- {name} -->\n```bash\n(.*?)```", text, re.DOTALL)
+
+    assert len(blocks) == 1
+    assert len(blocks[0].splitlines()) == 1
