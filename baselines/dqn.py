@@ -98,12 +98,13 @@ class DQN(Learner):
         network = TensorDictSequential(encoder(observation_spec, hidden_size), values)
         self.greedy = QValueActor(network, in_keys=["observation"], spec=action_spec)
         batches = max(1, annealing_num_steps // (num_envs * num_steps))
-        self.exploration = EGreedyModule(action_spec, eps_init, eps_end, batches)
+        self.exploration = EGreedyModule(action_spec, float(eps_init), float(eps_end), batches)
         self.policy = TensorDictSequential(self.greedy, self.exploration, selected_out_keys=["action"])
         self.dqn = DQNLoss(self.greedy, delay_value=True, double_dqn=True, action_space=action_spec)
         self.dqn.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        self.target_update = HardUpdate(self.dqn, value_network_update_interval=target_update_interval)
+        self.target_update = HardUpdate(self.dqn, value_network_update_interval=target_update_interval - 1)
         self.multi_step = MultiStep(gamma, n_steps)
+        self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
         self.replay = TensorDictReplayBuffer(storage=LazyTensorStorage(buffer_size), batch_size=batch_size)
         self.optimiser = torch.optim.Adam(self.greedy.parameters(), lr=learning_rate, fused=True)
 
@@ -130,10 +131,12 @@ class DQN(Learner):
         return measured
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The optimiser's state and the replay buffer."""
-        return {**super().get_extra_state(), "replay": self.replay.state_dict()}
+        """The optimiser's state, the replay buffer and the gradient steps since the last copy to the target network."""
+        own = {"replay": self.replay.state_dict(), "target_age": self.target_update.counter}
+        return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])
+        self.target_update.counter = state["target_age"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -9,6 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from ctgraph_rl.checks import at_least_one, positive, require
+
+LARGEST_WEIGHT = 1e12
+"""Beyond this a network has diverged, and its outputs soon overflow."""
 
 
 class Learner(nn.Module):
@@ -44,10 +48,15 @@ class Learner(nn.Module):
     def gradient_step(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
         losses = self.loss(batch)
+        for key, value in losses.items():
+            require_finite(key, value)
         self.optimiser.zero_grad()
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
         norm = nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
+        require_finite("grad_norm", norm)
         self.optimiser.step()
+        largest = torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max()
+        require_finite("the largest weight", largest, LARGEST_WEIGHT)
         return {**losses.detach(), "grad_norm": norm}
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -57,6 +66,16 @@ class Learner(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         self.optimiser.load_state_dict(state["optimiser"])
+
+
+def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:
+    """Stop learning where a number is NaN, infinite or larger than ``most``.
+
+    Raises:
+        FloatingPointError: names the number.
+    """
+    if not (value.isfinite() and value.abs() <= most):
+        raise FloatingPointError(f"{name} is {value.item():g}")
 
 
 def mean_measurements(steps: list[dict[str, Tensor]]) -> dict[str, float]:

@@ -24,7 +24,8 @@ class Agent(Protocol):
     policy: TensorDictModuleBase
     """Reads ``observation`` and ``is_init``, writes ``action``; explores unless TorchRL's exploration type forbids it.
 
-    A recurrent policy reads its state under its own keys and writes the new one under ``("next", key)``.
+    A recurrent policy reads its state under its own keys and writes the new one under ``("next", key)``. Where
+    ``is_init`` is set, the state that it reads is that of `initial_state`.
     """
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -44,7 +45,11 @@ class Agent(Protocol):
         ...
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch of shape [num_envs, num_steps] in time order; returns what is worth logging."""
+        """Learn from a batch of shape [num_envs, num_steps] in time order; returns what is worth logging.
+
+        Raises:
+            FloatingPointError: if a loss or a weight is not finite; names it.
+        """
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -97,6 +97,7 @@ class CTGraphEnv(EnvBase):
         num_rows = len(tasks)
         require(
             (num_rows > 0, "tasks must hold at least one task, got none"),
+            (len(pool) > 0, "task_pool must hold at least one task, got none"),
             _seed_rule(seed),
             (is_int(first_row, 0, 2**32 - num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
         )
@@ -152,14 +153,15 @@ class CTGraphEnv(EnvBase):
         Raises:
             ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
         """
-        self.tasks = tuple(tasks)
-        different = tuple(dict.fromkeys(self.tasks))
+        tasks = tuple(tasks)
+        different = tuple(dict.fromkeys(tasks))
         unknown = [task for task in different if task not in self._pool]
         n = self.batch_size[0]
         require(
-            (len(self.tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(self.tasks)}"),
+            (len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"),
             (not unknown, f"set_tasks got tasks that are not in task_pool: {unknown[:3]}; name them at construction"),
         )
+        self.tasks = tasks
         number = {task: i for i, task in enumerate(different)}
         index = torch.tensor([number[task] for task in self.tasks], device=self.device)
 
@@ -216,7 +218,7 @@ class CTGraphEnv(EnvBase):
         return self._data(self._words(), is_init=resets)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict.get("action")
+        action = tensordict.get("action", None)
         if self.check_actions:
             self._check(action)
         self._tick.add_(1)
@@ -282,6 +284,7 @@ class CTGraphEnv(EnvBase):
 
     def _check(self, action: Tensor) -> None:
         spec = f"action must be int64 of shape {list(self.batch_size)} with values in 0..{self._max_branching}"
+        require((action is not None, f"{spec}, got none: a policy must write it before a step"))
         require(
             (action.dtype == torch.int64, f"{spec}, got dtype {action.dtype}"),
             (action.shape == self.batch_size, f"{spec}, got shape {list(action.shape)}"),

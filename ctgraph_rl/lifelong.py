@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -56,10 +56,10 @@ def learn_curriculum(
 
     Raises:
         ValueError: before any work, if a block's frames are not a multiple of the agent's rows.
-        FloatingPointError: if a loss is not finite; names block, frames and loss.
+        FloatingPointError: if a loss or weight is not finite; names it, block and frames.
     """
     log = RunLog() if log is None else log
-    check_frames(curriculum, agent.num_envs)
+    check_rows(curriculum, agent.num_envs)
     rows = [block.rows(agent.num_envs) for block in curriculum.blocks]
     env = CTGraphEnv(rows[0], seed=seed, task_pool=curriculum.tasks, device=device)
     frames = 0
@@ -68,11 +68,10 @@ def learn_curriculum(
         env.set_tasks(rows[number - 1])
         agent.start_task()
         for batch in collect(env, agent.policy, block.num_frames, agent.num_steps, agent.initial_state):
-            measurements = agent.learn(batch)
             frames += batch.numel()
+            measurements = _learn(agent, batch, number, frames)
             episodes = episode_means(batch["next"][batch["next", "done"].squeeze(-1)])
             log.append("training", block=number, frames=frames, **episodes, **measurements)
-            _require_finite(measurements, number, frames)
             if progress is not None:
                 progress.update(number, frames, episodes["return_mean"])
         agent.end_task()
@@ -80,12 +79,14 @@ def learn_curriculum(
     return log
 
 
-def check_frames(curriculum: Curriculum, num_envs: int) -> None:
+def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     """Refuse a curriculum whose blocks cannot be learned in whole steps of ``num_envs`` rows.
 
     Raises:
-        ValueError: names the block and the nearest possible numbers of frames.
+        ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
     """
+    for block in curriculum.blocks:
+        block.rows(num_envs)
     require(*(block.frame_rule(num_envs, f"block {i}") for i, block in enumerate(curriculum.blocks, 1)))
 
 
@@ -106,13 +107,14 @@ def collect(
         num_steps: steps in a batch.
         initial_state: gives the recurrent state that the rows start with.
     """
-    carried, state_keys = _start(env, initial_state)
+    start = _start(env, initial_state)
+    carried = env.reset().update(start)
     steps_left = num_frames // env.numel()
     while steps_left:
         steps = []
         with set_exploration_type(ExplorationType.RANDOM):
             for _ in range(min(num_steps, steps_left)):
-                step, carried = _act(env, policy, carried, state_keys)
+                step, carried = _act(env, policy, carried, start)
                 steps.append(step)
         steps_left -= len(steps)
         yield torch.stack(steps, dim=1)
@@ -157,29 +159,32 @@ def evaluate(
 
 def _first_episodes(env: CTGraphEnv, policy: Policy, initial_state: InitialState | None) -> TensorDict:
     """The end of each row's first episode."""
-    carried, state_keys = _start(env, initial_state)
+    start = _start(env, initial_state)
+    carried = env.reset().update(start)
     keys = ("episode_reward", "step_count", "outcome", "leaf")
     running, result = torch.ones(env.batch_size, dtype=torch.bool, device=env.device), None
     while running.any():
-        step, carried = _act(env, policy, carried, state_keys)
+        step, carried = _act(env, policy, carried, start)
         now = step["next"].select(*keys)
         result = now if result is None else torch.where(running, now, result)
         running &= ~step["next", "done"].squeeze(-1)
     return result
 
 
-def _start(env: CTGraphEnv, initial_state: InitialState | None) -> tuple[TensorDictBase, list[str]]:
-    """The first observations with the policy's recurrent state, and the keys of that state."""
-    state = TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
-    return env.reset().update(state), list(state.keys())
+def _start(env: CTGraphEnv, initial_state: InitialState | None) -> TensorDict:
+    """The recurrent state that every episode starts with; empty without memory."""
+    return TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
 
 
 def _act(
-    env: CTGraphEnv, policy: Policy, carried: TensorDictBase, state_keys: list[str]
+    env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """One step of every row, and what the next one starts from. The policy forgets where ``is_init`` is set."""
+    """One step of every row, and what the next one starts from: a new episode with the state of a start."""
     step, following = env.step_and_maybe_reset(policy(carried))
-    return step, following.update(step["next"].select(*state_keys))
+    if start.is_empty():
+        return step, following
+    state = step["next"].select(*start.keys())
+    return step, following.update(torch.where(following["is_init"].squeeze(-1), start, state))
 
 
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
@@ -189,7 +194,7 @@ def episode_means(ends: TensorDictBase) -> dict[str, Any]:
         ends: the data of the last step of each episode.
     """
     return {
-        "episodes": ends.numel(),
+        "episodes": ends.batch_size[0],
         "return_mean": ends["episode_reward"].double().mean().item(),
         "success_rate": (ends["outcome"] == OUTCOME_GOAL).double().mean().item(),
         "length_mean": ends["step_count"].double().mean().item(),
@@ -219,7 +224,14 @@ def _evaluate_all(
         log.append("evaluation", block=block, frames=frames, task=number, label=label, **episode_means(episodes))
 
 
-def _require_finite(measurements: Mapping[str, float], block: int, frames: int) -> None:
+def _learn(agent: Agent, batch: TensorDictBase, block: int, frames: int) -> dict[str, float]:
+    """Let the agent learn; what is not finite stops the run."""
+    where = f"in block {block} after {frames} frames; the run stops here"
+    try:
+        measurements = agent.learn(batch)
+    except FloatingPointError as error:
+        raise FloatingPointError(f"{error} {where}") from None
     for name, value in measurements.items():
         if not math.isfinite(value):
-            raise FloatingPointError(f"{name} is {value} in block {block} after {frames} frames; the run stops here")
+            raise FloatingPointError(f"{name} is {value} {where}")
+    return measurements

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
-from inspect import signature
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from ctgraph_rl.curriculum import Curriculum
 
 RESULTS = ("run.jsonl", "performance.csv", "metrics.json", "agent.pt")
-"""What a run writes into its directory, beside Hydra's ``.hydra``; ``metrics.json`` is complete when the run is."""
+"""What a run writes into its directory, beside ``.hydra``; ``metrics.json`` is there when the run is complete."""
+
+SPECS = ("observation_spec", "action_spec")
+"""Arguments of agents that come from the environment."""
 
 NOT_HASHED = ("overwrite",)
 """Keys of the configuration that do not change results."""
@@ -134,7 +137,7 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
 
     from ctgraph_rl import metrics
     from ctgraph_rl.env import CTGraphEnv
-    from ctgraph_rl.lifelong import check_frames, learn_curriculum
+    from ctgraph_rl.lifelong import check_rows, learn_curriculum
     from ctgraph_rl.log import RunLog, write_metrics, write_performance
     from ctgraph_rl.progress import ProgressBar
 
@@ -146,9 +149,10 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     curriculum = named(target(cfg, "curriculum")())
     env = CTGraphEnv(curriculum.tasks)
     agent = target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched).to(device)
-    check_frames(curriculum, agent.num_envs)
+    check_rows(curriculum, agent.num_envs)
     for name in RESULTS:
         (run_dir / name).unlink(missing_ok=True)
+    write_configuration(cfg, run_dir / ".hydra")
     log = RunLog(run_dir / "run.jsonl")
     log.append("run", **about(cfg, curriculum))
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames) as progress:
@@ -159,15 +163,30 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), curriculum.trained))
 
 
+def write_configuration(cfg: DictConfig, folder: Path) -> None:
+    """Write what Hydra writes, but only once nothing is refused any more."""
+    folder.mkdir(exist_ok=True)
+    OmegaConf.save(cfg, folder / "config.yaml")
+    if HydraConfig.initialized():
+        OmegaConf.save(HydraConfig.instance().cfg, folder / "hydra.yaml")
+        OmegaConf.save(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+
+
 def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     """What a group of the configuration builds, with its arguments bound.
 
     Raises:
         ValueError: for an argument that the target does not take; lists the choices.
     """
-    choices = signature(hydra.utils.get_object(cfg[group]["_target_"])).parameters
-    unknown = [key for key in cfg[group] if not str(key).startswith("_") and key not in choices]
-    require((not unknown, f"{group} has no {', '.join(unknown)}. Choices: {', '.join(choices)}"))
+    given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
+    parameters = signature(hydra.utils.get_object(cfg[group]["_target_"])).parameters
+    choices = [name for name in parameters if name not in SPECS]
+    unknown = [name for name in given if name not in choices]
+    missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
+    require(
+        (not unknown, f"{group} has no {', '.join(unknown)}. Choices: {', '.join(choices)}"),
+        (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
+    )
     return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
 
 

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from torch import Tensor
+
+from ctgraph_rl import values
 from ctgraph_rl.checks import as_tuple, is_int, is_real, require
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.observations import ImageSet, Observations, PaperImages
 from ctgraph_rl.rewards import Needle, RewardFn
+
+LARGEST_REWARD = 3.4e38
+"""Rewards are float32."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +54,7 @@ class Task:
             *self.observations.rules(self.graph),
             (last_id < room, too_few),
             (not (one_hot and varies), "read_noise and read_rotation must be 0 with one-hot observations"),
-            (is_real(self.goal_reward), f"goal_reward must be a finite number, got {self.goal_reward!r}"),
-            (is_real(self.fail_reward), f"fail_reward must be a finite number, got {self.fail_reward!r}"),
+            *(_reward_rule(name, getattr(self, name)) for name in ("goal_reward", "fail_reward")),
         )
         object.__setattr__(self, "goal_reward", float(self.goal_reward))
         object.__setattr__(self, "fail_reward", float(self.fail_reward))
@@ -68,6 +73,22 @@ class Task:
             leaf = leaf * self.graph.branching_factor + decision - 1
         return leaf
 
+    def optimal_value(self, gamma: float) -> float:
+        """The best expected discounted return from the home state; see `values.optimal_value`."""
+        return values.optimal_value(self, gamma)
+
+    def policy_value(self, policy: Tensor, gamma: float = 1.0) -> float:
+        """The expected discounted return of action probabilities per observation id; see `values.policy_value`."""
+        return values.policy_value(self, policy, gamma)
+
+    def success_prob(self, policy: Tensor) -> float:
+        """The probability that such a policy reaches the goal; see `values.success_prob`."""
+        return values.success_prob(self, policy)
+
+    def memoryless_ceiling(self, deterministic: bool = False) -> float:
+        """The best mean return of a policy that remembers nothing; see `values.memoryless_ceiling`."""
+        return values.memoryless_ceiling(self, deterministic)
+
     @property
     def image_seed(self) -> int | None:
         """The image seed of a `PaperImages` set, None for other sets."""
@@ -84,3 +105,8 @@ class Task:
             "wait_prob": f"p{self.graph.wait_prob:g}",
             "images": images,
         }
+
+
+def _reward_rule(name: str, value: object) -> tuple[bool, str]:
+    holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
+    return holds, f"{name} must be a finite number, got {value!r}; rewards are float32"

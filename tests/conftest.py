@@ -1,0 +1,62 @@
+"""What several test files use: configurations as a run composes them, and agents of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
+
+from ctgraph_rl import run
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.task import Task
+
+SMALL_AGENT = {
+    "lstm_ppo": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8"],
+    "dqn": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "agent.batch_size=32"],
+}
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Small networks gain nothing from more."""
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+
+
+@pytest.fixture
+def compose() -> Iterator[Callable[..., DictConfig]]:
+    """Composes a configuration from overrides, as the command line does."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(run.conf_dir(), version_base="1.3"):
+        yield lambda *overrides, **how: hydra.compose("config", overrides=list(overrides), **how)
+
+
+@pytest.fixture
+def build_agent(compose: Callable[..., DictConfig]) -> Callable[..., Any]:
+    """Builds ``conf/agent/NAME.yaml`` for tasks, with overrides; equal weights for every call."""
+
+    def build(name: str, tasks: Sequence[Task], *overrides: str) -> Any:
+        cfg = compose(f"agent={name}", *overrides)
+        env = CTGraphEnv(tasks)
+        torch.manual_seed(cfg.seed)
+        return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+
+    return build
+
+
+@pytest.fixture
+def small_agent(build_agent: Callable[..., Any]) -> Callable[..., Any]:
+    """As ``build_agent``, with a small network, few rows and short batches."""
+    return lambda name, tasks, *overrides: build_agent(name, tasks, *SMALL_AGENT[name], *overrides)
+
+
+@pytest.fixture(scope="session")
+def checkout() -> Path:
+    """The folder with the packages."""
+    return Path(__file__).resolve().parents[1]

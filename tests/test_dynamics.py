@@ -1,0 +1,246 @@
+import random
+from itertools import product
+
+import pytest
+import torch
+from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
+
+from ctgraph_rl.dynamics import (
+    STREAM_IMAGES,
+    STREAM_NOISE,
+    STREAM_STEP,
+    State,
+    TreeParams,
+    add_noise,
+    draw,
+    philox,
+    randint,
+    stays,
+    transition,
+)
+from ctgraph_rl.graph import CTGraph
+
+SHAPES = list(product((2, 3), (1, 2, 3)))
+
+KNOWN_ANSWERS = [
+    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    (
+        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+        (0xA4093822, 0x299F31D0),
+        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+    ),
+]
+"""Counter, key and output of Philox4x32-10, published with Random123 (Salmon et al. 2011)."""
+
+
+def philox_in_python(counter, key):
+    """Philox4x32-10 on Python's integers."""
+    c, k = list(counter), list(key)
+    for _ in range(10):
+        high0, low0 = divmod(0xD2511F53 * c[0], 2**32)
+        high1, low1 = divmod(0xCD9E8D57 * c[2], 2**32)
+        c = [high1 ^ c[1] ^ k[0], low1, high0 ^ c[3] ^ k[1], low0]
+        k = [(k[0] + 0x9E3779B9) % 2**32, (k[1] + 0xBB67AE85) % 2**32]
+    return tuple(c)
+
+
+def tree_params(b, d, num_rows, stay_below=0):
+    return TreeParams(*(torch.full((num_rows,), value) for value in (b, (b**d - 1) // (b - 1), stay_below)))
+
+
+def states_and_actions(b, d):
+    """Every state, the ways to fail included, with every action up to b + 1 and both wait draws."""
+    states = tree_states(b, d) + [(FAIL, path) for kind, path in tree_states(b, d) if kind == WAIT]
+    return list(product(states, range(b + 2), (False, True)))
+
+
+def as_tensors(b, d, cases):
+    """Plain states as the tensors of a batch."""
+    nodes = node_numbers(b, d)
+    kinds, numbers = zip(*((int(kind), nodes[path]) for kind, path in cases), strict=True)
+    return State(torch.tensor(kinds), torch.tensor(numbers))
+
+
+@pytest.mark.parametrize(("counter", "key", "expected"), KNOWN_ANSWERS)
+def test_philox_meets_the_published_known_answers(counter, key, expected):
+    words = philox(tuple(map(torch.tensor, counter)), tuple(map(torch.tensor, key)))
+
+    assert tuple(map(int, words)) == expected
+
+
+@pytest.mark.parametrize(("counter", "key", "expected"), KNOWN_ANSWERS)
+def test_the_plain_python_philox_meets_the_published_known_answers(counter, key, expected):
+    assert philox_in_python(counter, key) == expected
+
+
+def test_philox_equals_plain_python_on_random_words():
+    source = random.Random(0)
+    inputs = [[source.getrandbits(32) for _ in range(6)] for _ in range(500)]
+    expected = [list(philox_in_python(row[:4], row[4:])) for row in inputs]
+
+    columns = torch.tensor(inputs).unbind(-1)
+    words = torch.stack(philox(columns[:4], columns[4:]), -1)
+
+    assert words.tolist() == expected
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1, 2**32 + 7, 2**63 - 1])
+@pytest.mark.parametrize("tick", [0, 1, 2**32 - 1, 2**32 + 3, 2**62])
+def test_a_draw_is_a_philox_block_of_its_seed_row_tick_stream_and_block(seed, tick):
+    row, block, stream = 2**32 - 2, 2**28 - 1, STREAM_IMAGES
+    counter = (tick % 2**32, tick // 2**32, row, block + stream * 2**28)
+    expected = philox_in_python(counter, (seed % 2**32, seed // 2**32))
+
+    words = draw(torch.tensor(seed), torch.tensor(row), torch.tensor(tick), stream, block)
+
+    assert tuple(map(int, words)) == expected
+
+
+def test_no_two_draws_of_rows_ticks_streams_and_blocks_are_equal():
+    rows, ticks = torch.arange(64).view(-1, 1, 1), torch.arange(32).view(1, -1, 1)
+
+    words = [
+        torch.stack(draw(torch.tensor(1), rows, ticks, stream, torch.arange(4)), -1).view(-1, 4)
+        for stream in (STREAM_STEP, STREAM_NOISE, STREAM_IMAGES)
+    ]
+
+    assert len(torch.cat(words).unique(dim=0)) == 3 * 64 * 32 * 4
+
+
+@pytest.mark.parametrize("high", [2, 3, 7, 360, 2**31])
+def test_randint_splits_the_words_evenly_from_zero_to_high_exclusive(high):
+    second_value_from = -(-(2**32) // high)
+    words = torch.tensor([0, second_value_from - 1, second_value_from, 2**32 - 1])
+
+    values = randint(words, high)
+
+    assert values.tolist() == [0, 0, 1, high - 1]
+
+
+def test_randint_below_one_is_zero():
+    assert randint(torch.tensor([0, 2**32 - 1]), 1).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("wait_prob", "first_word", "second_word", "expected"),
+    [
+        (0.0, 0, 0, False),
+        (0.5, 2**31 - 1, 2**32 - 1, True),
+        (0.5, 2**31, 0, False),
+        (2**-63, 0, 1, True),
+        (2**-63, 0, 2, False),
+        (0.75, 3 * 2**30 - 1, 2**32 - 1, True),
+        (0.75, 3 * 2**30, 0, False),
+        (1 - 2**-53, 2**32 - 1, 2**32 - 1, False),
+    ],
+)
+def test_a_wait_draw_stays_for_exactly_the_share_p_of_all_words(wait_prob, first_word, second_word, expected):
+    tree = tree_params(2, 2, 1, int(wait_prob * 2**63))
+    words = (torch.tensor([first_word]), torch.tensor([second_word]), torch.zeros(1), torch.zeros(1))
+
+    assert stays(words, tree).tolist() == [expected]
+
+
+@pytest.mark.parametrize(("b", "d"), SHAPES)
+def test_every_state_and_action_leads_where_the_paper_says(b, d):
+    cases = states_and_actions(b, d)
+    expected = as_tensors(b, d, [tree_step(b, d, *case) for case in cases])
+    states, actions, stay = zip(*cases, strict=True)
+
+    after = transition(
+        as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree_params(b, d, len(cases))
+    )
+
+    assert torch.equal(after.state_type, expected.state_type)
+    assert torch.equal(after.node, expected.node)
+
+
+@pytest.mark.parametrize(("b", "d"), SHAPES)
+def test_as_many_states_can_be_reached_as_the_closed_form_counts(b, d):
+    reached, frontier = set(), {(int(HOME), 0)}
+    tree = tree_params(b, d, 1)
+
+    while frontier:
+        reached |= frontier
+        found = set()
+        for (kind, node), action in product(frontier, range(b + 1)):
+            state = State(torch.tensor([kind]), torch.tensor([node]))
+            after = transition(state, torch.tensor([action]), torch.tensor([False]), tree)
+            failed = int(after.state_type) == FAIL
+            found.add((int(FAIL), 0) if failed else (int(after.state_type), int(after.node)))
+        frontier = found - reached
+
+    assert len(reached) == CTGraph(b, d).num_states
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "expected"),
+    [
+        (HOME, 0, WAIT),
+        (HOME, 2, WAIT),
+        (WAIT, 0, DECISION),
+        (WAIT, 1, FAIL),
+        (DECISION, 0, FAIL),
+        (DECISION, 1, WAIT),
+        (DECISION, 2, WAIT),
+        (DECISION, 3, FAIL),
+        (END, 0, END),
+        (FAIL, 0, FAIL),
+    ],
+)
+def test_the_table_of_transitions_at_the_root_of_a_binary_tree(kind, action, expected):
+    state = State(torch.tensor([int(kind)]), torch.tensor([0]))
+
+    after = transition(state, torch.tensor([action]), torch.tensor([False]), tree_params(2, 2, 1))
+
+    assert after.state_type.tolist() == [expected]
+
+
+def test_rows_of_one_batch_may_have_trees_of_their_own():
+    tree = TreeParams(torch.tensor([2, 3, 3]), torch.tensor([3, 1, 4]), torch.zeros(3, dtype=torch.int64))
+    state = State(torch.full((3,), int(DECISION)), torch.tensor([1, 0, 0]))
+
+    after = transition(state, torch.tensor([3, 3, 3]), torch.zeros(3, dtype=torch.bool), tree)
+
+    assert after.state_type.tolist() == [FAIL, WAIT, WAIT]
+    assert after.node.tolist() == [1, 3, 3]
+
+
+def test_the_deepest_tree_has_no_overflow_on_the_way_to_its_last_leaf():
+    b, d = 2, 60
+    state, tree = State(torch.tensor([int(HOME)]), torch.tensor([0])), tree_params(b, d, 1)
+
+    for action in [0, 0, *[2, 0] * d]:
+        state = transition(state, torch.tensor([action]), torch.tensor([False]), tree)
+
+    assert (int(state.state_type), int(state.node)) == (END, 2**61 - 2)
+
+
+def test_the_transition_can_be_vmapped():
+    b, d = 2, 2
+    states, actions, stay = zip(*states_and_actions(b, d), strict=True)
+    arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree_params(b, d, len(states)))
+
+    mapped = torch.vmap(transition)(*arguments)
+
+    assert all(torch.equal(*pair) for pair in zip(mapped, transition(*arguments), strict=True))
+
+
+def test_draws_can_be_vmapped_over_rows():
+    rows, seed, tick = torch.arange(8), torch.tensor(3), torch.tensor(5)
+
+    mapped = torch.vmap(lambda row: torch.stack(draw(seed, row, tick, STREAM_STEP)))(rows)
+
+    assert torch.equal(mapped, torch.stack(draw(seed, rows, tick, STREAM_STEP), -1))
+
+
+def test_noise_uses_a_draw_of_its_own_for_every_pixel():
+    images = torch.zeros(2, 1, 8, 8, dtype=torch.uint8)
+    words = draw(torch.tensor(9), torch.tensor([[4], [5]]), torch.tensor([[6], [7]]), STREAM_NOISE, torch.arange(16))
+    expected = [(torch.stack(words, -1)[row].flatten() * (noise + 1)) >> 32 for row, noise in enumerate((10, 255))]
+
+    noisy = add_noise(images, torch.tensor(9), torch.tensor([4, 5]), torch.tensor([6, 7]), torch.tensor([10, 255]))
+
+    assert noisy.dtype == torch.uint8
+    assert torch.equal(noisy.flatten(1).long(), torch.stack(expected))

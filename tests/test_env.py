@@ -1,0 +1,697 @@
+import dataclasses
+from dataclasses import dataclass
+from itertools import product
+
+import pytest
+import torch
+from oracles import (
+    ALPHA,
+    DECISION,
+    END,
+    FAIL,
+    HOME,
+    WAIT,
+    PlainCTGraph,
+    act,
+    binomial_p_value,
+    confounding,
+    fully_observable,
+    is_uniform,
+    navigation,
+    one_hot,
+    optimal,
+    play,
+    record,
+    scripts,
+    surjective,
+    uniform,
+)
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import StepCounter, TransformedEnv, check_env_specs
+
+from ctgraph_rl import CTGraphEnv, OneHot, PaperImages
+from ctgraph_rl.env import NO_LEAF, OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_RUNNING
+from curricula.paper import ct_su_b1
+
+MIXED = [
+    surjective(2, 1, goal=(2,)),
+    surjective(2, 3, p=0.5, goal=(1, 2, 1)),
+    fully_observable(3, 2, goal=(3, 1)),
+    confounding(4, 1, p=0.9, goal=(4,), read_noise=9),
+    surjective(3, 2, goal=(2, 2), image_seed=2, read_rotation=20),
+]
+"""Tasks that differ in every field a batch may mix."""
+
+FAMILIES = {
+    "surjective": [surjective()] * 3,
+    "fully observable": [fully_observable()] * 3,
+    "fully observable b=3": [fully_observable(3, 2)] * 3,
+    "confounding": [confounding()] * 3,
+    "one-hot": [one_hot()] * 3,
+    "noise and rotation": [surjective(read_noise=20, read_rotation=30)] * 3,
+    "p > 0": [surjective(p=0.9)] * 3,
+    "mixed": MIXED,
+    "mixed one-hot": [one_hot(), one_hot(3, 3, images=OneHot(9))],
+    "84 pixels": [dataclasses.replace(surjective(), images=PaperImages(5, size=84))],
+}
+
+FORKS = [surjective(2, 2, goal=goal) for goal in product((1, 2), repeat=2)]
+"""The four goals of one graph."""
+
+KEYS = ("observation", "step_count", "episode_reward", "outcome", "leaf", "done", "terminated", "truncated", "is_init")
+STATE = ("state_type", "node", "observation_id", "_tick", "_step_count", "_episode_reward")
+
+
+@dataclass(frozen=True)
+class PathReward:
+    """A user's own reward: the leaf's number."""
+
+    def __call__(self, leaf, goal_leaf, branching_factor, depth):
+        return leaf.to(torch.float32)
+
+
+@pytest.mark.parametrize("tasks", FAMILIES.values(), ids=FAMILIES)
+def test_torchrl_finds_the_specs_of_every_family_in_order(tasks):
+    env = CTGraphEnv(tasks)
+
+    check_env_specs(env, break_when_any_done="both")
+
+
+def test_images_have_the_promised_keys_shapes_and_types():
+    env = CTGraphEnv([surjective()] * 3)
+
+    data = env.rollout(1)[:, 0]
+
+    expected = {
+        "observation": ((3, 1, 12, 12), torch.uint8),
+        "is_init": ((3, 1), torch.bool),
+        "step_count": ((3, 1), torch.int64),
+        "episode_reward": ((3, 1), torch.float32),
+        "outcome": ((3, 1), torch.uint8),
+        "leaf": ((3, 1), torch.int64),
+        "done": ((3, 1), torch.bool),
+        "terminated": ((3, 1), torch.bool),
+        "truncated": ((3, 1), torch.bool),
+    }
+    reward = {"reward": ((3, 1), torch.float32)}
+    assert env.batch_size == torch.Size([3])
+    assert (data["action"].shape, data["action"].dtype) == ((3,), torch.int64)
+    assert {k: (tuple(v.shape), v.dtype) for k, v in data["next"].items()} == expected | reward
+    assert {k: (tuple(v.shape), v.dtype) for k, v in env.reset().items()} == expected
+
+
+def test_one_hot_observations_are_vectors():
+    env = CTGraphEnv([one_hot(), one_hot()])
+
+    observation = env.reset()["observation"]
+
+    assert observation.dtype == torch.uint8
+    assert observation.tolist() == [[1, 0, 0, 0, 0], [1, 0, 0, 0, 0]]
+
+
+def test_one_hot_rows_are_padded_with_zeros_to_the_length_of_the_pool():
+    short, long = one_hot(images=OneHot(5)), one_hot(images=OneHot(7))
+    env = CTGraphEnv([short, short], task_pool=[short, long])
+
+    env.reset()
+    act(env, [0, 0])
+    observation = act(env, [0, 1])["observation"]
+
+    assert observation.tolist() == [[0, 0, 0, 1, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]]
+    assert env.observation_spec["observation"].shape == (2, 7)
+
+
+def test_the_action_spec_holds_the_wait_action_and_the_largest_branching_factor_of_the_pool():
+    env = CTGraphEnv([surjective(2)], task_pool=[surjective(2), surjective(5)])
+
+    assert env.action_spec.n == 6
+    assert env.action_spec.shape == (1,)
+    assert env.action_spec.dtype == torch.int64
+
+
+def test_the_hidden_markov_state_is_not_in_the_data():
+    env = CTGraphEnv([fully_observable()] * 2)
+
+    keys = {key[-1] if isinstance(key, tuple) else key for key in env.rollout(3).keys(True, True)}
+
+    assert keys == {
+        *("observation", "action", "reward", "done", "terminated", "truncated"),
+        *("is_init", "step_count", "episode_reward", "outcome", "leaf"),
+    }
+
+
+def test_every_image_set_is_held_once():
+    tasks = [surjective(goal=goal, image_seed=seed) for goal in ((1, 1), (2, 2)) for seed in (1, 2)]
+    turned = surjective(image_seed=1, read_rotation=3)
+
+    rows = [len(CTGraphEnv(pool)._bank) for pool in (tasks[:1] * 9, tasks, [*tasks, turned])]
+
+    assert rows == [5, 10, 10 + 5 * 4]
+
+
+@pytest.mark.parametrize(("b", "d"), [(2, 1), (2, 2), (3, 2), (2, 4), (4, 3), (2, 16), (2, 60)])
+def test_the_optimal_policy_gets_exactly_one_in_exactly_two_times_d_plus_one_steps(b, d):
+    goals = [(1,) * d, (b,) * d, tuple(1 + i % b for i in range(d))]
+    env = CTGraphEnv([surjective(b, d, goal=goal) for goal in goals])
+
+    last = play(env, optimal)
+
+    assert last["episode_reward"].flatten().tolist() == [1.0, 1.0, 1.0]
+    assert last["step_count"].flatten().tolist() == [2 * (d + 1)] * 3
+    assert last["outcome"].flatten().tolist() == [OUTCOME_GOAL] * 3
+    assert last["leaf"].flatten().tolist() == [task.goal_leaf for task in env.tasks]
+
+
+@pytest.mark.parametrize(("b", "d"), [(2, 3), (3, 2)])
+def test_the_optimal_policy_reaches_every_goal(b, d):
+    env = CTGraphEnv([surjective(b, d, goal=goal) for goal in product(range(1, b + 1), repeat=d)])
+
+    last = play(env, optimal)
+
+    assert last["leaf"].flatten().tolist() == list(range(b**d))
+    assert last["episode_reward"].sum() == b**d
+
+
+@pytest.mark.parametrize("p", [0.5, 0.9])
+def test_an_optimal_episode_with_waiting_still_gets_exactly_one(p):
+    env = CTGraphEnv([surjective(2, 2, p, goal=(1, 2))] * 500, seed=1, check_actions=False)
+
+    last = play(env, optimal)
+
+    assert last["episode_reward"].unique().tolist() == [1.0]
+    assert last["step_count"].min() >= 6
+
+
+@pytest.mark.parametrize("p", [0.5, 0.9])
+def test_the_waiting_of_an_optimal_episode_is_as_long_as_e_rho(p):
+    task, rows = surjective(2, 2, p, goal=(1, 2)), 20_000
+    env = CTGraphEnv([task] * rows, seed=1, check_actions=False)
+
+    steps = play(env, navigation(seed=1))["step_count"].sum().item()
+
+    # 3 * rows escapes need a negative binomial number of tries: escapes among the tries are binomial(tries, 1 - p)
+    tries = steps - 3 * rows
+    assert task.graph.expected_episode_length == pytest.approx(3 / (1 - p) + 3)
+    assert binomial_p_value(3 * rows, tries, 1 - p) >= ALPHA
+
+
+@pytest.mark.parametrize(("b", "d", "p"), [(2, 2, 0.0), (3, 2, 0.0), (2, 4, 0.5)])
+def test_a_navigation_policy_gets_the_reward_with_probability_b_to_the_minus_d(b, d, p):
+    rows = 50_000
+    env = CTGraphEnv([surjective(b, d, p, goal=(b,) * d)] * rows, seed=1, check_actions=False)
+
+    last = play(env, navigation(seed=2))
+
+    assert (last["outcome"] >= OUTCOME_OTHER_END).all()
+    assert binomial_p_value(int(last["episode_reward"].sum()), rows, b**-d) >= ALPHA
+    assert is_uniform(torch.bincount(last["leaf"].flatten()).tolist())
+
+
+@pytest.mark.parametrize(
+    ("task", "prob"),
+    [(ct_su_b1((1, 2)), 1 / 243), (surjective(2, 2, 0.5, goal=(2, 1)), 3 / 3375), (surjective(3, 1, 0.5), 1 / 196)],
+    ids=["CT-SU-B1", "p=.5", "b=3"],
+)
+def test_a_uniformly_random_policy_gets_the_reward_with_probability_p_r(task, prob):
+    rows, batches, ends = 100_000, 4, task.graph.num_end_states
+    env = CTGraphEnv([task] * rows, seed=1, check_actions=False)
+
+    outcomes = torch.cat([play(env, uniform(seed))["outcome"] for seed in range(batches)])
+
+    goals, arrivals = (outcomes == OUTCOME_GOAL).sum().item(), (outcomes >= OUTCOME_OTHER_END).sum().item()
+    assert task.graph.reward_prob_random == pytest.approx(prob, rel=1e-12)
+    assert binomial_p_value(goals, rows * batches, prob) >= ALPHA / 2
+    assert binomial_p_value(arrivals, rows * batches, ends * prob) >= ALPHA / 2
+
+
+def test_every_row_follows_the_papers_tree_for_any_actions():
+    tasks = [surjective(b, d, goal=(b, *[1] * (d - 1))) for b in (2, 3, 4) for d in (1, 2, 3)]
+    env, rows, outcomes = CTGraphEnv(tasks), [PlainCTGraph(task) for task in tasks], set()
+    data = env.reset()
+
+    for actions in scripts(300, 9, num_actions=5):
+        step, data = env.step_and_maybe_reset(data.set("action", actions))
+        expected = [row.step(action) for row, action in zip(rows, actions.tolist(), strict=True)]
+        for row, now in zip(rows, expected, strict=True):
+            if now["done"]:
+                row.reset()
+            outcomes.add(now["outcome"])
+
+        assert {key: [now[key] for now in expected] for key in expected[0]} == {
+            key: step["next", key].flatten().tolist() for key in expected[0]
+        }
+        assert env.state_type.tolist() == [row.state[0] for row in rows]
+        assert env.node.tolist() == [row.numbers[row.state[1]] for row in rows]
+        assert data["is_init"].flatten().tolist() == [now["done"] for now in expected]
+    assert outcomes == {OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL}
+
+
+def test_outcome_and_leaf_tell_fail_other_ends_and_the_goal_apart():
+    env = CTGraphEnv([surjective(2, 2, goal=(2, 1))] * 4)
+    env.reset()
+
+    data = [act(env, a) for a in ([0] * 4, [0] * 4, [2, 2, 1, 1], [0] * 4, [1, 2, 2, 1], [0, 0, 0, 2])]
+
+    assert [step["outcome"].sum().item() for step in data[:-1]] == [OUTCOME_RUNNING] * 5
+    assert [step["leaf"].unique().item() for step in data[:-1]] == [NO_LEAF] * 5
+    assert data[-1]["outcome"].flatten().tolist() == [OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_OTHER_END, OUTCOME_FAIL]
+    assert data[-1]["leaf"].flatten().tolist() == [2, 3, 1, NO_LEAF]
+
+
+def test_the_codes_of_outcomes_are_those_of_the_documentation():
+    assert (OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL, NO_LEAF) == (0, 1, 2, 3, -1)
+
+
+@pytest.mark.parametrize("action", [1, 2])
+def test_an_action_other_than_wait_at_a_wait_state_fails(action):
+    env = CTGraphEnv([surjective()])
+    env.reset()
+    act(env, [0])
+
+    last = act(env, [action])
+
+    assert (last["outcome"].item(), last["terminated"].item(), env.state_type.item()) == (OUTCOME_FAIL, True, FAIL)
+
+
+def test_a_wait_action_at_a_decision_state_fails():
+    env = CTGraphEnv([surjective()])
+    env.reset()
+    act(env, [0])
+    act(env, [0])
+
+    last = act(env, [0])
+
+    assert (last["outcome"].item(), last["terminated"].item(), env.state_type.item()) == (OUTCOME_FAIL, True, FAIL)
+
+
+@pytest.mark.parametrize("action", [0, 1, 2])
+def test_any_action_leaves_home(action):
+    env = CTGraphEnv([surjective()])
+    env.reset()
+
+    last = act(env, [action])
+
+    assert (env.state_type.item(), last["outcome"].item(), last["step_count"].item()) == (WAIT, OUTCOME_RUNNING, 1)
+
+
+def test_an_action_above_a_rows_own_branching_factor_fails_where_it_is_legal_for_another():
+    env = CTGraphEnv([surjective(2, 1), surjective(3, 1)])
+    env.reset()
+    act(env, [3, 3])
+    act(env, [0, 0])
+
+    last = act(env, [3, 3])
+
+    assert last["outcome"].flatten().tolist() == [OUTCOME_FAIL, OUTCOME_RUNNING]
+    assert env.state_type.tolist() == [FAIL, WAIT]
+
+
+def test_the_fail_reward_is_paid_once_on_entering_the_fail_state():
+    env = CTGraphEnv([dataclasses.replace(surjective(), fail_reward=-0.5)], check_actions=False)
+    env.reset()
+
+    steps = [act(env, [action]) for action in (0, 2, 0, 1)]
+
+    assert [step["reward"].item() for step in steps] == [0.0, -0.5, 0.0, 0.0]
+    assert [step["episode_reward"].item() for step in steps] == [0.0, -0.5, -0.5, -0.5]
+
+
+def test_the_goal_reward_is_paid_once_on_entering_the_goal():
+    env = CTGraphEnv([dataclasses.replace(surjective(2, 1), goal_reward=2.5, fail_reward=-1.0)], check_actions=False)
+    env.reset()
+
+    steps = [act(env, [action]) for action in (0, 0, 1, 0, 0, 1)]
+
+    assert [step["reward"].item() for step in steps] == [0.0, 0.0, 0.0, 2.5, 0.0, 0.0]
+    assert [step["terminated"].item() for step in steps] == [False, False, False, True, True, True]
+
+
+def test_rows_may_have_rewards_of_their_own():
+    paths = dataclasses.replace(surjective(2, 2, goal=(2, 1)), reward_fn=PathReward(), goal_reward=0.5)
+    env = CTGraphEnv([surjective(2, 2, goal=(2, 2)), paths, surjective(2, 2, goal=(1, 1))])
+    env.reset()
+
+    for action in (0, 0, 2, 0, 2):
+        act(env, [action] * 3)
+    last = act(env, [0, 0, 0])
+
+    assert last["reward"].flatten().tolist() == [1.0, 1.5, 0.0]
+    assert last["outcome"].flatten().tolist() == [OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_OTHER_END]
+
+
+def test_the_terminal_observation_is_the_image_of_the_end_state():
+    task = fully_observable(2, 2, goal=(2, 1))
+    env = CTGraphEnv([task])
+
+    actions = torch.tensor([0, 0, 2, 0, 1, 0]).view(-1, 1)
+    data = record(env, actions)
+
+    shown = data["next", "observation"][0, :, 0]
+    assert data["next", "done"].flatten().tolist() == [False] * 5 + [True]
+    assert torch.equal(shown, task.images.images[[2, 9, 4, 11, 7, 14]])
+    assert env.state_type.item() == HOME
+
+
+def test_the_terminal_observation_of_a_failed_episode_is_the_fail_image():
+    task = surjective()
+    env = CTGraphEnv([task])
+
+    data = record(env, torch.tensor([[0], [1]]))
+
+    assert torch.equal(data["next", "observation"][0, 1, 0], task.images.images[1])
+
+
+def test_is_init_marks_the_first_observation_of_each_episode():
+    env = CTGraphEnv([surjective(2, 1)])
+
+    data = record(env, torch.tensor([[0], [0], [1], [0], [0], [1], [0]]))
+
+    assert data["is_init"].flatten().tolist() == [True, False, False, False, True, False, True]
+    assert data["next", "is_init"].any().item() is False
+    assert data["step_count"].flatten().tolist() == [0, 1, 2, 3, 0, 1, 0]
+    assert data["next", "step_count"].flatten().tolist() == [1, 2, 3, 4, 1, 2, 1]
+    assert data["next", "episode_reward"].flatten().tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    assert data["episode_reward"].flatten().tolist() == [0.0] * 7
+
+
+def test_recorded_data_do_not_change_with_later_steps():
+    env = CTGraphEnv(MIXED)
+    data = env.reset()
+    before = data.clone()
+
+    record(env, scripts(20, 5), data.clone())
+
+    assert (data == before).all()
+
+
+def test_the_flags_of_a_step_share_no_memory():
+    env = CTGraphEnv([surjective()])
+    env.reset()
+
+    data = act(env, [0])
+
+    assert len({data[flag].data_ptr() for flag in ("done", "terminated", "truncated", "is_init")}) == 4
+
+
+def test_a_partial_reset_leaves_the_other_rows_bit_identical():
+    env = CTGraphEnv([confounding(p=0.5, read_noise=50, read_rotation=40)] * 4, seed=1)
+    env.reset()
+    data = act(env, [0] * 4)
+    state = {name: getattr(env, name).clone() for name in STATE}
+    mask = torch.tensor([True, False, False, True])
+
+    after = env.reset(data.clone().set("_reset", mask.unsqueeze(-1)))
+
+    assert all((after[key] == data[key])[~mask].all() for key in KEYS)
+    assert all(torch.equal(getattr(env, name)[~mask], state[name][~mask]) for name in STATE)
+    assert env.state_type[mask].tolist() == [HOME, HOME] and env.state_type[~mask].tolist() == [WAIT, WAIT]
+    assert after["is_init"].flatten().tolist() == [True, False, False, True]
+
+
+def test_a_partial_reset_does_not_change_the_future_of_the_other_rows():
+    tasks, actions = [confounding(p=0.5, read_noise=50)] * 4, scripts(30, 4)
+    env, undisturbed = CTGraphEnv(tasks, seed=1), CTGraphEnv(tasks, seed=1)
+    mask = torch.tensor([[True], [False], [False], [True]])
+    disturbed = env.reset(act(env, [0] * 4, env.reset()).clone().set("_reset", mask))
+
+    data = record(env, actions, disturbed.exclude("reward"))
+    expected = record(undisturbed, actions, act(undisturbed, [0] * 4, undisturbed.reset()).exclude("reward"))
+
+    assert (data["next"] == expected["next"])[1:3].all()
+    assert not (data["next"] == expected["next"])[[0, 3]].all()
+
+
+@pytest.mark.parametrize("steps", range(1, 7))
+def test_a_reset_at_any_moment_starts_a_whole_new_episode(steps):
+    env = CTGraphEnv([dataclasses.replace(surjective(2, 2, goal=(2, 1)), fail_reward=-1.0)])
+    for action in ([0, 0, 2, 0, 1, 0], [0, 0, 2, 0, 1, 1], [0, 0, 2, 2], [0, 1]):
+        env.reset()
+        for a in action[:steps]:
+            act(env, [a])
+        start = env.reset()
+
+        assert (env.state_type.item(), env.node.item(), env.observation_id.item()) == (HOME, 0, 0)
+        assert (start["step_count"].item(), start["episode_reward"].item()) == (0, 0.0)
+        assert (start["outcome"].item(), start["leaf"].item(), start["done"].item()) == (
+            OUTCOME_RUNNING,
+            NO_LEAF,
+            False,
+        )
+        assert play(env, optimal)["step_count"].item() == 6
+
+
+def test_set_tasks_changes_the_tasks_in_place():
+    env = CTGraphEnv([FORKS[0], FORKS[3]], task_pool=FORKS)
+    buffers = {name: buffer.data_ptr() for name, buffer in env.named_buffers()}
+
+    env.set_tasks([FORKS[1], FORKS[2]])
+    last = play(env, optimal)
+
+    assert env.tasks == (FORKS[1], FORKS[2])
+    assert last["leaf"].flatten().tolist() == [1, 2]
+    assert last["episode_reward"].flatten().tolist() == [1.0, 1.0]
+    assert {name: buffer.data_ptr() for name, buffer in env.named_buffers()} == buffers
+
+
+def test_set_tasks_may_change_every_field_that_a_batch_may_mix():
+    env = CTGraphEnv(MIXED)
+
+    env.set_tasks(MIXED[::-1])
+    changed = record(env, scripts(50, 5))
+
+    fresh = CTGraphEnv(MIXED[::-1])
+    assert (changed == record(fresh, scripts(50, 5))).all()
+
+
+def test_set_tasks_ends_all_episodes():
+    env = CTGraphEnv(FORKS)
+    env.reset()
+    act(env, [0] * 4)
+
+    env.set_tasks(FORKS)
+
+    with pytest.raises(ValueError, match=r"rows \[0, 1, 2, 3\] are done: reset them first"):
+        act(env, [0] * 4)
+    assert env.reset()["is_init"].all() and act(env, [0] * 4)["step_count"].tolist() == [[1]] * 4
+
+
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        ([FORKS[0], surjective(2, 3)], "set_tasks got tasks that are not in task_pool: .*name them at construction"),
+        ([FORKS[0]], "set_tasks needs one task per row, 2 in all, got 1"),
+        ([FORKS[0]] * 3, "set_tasks needs one task per row, 2 in all, got 3"),
+        ([], "set_tasks needs one task per row, 2 in all, got 0"),
+    ],
+)
+def test_set_tasks_refuses_what_does_not_fit(tasks, message):
+    env = CTGraphEnv(FORKS[:2], task_pool=FORKS)
+
+    with pytest.raises(ValueError, match=message):
+        env.set_tasks(tasks)
+
+
+def test_a_refused_set_tasks_leaves_the_environment_as_it_was():
+    env = CTGraphEnv(FORKS[:2])
+    env.reset()
+
+    with pytest.raises(ValueError, match="not in task_pool"):
+        env.set_tasks(FORKS[2:])
+
+    assert env.tasks == tuple(FORKS[:2])
+    assert act(env, [0, 0])["step_count"].flatten().tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tasks": []}, "tasks must hold at least one task, got none"),
+        ({"task_pool": []}, "task_pool"),
+        ({"task_pool": FORKS[1:]}, "set_tasks got tasks that are not in task_pool"),
+        ({"seed": -1}, r"seed must be an integer in \[0, 2\*\*63\), got -1"),
+        ({"seed": 2**63}, r"seed must be an integer in \[0, 2\*\*63\), got 9223372036854775808"),
+        ({"seed": 0.5}, r"seed must be an integer in \[0, 2\*\*63\), got 0\.5"),
+        ({"first_row": -1}, r"rows must be numbered in \[0, 2\*\*32\), got first_row=-1"),
+        ({"first_row": 2**32}, r"rows must be numbered in \[0, 2\*\*32\), got first_row=4294967296"),
+    ],
+)
+def test_constructor_arguments_out_of_range_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CTGraphEnv(**({"tasks": FORKS[:1]} | arguments))
+
+
+def test_the_last_row_number_and_the_largest_seed_are_accepted():
+    env = CTGraphEnv([confounding(read_noise=5)] * 2, seed=2**63 - 1, first_row=2**32 - 2)
+
+    data = record(env, scripts(20, 2))
+
+    assert not (data[0] == data[1]).all()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [dataclasses.replace(surjective(), images=PaperImages(5, size=16)), one_hot()],
+    ids=["image sizes", "images and one-hot"],
+)
+def test_observations_of_different_shapes_are_refused_in_one_batch(other):
+    message = "all tasks of a batch must show observations of one shape, got"
+
+    with pytest.raises(ValueError, match=message):
+        CTGraphEnv([surjective(), other])
+    with pytest.raises(ValueError, match=message):
+        CTGraphEnv([surjective()], task_pool=[surjective(), other])
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = CTGraphEnv([surjective()] * 2)
+
+    with pytest.raises(ValueError, match=r"rows \[0, 1\] are done: reset them first"):
+        act(env, [0, 0])
+
+
+def test_a_step_of_a_finished_row_is_refused():
+    env = CTGraphEnv([surjective()] * 2)
+    env.reset()
+    act(env, [0, 0])
+    act(env, [0, 1])
+
+    with pytest.raises(ValueError, match=r"rows \[1\] are done: reset them first"):
+        act(env, [1, 0])
+
+
+@pytest.mark.parametrize(
+    ("action", "got"),
+    [
+        (torch.tensor([0, 3]), r"got \[3\]"),
+        (torch.tensor([-1, 0]), r"got \[-1\]"),
+        (torch.tensor([[0], [0]]), r"got shape \[2, 1\]"),
+        (torch.tensor([[1, 0, 0], [1, 0, 0]]), r"got shape \[2, 3\]"),
+        (torch.tensor([0.0, 1.0]), "got dtype torch.float32"),
+        (torch.tensor([0.0, float("nan")]), "got dtype torch.float32"),
+        (torch.tensor([0, 1], dtype=torch.int32), "got dtype torch.int32"),
+        (torch.tensor([False, True]), "got dtype torch.bool"),
+    ],
+)
+def test_an_action_of_a_wrong_range_shape_or_type_is_refused_and_changes_nothing(action, got):
+    env = CTGraphEnv([surjective()] * 2)
+    env.reset()
+    state = {name: getattr(env, name).clone() for name in STATE}
+
+    with pytest.raises(ValueError, match=r"action must be int64 of shape \[2\] with values in 0\.\.2, " + got):
+        act(env, action)
+
+    assert all(torch.equal(getattr(env, name), value) for name, value in state.items())
+
+
+def test_a_missing_action_is_refused():
+    env = CTGraphEnv([surjective()] * 2)
+    data = env.reset()
+
+    with pytest.raises(ValueError, match="action"):
+        env.step(data)
+
+
+def test_unchecked_actions_are_trusted_and_fail_as_wrong_actions_do():
+    env = CTGraphEnv([surjective()] * 2, check_actions=False)
+    env.reset()
+    act(env, [0, 0])
+    act(env, [0, 0])
+
+    last = act(env, [7, 3])
+
+    assert env.state_type.tolist() == [FAIL, FAIL]
+    assert last["outcome"].flatten().tolist() == [OUTCOME_FAIL, OUTCOME_FAIL]
+
+
+def test_end_and_fail_states_are_absorbing_without_checks():
+    env = CTGraphEnv([surjective(2, 1)] * 2, check_actions=False)
+    env.reset()
+    for action in ([0, 0], [0, 1], [1, 0], [0, 0]):
+        act(env, action)
+
+    later = [act(env, [action] * 2) for action in (0, 1, 2)]
+
+    assert env.state_type.tolist() == [END, FAIL]
+    assert all(step["done"].all() and not step["reward"].any() for step in later)
+    assert [step["outcome"].flatten().tolist() for step in later] == [[OUTCOME_GOAL, OUTCOME_FAIL]] * 3
+
+
+def test_a_state_dict_of_the_middle_of_an_episode_resumes_bit_exactly():
+    tasks = [confounding(p=0.5, read_noise=50, read_rotation=40), *MIXED]
+    env, actions = CTGraphEnv(tasks, seed=1, first_row=3), scripts(60, 6)
+    env.reset()
+    data = act(env, [0] * 6).exclude("reward").clone()
+    state = {name: value.clone() for name, value in env.state_dict().items()}
+    expected = record(env, actions, data.clone())
+
+    resumed = CTGraphEnv(tasks, seed=99)
+    resumed.load_state_dict(state)
+
+    assert (record(resumed, actions, data.clone()) == expected).all()
+
+
+def test_a_step_counter_gives_a_time_limit():
+    env = TransformedEnv(CTGraphEnv([surjective()] * 3), StepCounter(max_steps=2))
+    waits = TensorDictModule(lambda leaf: torch.zeros(3, dtype=torch.int64), in_keys=["leaf"], out_keys=["action"])
+
+    check_env_specs(env)
+    data = env.rollout(4, waits)
+
+    assert data.shape == (3, 2)
+    assert data["next", "truncated"].squeeze(-1).tolist() == [[False, True]] * 3
+    assert data["next", "terminated"].any().item() is False
+
+
+def test_a_collector_collects_whole_episodes():
+    torch.manual_seed(0)
+    env = CTGraphEnv([surjective(2, 1, goal=(2,))] * 8)
+    collector = Collector(env, frames_per_batch=8 * 500, total_frames=8 * 500, auto_register_policy_transforms=True)
+
+    data = next(iter(collector))
+    collector.shutdown()
+
+    done, goal = data["next", "done"], data["next", "outcome"] == OUTCOME_GOAL
+    assert data.shape == (8, 500)
+    assert torch.equal(data["is_init"][:, 1:], done[:, :-1])
+    assert torch.equal(data["next", "episode_reward"] == 1, goal)
+    assert binomial_p_value(goal.sum().item(), done.sum().item(), 1 / 27) >= ALPHA
+
+
+def test_policies_given_the_unbatched_action_spec_act_on_the_whole_batch():
+    env = CTGraphEnv([surjective(2)] * 4)
+
+    assert env.action_spec_unbatched.shape == ()
+    assert env.action_spec_unbatched.n == 3
+
+
+def test_rows_of_a_mixed_batch_show_images_of_their_own_sets():
+    tasks = [surjective(image_seed=seed) for seed in (1, 2, 3)]
+    env = CTGraphEnv(tasks)
+
+    observation = env.reset()["observation"][:, 0]
+
+    assert torch.equal(observation, torch.stack([task.images.images[0] for task in tasks]))
+    assert len(observation.flatten(1).unique(dim=0)) == 3
+
+
+def test_a_decision_state_is_followed_by_the_wait_state_of_the_chosen_child():
+    env = CTGraphEnv([surjective(3, 2)] * 3)
+    env.reset()
+    act(env, [0] * 3)
+    act(env, [0] * 3)
+    kinds = env.state_type.tolist()
+
+    act(env, [1, 2, 3])
+
+    assert kinds == [DECISION] * 3
+    assert env.state_type.tolist() == [WAIT] * 3
+    assert env.node.tolist() == [1, 2, 3]
+
+
+def test_an_environment_takes_any_iterable_of_tasks():
+    env = CTGraphEnv(task for task in FORKS)
+
+    assert env.tasks == tuple(FORKS)
+    assert env.reset(TensorDict(batch_size=[4])).shape == (4,)

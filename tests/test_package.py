@@ -1,0 +1,76 @@
+"""The wheel: what is in it, and that it runs from an empty directory."""
+
+from __future__ import annotations
+
+import configparser
+import importlib.util
+import os
+import subprocess
+import sys
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+import ctgraph_rl
+
+TINY = ["curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8"]
+
+
+@pytest.fixture(scope="module")
+def wheel(checkout, tmp_path_factory) -> Path:
+    if importlib.util.find_spec("build") is None:
+        pytest.skip("needs the package build")
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(checkout)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(wheel, checkout):
+    found = set(zipfile.ZipFile(wheel).namelist())
+
+    code = {
+        str(path.relative_to(checkout))
+        for package in ("ctgraph_rl", "curricula", "baselines")
+        for path in (checkout / package).rglob("*.py")
+    }
+    conf = {f"ctgraph_rl/{path.relative_to(checkout)}" for path in (checkout / "conf").rglob("*.yaml")}
+    assert "ctgraph_rl/conf/config.yaml" in conf
+    assert code | conf | {"ctgraph_rl/py.typed"} <= found
+    rest = {name for name in found - code - conf if ".dist-info/" not in name}
+    assert rest <= {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
+
+
+def test_the_wheel_declares_version_licence_and_console_script(wheel):
+    files = zipfile.ZipFile(wheel)
+    info = next(name.split("/")[0] for name in files.namelist() if ".dist-info/" in name)
+
+    metadata = Parser().parsestr(files.read(f"{info}/METADATA").decode())
+    scripts = configparser.ConfigParser()
+    scripts.read_string(files.read(f"{info}/entry_points.txt").decode())
+
+    assert (metadata["Name"], metadata["Version"]) == ("ctgraph_rl", ctgraph_rl.__version__)
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert dict(scripts["console_scripts"]) == {"ctgraph-rl": "ctgraph_rl.run:main"}
+
+
+def test_the_wheel_runs_from_an_empty_directory_and_writes_only_under_runs(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    (tmp_path / "empty").mkdir()
+    env = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "PYTHONDONTWRITEBYTECODE": "1"}
+
+    result = subprocess.run(
+        [sys.executable, "-m", "ctgraph_rl.run", *TINY], cwd=tmp_path / "empty", env=env, capture_output=True, text=True
+    )
+
+    assert result.returncode == 0, result.stderr
+    assert "average performance" in result.stdout and "results: " in result.stdout
+    (run_dir,) = (tmp_path / "empty" / "runs" / "su_b1_4tasks").iterdir()
+    assert run_dir.name.startswith("lstm_ppo-seed0-")
+    written = {path.name for path in run_dir.iterdir()}
+    assert written == {".hydra", "run.jsonl", "performance.csv", "metrics.json", "agent.pt"}
+    assert [path.name for path in (tmp_path / "empty").iterdir()] == ["runs"]

@@ -1,0 +1,96 @@
+"""Tables and figure of a run directory."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+from rich.console import Console
+
+from ctgraph_rl import RunLog, metrics, report
+from ctgraph_rl.log import write_metrics, write_performance
+
+LABELS = ("goal1.1", "goal1.2")
+
+
+@pytest.fixture
+def run_dir(tmp_path):
+    """What a run of two tasks leaves."""
+    log = RunLog(tmp_path / "run.jsonl")
+    for block, frames, returns in ((0, 0, (0.0, 0.25)), (1, 1024, (1.0, 0.5)), (2, 2048, (0.75, 1.0))):
+        if block:
+            log.append("training", block=block, frames=frames - 512, return_mean=float("nan"))
+            log.append("training", block=block, frames=frames, return_mean=0.5)
+        for task, (label, value) in enumerate(zip(LABELS, returns, strict=True), 1):
+            log.append("evaluation", block=block, frames=frames, task=task, label=label, return_mean=value)
+    log.close()
+    write_performance(tmp_path / "performance.csv", log, LABELS)
+    write_metrics(tmp_path / "metrics.json", metrics.summary(log.performance(), [(0,), (1,)]))
+    return tmp_path
+
+
+def shown(run_dir, width: int = 200) -> list[list[str]]:
+    """The cells of the printed tables, line by line."""
+    console = Console(file=io.StringIO(), width=width)
+    report.print_summary(run_dir, console)
+    lines = console.file.getvalue().splitlines()
+    return [[cell.strip() for cell in line.strip("│┃").replace("┃", "│").split("│")] for line in lines]
+
+
+def test_the_summary_shows_the_performance_matrix_and_every_metric(run_dir):
+    rows = shown(run_dir)
+
+    assert ["block", "frames", *LABELS] in rows
+    matrix = [["0", "0", "0.00", "0.25"], ["1", "1,024", "1.00", "0.50"], ["2", "2,048", "0.75", "1.00"]]
+    assert [row for row in rows if row in matrix] == matrix
+    assert ["average performance", "0.88", "1/T sum_j R[T,j]"] in rows
+    assert ["forward transfer", "0.25", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])"] in rows
+    assert ["backward transfer", "-0.25", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])"] in rows
+    assert ["forgetting", "0.25", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])"] in rows
+
+
+def test_an_undefined_metric_shows_why(run_dir):
+    log = RunLog.read(run_dir / "run.jsonl")
+    write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), [(1,), (0,)]))
+
+    rows = shown(run_dir)
+
+    reason = "the definition needs each task trained once, alone, in the order of the columns"
+    assert ["forgetting", "undefined", reason] in rows
+
+
+def test_a_figure_is_drawn_in_the_format_of_its_name(run_dir):
+    pytest.importorskip("matplotlib")
+
+    report.draw_figure(run_dir, run_dir / "figure.png")
+    report.draw_figure(run_dir, run_dir / "figure.svg")
+
+    assert (run_dir / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (run_dir / "figure.svg").read_text()
+
+
+def test_a_figure_without_matplotlib_names_what_to_install(run_dir, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+
+    with pytest.raises(ModuleNotFoundError, match=r"figures need matplotlib: pip install 'ctgraph_rl\[plot\]'"):
+        report.draw_figure(run_dir, run_dir / "figure.png")
+
+
+def test_the_command_prints_the_tables_of_a_run(run_dir, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["report", str(run_dir)])
+
+    report.main()
+
+    assert "goal1.2" in capsys.readouterr().out
+
+
+def test_a_folder_without_a_finished_run_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path)])
+
+    with pytest.raises(SystemExit) as end:
+        report.main()
+
+    assert end.value.code == 2
+    assert f"{tmp_path} is no finished run: it has no metrics.json" in capsys.readouterr().err

@@ -1,0 +1,300 @@
+"""The command line: what it writes, what it refuses, and that a seed decides a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import curricula
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, RunLog, evaluate
+from ctgraph_rl import run as run_module
+from ctgraph_rl.run import RESULTS, named, run, target
+from curricula.paper import ct_su_b1
+
+SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
+
+
+def command_line(monkeypatch, *arguments: str) -> int:
+    """The exit code of ``ctgraph-rl ARGUMENTS`` in this process."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *arguments])
+    try:
+        run_module.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def measured(run_dir: Path) -> list[dict]:
+    """The lines of a run's log without what may differ."""
+    return [{**m, "seconds": 0} for m in RunLog.read(run_dir / "run.jsonl").measurements]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """The folder in which a short run was made; its only run directory is ``finished.run_dir``."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        folder = tmp_path_factory.mktemp("finished")
+        monkeypatch.chdir(folder)
+        assert command_line(monkeypatch, *SHORT, "hydra.run.dir=out") == 0
+    return folder
+
+
+@pytest.fixture
+def copy_of(finished, tmp_path) -> Path:
+    """A finished run directory that a test may change."""
+    return Path(shutil.copytree(finished / "out", tmp_path / "out"))
+
+
+def test_a_run_writes_its_results_and_nothing_else(finished):
+    hydra_files = {".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"}
+
+    assert set(RESULTS) == {"run.jsonl", "performance.csv", "metrics.json", "agent.pt"}
+    assert files_in(finished) == {f"out/{name}" for name in {*hydra_files, *RESULTS}}
+
+
+def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished):
+    first = RunLog.read(finished / "out" / "run.jsonl").measurements[0]
+
+    published = curricula.load("su_b1_4tasks")
+    assert first["kind"] == "run"
+    assert (first["curriculum"], first["version"]) == ("su_b1_4tasks (modified)", published.version)
+    assert first["fingerprint"] == curricula.su_b1_4tasks(num_frames=1024).fingerprint != published.fingerprint
+    assert set(first["config"]) == {"curriculum", "agent", "seed", "device", "num_threads"}
+    assert first["config"]["curriculum"]["num_frames"] == 1024
+    assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}
+    assert (first["num_threads"], first["schema"]) == (1, 1)
+
+
+def test_the_files_of_a_run_agree_with_its_log(finished):
+    log = RunLog.read(finished / "out" / "run.jsonl")
+
+    header, *rows = (finished / "out" / "performance.csv").read_text().splitlines()
+    metrics = json.loads((finished / "out" / "metrics.json").read_text())
+
+    assert header == "block,frames,goal1.1,goal1.2,goal2.1,goal2.2"
+    assert [row.split(",")[:2] for row in rows] == [[str(i), str(1024 * i)] for i in range(5)]
+    assert [[float(value) for value in row.split(",")[2:]] for row in rows] == log.performance().tolist()
+    assert list(metrics) == ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
+    assert metrics["average_performance"]["value"] == pytest.approx(log.performance()[-1].mean().item(), abs=1e-12)
+    assert {m["episodes"] for m in log.of_kind("evaluation")} == {100}
+
+
+def test_the_saved_agent_performs_as_the_log_says(finished, compose):
+    log = RunLog.read(finished / "out" / "run.jsonl")
+    tasks = curricula.load("su_b1_4tasks").tasks
+    env = CTGraphEnv(tasks)
+    agent = target(compose(*SHORT), "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+
+    agent.load_state_dict(torch.load(finished / "out" / "agent.pt", weights_only=True))
+    result = evaluate(agent.policy, tasks, 20, initial_state=agent.initial_state)
+
+    assert result["episode_reward"].mean(dim=(1, 2)).tolist() == log.performance()[-1].tolist()
+
+
+def test_the_same_seed_gives_the_same_log_and_another_seed_another(finished, compose, tmp_path):
+    for seed in (0, 1):
+        (tmp_path / str(seed)).mkdir()
+        run(compose(*SHORT, f"seed={seed}"), tmp_path / str(seed))
+
+    first, again, other = measured(finished / "out"), measured(tmp_path / "0"), measured(tmp_path / "1")
+
+    assert first == again
+    assert [m for m in first if m["kind"] == "training"] != [m for m in other if m["kind"] == "training"]
+
+
+def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, monkeypatch):
+    monkeypatch.setattr(run_module, "learn", lambda *args: pytest.fail("ran again"))
+    before = {name: (copy_of / name).read_bytes() for name in RESULTS}
+
+    run(compose(*SHORT), copy_of)
+
+    shown = capsys.readouterr().out
+    assert "this run is complete; overwrite=true runs it again" in shown
+    assert "average performance" in shown and f"results: {copy_of}" in shown
+    assert {name: (copy_of / name).read_bytes() for name in RESULTS} == before
+
+
+@pytest.mark.parametrize(
+    ("override", "different"),
+    [
+        ("seed=1", "seed"),
+        ("agent.gamma=0.9", "agent"),
+        ("curriculum.image_seed=2", "curriculum"),
+        ("agent=dqn", "agent"),
+    ],
+)
+def test_another_configuration_is_refused_in_the_directory_of_a_run(copy_of, compose, override, different):
+    before = (copy_of / "run.jsonl").read_bytes()
+
+    with pytest.raises(FileExistsError, match=f"holds a run with another {different}; .*overwrite=true"):
+        run(compose(override, *SHORT), copy_of)
+
+    assert (copy_of / "run.jsonl").read_bytes() == before
+
+
+def test_an_unfinished_run_is_refused_and_kept(copy_of, compose):
+    (copy_of / "metrics.json").unlink()
+
+    with pytest.raises(FileExistsError, match=r"holds an unfinished run; .*overwrite=true"):
+        run(compose(*SHORT), copy_of)
+
+    assert (copy_of / "run.jsonl").exists()
+
+
+def test_overwrite_replaces_a_run(copy_of, compose):
+    run(compose(*SHORT, "seed=1", "overwrite=true"), copy_of)
+
+    assert [m["config"]["seed"] for m in RunLog.read(copy_of / "run.jsonl").of_kind("run")] == [1]
+    assert files_in(copy_of) == files_in(copy_of) | set(RESULTS)
+
+
+def test_a_refused_run_that_may_overwrite_leaves_the_old_results(copy_of, compose):
+    with pytest.raises(ValueError, match="hidden_size"):
+        run(compose(*SHORT, "agent.hidden_size=0", "overwrite=true"), copy_of)
+
+    assert set(RESULTS) <= files_in(copy_of)
+
+
+def test_only_a_changed_curriculum_is_named_modified(compose):
+    published = target(compose(), "curriculum")()
+    changed = target(compose("curriculum.image_seed=2"), "curriculum")()
+    own = Curriculum("mine", 1, "here", published.blocks)
+
+    assert named(published) == published
+    assert named(changed).name == "su_b1_4tasks (modified)"
+    assert named(changed).fingerprint == changed.fingerprint
+    assert named(own) == own
+
+
+REFUSED = [
+    (["curriculum=su_b2"], ["Could not find 'curriculum/su_b2'", "su_b1_4tasks"]),
+    (["agent=ppo"], ["Could not find 'agent/ppo'", "dqn", "lstm_ppo"]),
+    (["sed=1"], ["sed", "Choices: ", "seed", "num_threads", "overwrite"]),
+    (["agent.hidden=8"], ["hidden", "Choices: ", "hidden_size", "num_envs"]),
+    (["+agent.foo=1"], ["agent has no foo", "Choices: ", "hidden_size"]),
+    (["+curriculum.foo=1"], ["curriculum has no foo", "Choices: num_frames, image_seed"]),
+    (["seed=-1"], ["seed must be an integer in [0, 2**63), got -1"]),
+    (["seed=abc"], ["seed must be an integer in [0, 2**63), got 'abc'"]),
+    (["seed=1.5"], ["seed must be an integer in [0, 2**63), got 1.5"]),
+    (["device=bogus"], ["device must be one of cpu", "got 'bogus'"]),
+    (["num_threads=0"], ["num_threads must be an integer >= 1, got 0"]),
+    (["overwrite=1"], ["overwrite must be true or false, got 1"]),
+    (["curriculum.num_frames=1000"], ["num_frames=1000 of block 1 must be a multiple of num_envs=64", "960 or 1024"]),
+    (["curriculum.num_frames=0"], ["num_frames must be an integer >= 1, got 0"]),
+    (["curriculum.image_seed=abc"], ["seed", "'abc'"]),
+    (["agent.gamma=2"], ["gamma must be in [0, 1], got 2"]),
+    (["agent.hidden_size=wide"], ["hidden_size must be an integer >= 1, got 'wide'"]),
+    (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
+]
+
+
+@pytest.mark.parametrize(("overrides", "said"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
+def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_results(
+    monkeypatch, capsys, tmp_path, overrides, said
+):
+    monkeypatch.chdir(tmp_path)
+
+    code = command_line(monkeypatch, *SHORT, *overrides)
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert all(part in error for part in said), error
+    assert "Traceback" not in error
+    assert not any(Path(path).name in RESULTS for path in files_in(tmp_path))
+
+
+def test_an_argument_that_is_missing_is_one_message(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    code = command_line(monkeypatch, *SHORT, "~agent.gamma")
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert "gamma" in error and "Traceback" not in error
+
+
+def three_tasks_at_once() -> Curriculum:
+    return Curriculum("own", 1, "here", [Block((ct_su_b1((1, 1)), ct_su_b1((2, 2)), ct_su_b1((1, 2))), 1024)])
+
+
+def test_tasks_that_cannot_share_the_rows_leave_no_results(compose, tmp_path):
+    cfg = compose(*SHORT, "~curriculum.num_frames", "~curriculum.image_seed")
+    cfg.curriculum._target_ = f"{__name__}.three_tasks_at_once"
+
+    with pytest.raises(ValueError, match="num_envs=64 must be a multiple of the block's 3 tasks"):
+        run(cfg, tmp_path)
+
+    assert files_in(tmp_path) == set()
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_names_block_and_loss(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    code = command_line(monkeypatch, *SHORT, "agent.learning_rate=1e38")
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert "weight is nan in block 1 after 512 frames" in error and "Traceback" not in error
+
+
+def test_a_refused_configuration_does_not_change_what_is_recorded_of_a_run(finished, monkeypatch, tmp_path):
+    monkeypatch.chdir(shutil.copytree(finished, tmp_path / "copy"))
+    before = Path("out/.hydra/config.yaml").read_text()
+
+    code = command_line(monkeypatch, *SHORT, "hydra.run.dir=out", "seed=1")
+
+    assert code == 1
+    assert Path("out/.hydra/config.yaml").read_text() == before
+
+
+def test_a_multirun_makes_a_directory_for_every_agent(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    code = command_line(monkeypatch, "-m", "agent=lstm_ppo,dqn", *SHORT)
+
+    run_dirs = sorted(path.parent for path in tmp_path.rglob("metrics.json"))
+    assert code == 0
+    assert [path.name.split("-seed0-")[0] for path in run_dirs] == ["dqn", "lstm_ppo"]
+    assert {path.parent for path in run_dirs} == {tmp_path / "runs" / "su_b1_4tasks"}
+    assert all({*RESULTS} <= files_in(path) for path in run_dirs)
+    assert {Path(path).parts[0] for path in files_in(tmp_path)} == {"runs"}
+
+
+def test_the_name_of_a_run_holds_curriculum_agent_seed_and_what_else_changes_results(compose):
+    def directory(*overrides: str) -> str:
+        return compose("seed=3", *overrides, return_hydra_config=True).hydra.run.dir
+
+    plain, other, same = directory(), directory("agent.gamma=0.5"), directory("overwrite=true")
+
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{8}", plain)
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{8}", other)
+    assert other != plain
+    assert same == plain
+
+
+def test_a_folder_that_shadows_our_curricula_is_refused_with_its_path(checkout, tmp_path):
+    (tmp_path / "curricula").mkdir()
+    (tmp_path / "curricula" / "__init__.py").write_text("")
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+
+    result = subprocess.run(
+        [sys.executable, "-m", "ctgraph_rl.run", *SHORT], cwd=tmp_path, env=env, capture_output=True, text=True
+    )
+
+    assert result.returncode == 1
+    assert f"'curricula' was found in {tmp_path / 'curricula'}" in result.stderr
+    assert "Traceback" not in result.stderr and result.stdout == ""
+    assert not any(path.endswith("run.jsonl") for path in files_in(tmp_path))
