@@ -5,8 +5,10 @@ Soltoggio et al. 2023 (arXiv 2302.10887), sections 2 and 3, with the misprints t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
+from fractions import Fraction
 
 from ctgraph_rl.checks import is_int, is_real, require
 
@@ -77,24 +79,35 @@ class CTGraph:
         return self.num_wait_states + self.num_decision_states + self.num_end_states + 2
 
     @property
-    def _wait_passed_at_random(self) -> float:
-        """Probability that a uniformly random policy gets through one wait state."""
-        b, p = self.branching_factor, self.wait_prob
-        return (1 - p) / (b + 1 - p)
+    def _exact_reward_prob_random(self) -> Fraction:
+        """P_R without rounding, for the float that ``wait_prob`` is."""
+        b, p = self.branching_factor, Fraction(self.wait_prob)
+        return (b + 1) * ((1 - p) / ((b + 1) * (b + 1 - p))) ** (self.depth + 1)
 
     @property
     def reward_prob_random(self) -> float:
         """P_R: the probability that a uniformly random policy reaches one given end state.
 
-        (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form.
+        (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form, correctly rounded. Below the
+        smallest float it is 0.0: see `log_reward_prob_random`.
         """
-        b = self.branching_factor
-        return (b + 1) * (self._wait_passed_at_random / (b + 1)) ** (self.depth + 1)
+        return float(self._exact_reward_prob_random)
+
+    @property
+    def log_reward_prob_random(self) -> float:
+        """ln P_R, finite for every graph."""
+        b, p = self.branching_factor, self.wait_prob
+        return math.log(b + 1) + (self.depth + 1) * (math.log1p(-p) - math.log(b + 1) - math.log(b + 1 - p))
 
     @property
     def end_prob_random(self) -> float:
-        """P_E: the probability that a uniformly random policy reaches any end state, b^d P_R."""
-        return self.num_end_states * self.reward_prob_random
+        """P_E: the probability that a uniformly random policy reaches any end state, b^d P_R, correctly rounded."""
+        return float(self.num_end_states * self._exact_reward_prob_random)
+
+    @property
+    def log_end_prob_random(self) -> float:
+        """ln P_E, finite for every graph."""
+        return self.depth * math.log(self.branching_factor) + self.log_reward_prob_random
 
     @property
     def reward_prob_navigation(self) -> float:
@@ -103,8 +116,32 @@ class CTGraph:
 
     @property
     def expected_episode_length(self) -> float:
-        """E[rho]: mean steps of an episode that reaches an end state, (d + 1) / (1 - p) + d + 1."""
+        """E[rho]: mean steps to an end state, (d + 1) / (1 - p) + d + 1.
+
+        Of a policy that waits at every wait state. Episodes in which a policy that waits with probability a < 1
+        gets to an end state are shorter: they stay with probability a p instead of p.
+        """
         return (self.depth + 1) / (1 - self.wait_prob) + self.depth + 1
+
+    def episode_length_prob(self, length: int) -> float:
+        """P(rho = length): one step at home, d decisions, and d + 1 wait states left with probability 1 - p per step.
+
+        A negative binomial: C(w - 1, d) (1 - p)^(d+1) p^(w-d-1) for w = length - d - 1 steps in wait states. As
+        `expected_episode_length`, of a policy that waits at every wait state.
+
+        Args:
+            length: steps of an episode; 0.0 below the shortest episode, which has 2 (d + 1).
+
+        Raises:
+            ValueError: if ``length`` is not an integer.
+        """
+        require((is_int(length), f"length must be an integer, got {length!r}"))
+        waits, p = self.depth + 1, self.wait_prob
+        stays = length - 2 * waits
+        if stays < 0 or (p == 0 and stays > 0):
+            return 0.0
+        log_stays = stays * math.log(p) if stays else 0.0
+        return math.exp(math.log(math.comb(stays + waits - 1, stays)) + waits * math.log1p(-p) + log_stays)
 
     @property
     def expected_search_episodes(self) -> float:
