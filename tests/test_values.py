@@ -39,6 +39,14 @@ class Mixed:
         return torch.where(leaf == goal_leaf, 1.0, (leaf * 5 % 7 - 2) / 8)
 
 
+@dataclass(frozen=True)
+class LastDecision:
+    """Pays by the last decision and the depth."""
+
+    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
+        return leaf % branching_factor / (4 * depth).float()
+
+
 def make_task(
     b: int, d: int, p: float = 0.0, *, waits: int = 1, decisions: int = 1, unique: str = "", **fields
 ) -> Task:
@@ -454,7 +462,16 @@ def test_rows_of_home_end_and_fail_have_no_effect_and_float32_is_welcome():
     value = task.policy_value(policy)
 
     assert task.policy_value(other) == value
+    assert task.policy_value(policy.float()) == task.policy_value(policy.float().double())
     assert task.policy_value(policy.float()) == pytest.approx(value, rel=1e-6)
+
+
+def test_a_reward_gets_the_branching_factor_and_the_depth():
+    task = make_task(3, 2, 0.5, reward_fn=LastDecision(), goal_reward=2.0)
+
+    values = [task.policy_value(navigation(task)), task.optimal_value(1.0)]
+
+    assert values == pytest.approx([2 * (0 + 1 + 2) / 3 / 8, 2 * 2 / 8], rel=1e-14)
 
 
 def test_a_policy_of_certain_failure_gets_the_fail_reward_when_it_fails():
