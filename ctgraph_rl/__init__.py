@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
     from ctgraph_rl.graph import CTGraph as CTGraph
     from ctgraph_rl.graph import StateType as StateType
+    from ctgraph_rl.images import GroupedImages as GroupedImages
+    from ctgraph_rl.images import ImageFile as ImageFile
+    from ctgraph_rl.images import OneHot as OneHot
+    from ctgraph_rl.images import PaperImages as PaperImages
+    from ctgraph_rl.images import distances as distances
     from ctgraph_rl.lifelong import evaluate as evaluate
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
-    from ctgraph_rl.observations import OneHot as OneHot
-    from ctgraph_rl.observations import PaperImages as PaperImages
     from ctgraph_rl.rewards import Needle as Needle
     from ctgraph_rl.task import Task as Task
 
@@ -35,13 +38,16 @@ _HOMES = {
     "CTGraphEnv": "env",
     "Curriculum": "curriculum",
     "Evaluation": "curriculum",
+    "GroupedImages": "images",
+    "ImageFile": "images",
     "Needle": "rewards",
     "Observations": "observations",
-    "OneHot": "observations",
-    "PaperImages": "observations",
+    "OneHot": "images",
+    "PaperImages": "images",
     "RunLog": "log",
     "StateType": "graph",
     "Task": "task",
+    "distances": "images",
     "evaluate": "lifelong",
     "learn_curriculum": "lifelong",
 }

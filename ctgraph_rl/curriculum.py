@@ -142,9 +142,10 @@ class Curriculum:
 
 
 def _canonical(value: Any) -> Any:
-    """A value as plain JSON: dataclasses by name with the fields that differ from their defaults."""
+    """A value as plain JSON: dataclasses by name with the compared fields that differ from their defaults."""
     if is_dataclass(value) and not isinstance(value, type):
-        given = {f.name: getattr(value, f.name) for f in fields(value) if getattr(value, f.name) != _default(f)}
+        compared = [f for f in fields(value) if f.compare]
+        given = {f.name: getattr(value, f.name) for f in compared if getattr(value, f.name) != _default(f)}
         return {"type": type(value).__name__, **{name: _canonical(item) for name, item in given.items()}}
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]

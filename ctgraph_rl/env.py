@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,27 +14,15 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl import dynamics
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.dynamics import ObservationParams, State, TreeParams
+from ctgraph_rl.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Uses
 from ctgraph_rl.graph import StateType
-from ctgraph_rl.observations import ImageSet
+from ctgraph_rl.images import ImageSet
+from ctgraph_rl.render import render
 from ctgraph_rl.rewards import RewardFn
 from ctgraph_rl.task import Task
 
-OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)
-"""Values of ``("next", "outcome")``. Success means `OUTCOME_GOAL`, never a reward threshold."""
-
-NO_LEAF = -1
-"""Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
-
-
-class RewardParams(NamedTuple):
-    """What the reward needs to know of each row's task; [N]."""
-
-    goal_leaf: Tensor  # int64
-    depth: Tensor  # int64
-    goal_reward: Tensor  # float32
-    fail_reward: Tensor  # float32
-    reward_fn: Tensor  # int64: which of the environment's different reward functions
+PUBLIC_STATE = ("state_type", "node", "goal_leaf")
+"""Fields of a row's state that are buffers under their own name; the others start with an underscore."""
 
 
 class CTGraphEnv(EnvBase):
@@ -55,7 +44,8 @@ class CTGraphEnv(EnvBase):
     fails as a wrong one does. ``reward`` is float32 [N, 1], paid on entering an end or fail state. These states are
     terminal, as in the paper; ``truncated`` is always False (wrap in TorchRL's ``StepCounter`` for a time limit).
 
-    Buffers for tests and analysis, never in the data: ``state_type``, ``node``, ``observation_id`` (int64 [N]).
+    Buffers for tests and analysis, never in the data: ``state_type``, ``node``, ``goal_leaf``, ``observation_id``
+    (int64 [N]). For planners, `get_state` and ``reset(TensorDict(state=...), set_state=True)`` save and restore rows.
 
     Args:
         tasks: one task per row; ``[task] * 512`` trains on one task.
@@ -72,16 +62,18 @@ class CTGraphEnv(EnvBase):
 
     batch_locked = True
 
+    _supports_set_state = True
+
     state_type: Tensor
     node: Tensor
+    goal_leaf: Tensor
     observation_id: Tensor
     _seed_key: Tensor
-    _row: Tensor
     _tick: Tensor
-    _step_count: Tensor
-    _episode_reward: Tensor
-    _zeros: Tensor
+    _episodes_left: Tensor
+    _row: Tensor
     _bank: Tensor
+    _normal_table: Tensor
 
     def __init__(
         self,
@@ -92,6 +84,7 @@ class CTGraphEnv(EnvBase):
         device: torch.device | str = "cpu",
         check_actions: bool = True,
     ) -> None:
+        require((not isinstance(tasks, Task), "tasks must be a list with one Task per row, such as [task] * 512"))
         tasks = tuple(tasks)
         pool = tuple(dict.fromkeys(tasks if task_pool is None else task_pool))
         num_rows = len(tasks)
@@ -107,8 +100,10 @@ class CTGraphEnv(EnvBase):
         self._max_branching = max(task.graph.branching_factor for task in pool)
         self._image_shape, self._bank_start, bank = _shared_bank(pool)
         self._make_specs()
-        self._register_state(seed, first_row)
+        self._register_state(seed)
+        self.register_buffer("_row", torch.arange(first_row, first_row + num_rows, device=self.device))
         self.register_buffer("_bank", bank.to(self.device), persistent=False)
+        self.register_buffer("_normal_table", dynamics.normal_table().to(self.device), persistent=False)
         self.set_tasks(tasks)
 
     def _make_specs(self) -> None:
@@ -119,7 +114,7 @@ class CTGraphEnv(EnvBase):
             is_init=Binary(1, shape=(n, 1), dtype=torch.bool),
             step_count=Unbounded(shape=(n, 1), dtype=torch.int64),
             episode_reward=Unbounded(shape=(n, 1), dtype=torch.float32),
-            outcome=Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=(n, 1), dtype=torch.uint8),
+            outcome=Bounded(dynamics.OUTCOME_RUNNING, dynamics.OUTCOME_GOAL, shape=(n, 1), dtype=torch.uint8),
             leaf=Unbounded(shape=(n, 1), dtype=torch.int64),
             shape=(n,),
             device=device,
@@ -131,18 +126,13 @@ class CTGraphEnv(EnvBase):
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
         )
 
-    def _register_state(self, seed: int, first_row: int) -> None:
-        n, device = self.batch_size[0], self.device
-        zeros = torch.zeros(n, dtype=torch.int64, device=device)
-        self.register_buffer("_seed_key", torch.tensor(seed, device=device))
-        self.register_buffer("_row", zeros + torch.arange(first_row, first_row + n, device=device))
-        self.register_buffer("_tick", zeros.clone())
-        self.register_buffer("state_type", zeros.clone())
-        self.register_buffer("node", zeros.clone())
-        self.register_buffer("observation_id", zeros.clone())
-        self.register_buffer("_step_count", zeros.clone())
-        self.register_buffer("_episode_reward", torch.zeros(n, device=device))
-        self.register_buffer("_zeros", zeros, persistent=False)
+    def _register_state(self, seed: int) -> None:
+        self.register_buffer("_seed_key", torch.tensor(seed, device=self.device))
+        zeros = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
+        for field in RowState._fields:
+            dtype = torch.float32 if field in ("episode_reward", "reward") else torch.int64
+            self.register_buffer(_buffer(field), zeros.to(dtype, copy=True))
+        self.register_buffer("observation_id", zeros)
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
         """Give every row a task, in place. All episodes end: `reset` before the next step.
@@ -168,104 +158,172 @@ class CTGraphEnv(EnvBase):
         def rows(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
 
-        self._fill_params(different, rows)
+        self._params, self._uses = self._make_params(different, rows)
+        self.goal_leaf.copy_(rows([task.goal_leaf for task in different]))
         self.state_type.fill_(int(StateType.FAIL))
+        self._episodes_left.zero_()
 
-    def _fill_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> None:
-        graphs, observations = [task.graph for task in tasks], [task.observations for task in tasks]
-        self._tree = TreeParams(
+    def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
+        """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
+
+        Args:
+            goals: for every row its decisions in 1..b, or the numbers of end states, int64 [N].
+
+        Raises:
+            ValueError: if a goal is not one of its row's tree.
+        """
+        if not isinstance(goals, Tensor):
+            changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, goals, strict=True)]
+            goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
+        fits = goals.shape == self.batch_size and goals.dtype == torch.int64
+        require((fits, f"goals must be int64 of shape {list(self.batch_size)}, got {goals.dtype} {list(goals.shape)}"))
+        outside = (goals < 0) | (goals >= self._params.g.num_leaves)
+        require((not outside.any(), f"goals must be end states of the rows' trees, got {goals[outside][:5].tolist()}"))
+        self.goal_leaf.copy_(goals)
+
+    def _make_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> tuple[RowParams, Uses]:
+        """The rows' parameters from their different tasks, and what they have use for."""
+        reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
+        params = self._row_params(
+            self._tree_params(tasks, rows),
+            self._observation_params(tasks, rows),
+            self._reward_params(tasks, rows, reward_fns),
+        )
+        observations = [task.observations for task in tasks]
+        waits = any(task.graph.wait_prob > 0 for task in tasks)
+        views = any(_num_views(task) > 1 for task in tasks)
+        uses = Uses(
+            draws=waits or views or any(x.draws_ids for x in observations),
+            pixel_noise=any(x.read_noise for x in observations),
+            reward_noise=any(task.reward_std for task in tasks),
+            reward_cue=any(x.reward_cue for x in observations),
+            goal_change=any(task.goal_change for task in tasks),
+            max_depth=max(task.graph.depth for task in tasks),
+            reward_fns=reward_fns,
+        )
+        return params, uses
+
+    def _tree_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> TreeParams:
+        graphs = [task.graph for task in tasks]
+        return TreeParams(
             branching_factor=rows([graph.branching_factor for graph in graphs]),
             first_leaf=rows([graph.num_decision_states for graph in graphs]),
             stay_below=rows([int(graph.wait_prob * 2**63) for graph in graphs]),
         )
-        self._x = ObservationParams(
+
+    def _observation_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> ObservationParams:
+        observations = [task.observations for task in tasks]
+        first_leaves = [task.graph.num_decision_states for task in tasks]
+        return ObservationParams(
             first_id=rows([[x.ids(kind)[0] for kind in StateType] for x in observations]),
             num_ids=rows([[x.ids(kind)[1] - x.ids(kind)[0] + 1 for kind in StateType] for x in observations]),
             unique=rows([[x.is_unique(kind) for kind in StateType] for x in observations], torch.bool),
-            node_offset=rows(
-                [[(kind == StateType.END) * graph.num_decision_states for kind in StateType] for graph in graphs]
-            ),
+            node_offset=rows([[leaf * (kind == StateType.END) for kind in StateType] for leaf in first_leaves]),
             bank_start=rows([self._bank_start[_bank_key(task)] for task in tasks]),
-            num_angles=rows([x.read_rotation + 1 for x in observations]),
+            num_views=rows([_num_views(task) for task in tasks]),
             read_noise=rows([x.read_noise for x in observations]),
+            reward_cue=rows([x.reward_cue for x in observations], torch.bool),
         )
-        self._reward_fns: tuple[RewardFn, ...] = tuple(dict.fromkeys(task.reward_fn for task in tasks))
-        self._g = RewardParams(
-            goal_leaf=rows([task.goal_leaf for task in tasks]),
-            depth=rows([graph.depth for graph in graphs]),
+
+    def _reward_params(
+        self, tasks: tuple[Task, ...], rows: Callable[..., Tensor], reward_fns: tuple[RewardFn, ...]
+    ) -> RewardParams:
+        changes = [task.goal_change or (0, 0) for task in tasks]
+        return RewardParams(
+            depth=rows([task.graph.depth for task in tasks]),
+            num_leaves=rows([task.graph.num_end_states for task in tasks]),
+            reward_fn=rows([reward_fns.index(task.reward_fn) for task in tasks]),
             goal_reward=rows([task.goal_reward for task in tasks], torch.float32),
             fail_reward=rows([task.fail_reward for task in tasks], torch.float32),
-            reward_fn=rows([self._reward_fns.index(task.reward_fn) for task in tasks]),
+            step_reward=rows([task.step_reward for task in tasks], torch.float32),
+            reward_std=rows([task.reward_std for task in tasks], torch.float32),
+            multiplicative=rows([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
+            change_first=rows([first for first, _ in changes]),
+            change_last=rows([last for _, last in changes]),
         )
-        waits = any(graph.wait_prob > 0 for graph in graphs)
-        self._draws = waits or any(x.draws_ids or x.read_rotation for x in observations)
-        self._noisy = any(x.read_noise for x in observations)
+
+    @property
+    def branching_factor(self) -> Tensor:
+        """b of each row, int64 [N]."""
+        return self._params.tree.branching_factor
+
+    @property
+    def first_leaf(self) -> Tensor:
+        """Heap index of each row's first end state, int64 [N]: ``node - first_leaf`` is the number of an end state."""
+        return self._params.tree.first_leaf
+
+    @property
+    def num_end_states(self) -> Tensor:
+        """b^d of each row, int64 [N]."""
+        return self._params.g.num_leaves
+
+    @property
+    def max_depth(self) -> int:
+        """The largest depth of the rows."""
+        return self._uses.max_depth
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CTGraphEnv:
-        """Move the rows' parameters along with the buffers."""
+        """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
-        self._tree, self._x = TreeParams(*map(fn, self._tree)), ObservationParams(*map(fn, self._x))
-        self._g = RewardParams(*map(fn, self._g))
+        old = self._params
+        self._params = self._row_params(
+            TreeParams(*map(fn, old.tree)), ObservationParams(*map(fn, old.x)), RewardParams(*map(fn, old.g))
+        )
         return self
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+    def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
+        return RowParams(self._seed_key, self._row, tree, x, g, self._bank, self._normal_table)
+
+    def _state(self) -> RowState:
+        return RowState(*(getattr(self, _buffer(field)) for field in RowState._fields))
+
+    def _keep(self, state: RowState) -> None:
+        for field, value in zip(RowState._fields, state, strict=True):
+            getattr(self, _buffer(field)).copy_(value)
+
+    def get_state(self) -> TensorDict:
+        """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
+
+        It holds the hidden Markov state: a planner may see it, a policy may not. Rows of it may be put in any order, to
+        branch several rows off one; their further randomness is that of their own row numbers.
+        """
+        fields = {field: value.clone() for field, value in self._state()._asdict().items()}
+        return TensorDict(fields, batch_size=self.batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         resets = torch.ones_like(self.state_type, dtype=torch.bool) if mask is None else mask.view(-1)
-        self._tick.add_(resets)
-        self.state_type.masked_fill_(resets, int(StateType.HOME))
-        for buffer in (self.node, self._step_count, self._episode_reward):
-            buffer.masked_fill_(resets, 0)
-        return self._data(self._words(), is_init=resets)
+        given = tensordict.get("state", None) if set_state and tensordict is not None else None
+        if given is None:
+            state, shown = dynamics.reset(self._state(), resets, self._params, self._uses)
+        else:
+            kept = zip(self._state(), (given[field] for field in RowState._fields), strict=True)
+            state = RowState(*(torch.where(resets, new, old) for old, new in kept))
+            shown = dynamics.show(state, self._params, self._uses)
+        self._keep(state)
+        return self._data(state, shown, is_init=(state.step_count == 0) & resets)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict.get("action", None)
         if self.check_actions:
             self._check(action)
-        self._tick.add_(1)
-        words = self._words()
-        before = State(self.state_type, self.node)
-        after = dynamics.transition(before, action, dynamics.stays(words, self._tree), self._tree)
-        reward = self._reward(before.state_type, after)
-        self.state_type.copy_(after.state_type)
-        self.node.copy_(after.node)
-        self._step_count.add_(1)
-        self._episode_reward.add_(reward)
-        data = self._data(words, is_init=torch.zeros_like(self.state_type, dtype=torch.bool))
-        return data.set("reward", reward.unsqueeze(-1))
+        state, shown = dynamics.step(self._state(), action, self._params, self._uses)
+        self._keep(state)
+        data = self._data(state, shown, is_init=torch.zeros_like(shown.done))
+        return data.set("reward", state.reward.unsqueeze(-1).clone())
 
-    def _words(self) -> tuple[Tensor, ...]:
-        """The row's random words at its tick; zeros where no row of the batch has any use for them."""
-        if not self._draws:
-            return (self._zeros,) * 4
-        return dynamics.draw(self._seed_key, self._row, self._tick, dynamics.STREAM_STEP)
-
-    def _reward(self, before: Tensor, after: State) -> Tensor:
-        """float32 [N]: what is paid on entering an end or a fail state."""
-        leaf, tree, g = after.node - self._tree.first_leaf, self._tree, self._g
-        share = torch.zeros_like(g.goal_reward)
-        for i, reward_fn in enumerate(self._reward_fns):
-            paid = reward_fn(leaf, g.goal_leaf, tree.branching_factor, g.depth)
-            share = torch.where(g.reward_fn == i, paid, share)
-        entered = after.state_type != before
-        at_end = entered & (after.state_type == StateType.END)
-        failed = entered & (after.state_type == StateType.FAIL)
-        return torch.where(at_end, share * g.goal_reward, torch.where(failed, g.fail_reward, 0.0))
-
-    def _data(self, words: tuple[Tensor, ...], is_init: Tensor) -> TensorDict:
-        """What the rows show now: observation, book-keeping and done flags."""
-        at_end, failed = self.state_type == StateType.END, self.state_type == StateType.FAIL
-        leaf = torch.where(at_end, self.node - self._tree.first_leaf, NO_LEAF)
-        arrived = torch.where(leaf == self._g.goal_leaf, OUTCOME_GOAL, OUTCOME_OTHER_END)
-        outcome = torch.where(at_end, arrived, torch.where(failed, OUTCOME_FAIL, OUTCOME_RUNNING))
-        done = (at_end | failed).unsqueeze(-1)
+    def _data(self, state: RowState, shown: Shown, is_init: Tensor) -> TensorDict:
+        """Observation, book-keeping and done flags; nothing shares memory with the buffers."""
+        self.observation_id.copy_(shown.observation_id)
+        done = shown.done.unsqueeze(-1)
         return TensorDict(
             {
-                "observation": self._observe(words),
+                "observation": shown.observation,
                 "is_init": is_init.unsqueeze(-1),
-                "step_count": self._step_count.unsqueeze(-1).clone(),
-                "episode_reward": self._episode_reward.unsqueeze(-1).clone(),
-                "outcome": outcome.to(torch.uint8).unsqueeze(-1),
-                "leaf": leaf.unsqueeze(-1),
+                "step_count": state.step_count.unsqueeze(-1).clone(),
+                "episode_reward": state.episode_reward.unsqueeze(-1).clone(),
+                "outcome": shown.outcome.unsqueeze(-1),
+                "leaf": shown.leaf.unsqueeze(-1),
                 "done": done,
                 "terminated": done.clone(),
                 "truncated": torch.zeros_like(done),
@@ -274,13 +332,19 @@ class CTGraphEnv(EnvBase):
             device=self.device,
         )
 
-    def _observe(self, words: tuple[Tensor, ...]) -> Tensor:
-        state = State(self.state_type, self.node)
-        self.observation_id.copy_(dynamics.observation_id(state, words[2], self._x))
-        images = dynamics.read_images(self._bank, self.observation_id, words[3], self._x)
-        if not self._noisy:
-            return images
-        return dynamics.add_noise(images, self._seed_key, self._row, self._tick, self._x.read_noise)
+    def render(self, size: int = 192) -> Tensor:
+        """A picture of every row: the observation, and the tree with position and goal.
+
+        TorchRL's ``PixelRenderTransform`` and ``VideoRecorder`` make videos of it.
+
+        Args:
+            size: height in pixels, at least 48.
+
+        Returns:
+            uint8 [N, size, 2 * size, 3] on the CPU.
+        """
+        shown = dynamics.show(self._state(), self._params, self._uses)
+        return render(self.tasks, self.state_type, self.node, self.goal_leaf, shown.observation, size)
 
     def _check(self, action: Tensor) -> None:
         spec = f"action must be int64 of shape {list(self.batch_size)} with values in 0..{self._max_branching}"
@@ -302,10 +366,20 @@ class CTGraphEnv(EnvBase):
         require(_seed_rule(seed))
         self._seed_key.fill_(seed or 0)
         self._tick.zero_()
+        self._episodes_left.zero_()
 
 
 def _seed_rule(seed: object) -> tuple[bool, str]:
     return is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"
+
+
+def _buffer(field: str) -> str:
+    return field if field in PUBLIC_STATE else f"_{field}"
+
+
+def _num_views(task: Task) -> int:
+    """Bank rows that one id of a task has."""
+    return task.images.num_variants * (task.observations.read_rotation + 1)
 
 
 def _bank_key(task: Task) -> tuple[ImageSet, int]:
@@ -331,4 +405,4 @@ def _shared_bank(pool: tuple[Task, ...]) -> tuple[tuple[int, ...], dict[tuple[Im
         banks.append(bank)
         starts[key] = rows
         rows += len(bank)
-    return shape, starts, torch.cat(banks)
+    return shape, starts, banks[0] if len(banks) == 1 else torch.cat(banks)  # one may be large

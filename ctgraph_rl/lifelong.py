@@ -14,7 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
-from ctgraph_rl.env import OUTCOME_GOAL, CTGraphEnv
+from ctgraph_rl.dynamics import OUTCOME_GOAL
+from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.task import Task
 

@@ -1,33 +1,45 @@
 """g: what an end state pays. One small frozen dataclass per reward, called with tensors.
 
-A reward returns a share of ``Task.goal_reward``: 1 at the goal. Everything it needs is in its arguments, so a
-user's own reward is a frozen dataclass (equal and hashable by value) with the same ``__call__``.
+A reward returns a share of ``Task.goal_reward``: 1 at the goal. Everything it needs is in its argument, so a user's own
+reward is a frozen dataclass (equal and hashable by value) with the same ``__call__``, named by ``_target_`` in yaml.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 
+class Arrival(NamedTuple):
+    """The end states that the rows arrived at; int64 [N].
+
+    Rows that have not arrived have values without meaning, and what is computed for them is ignored.
+    """
+
+    leaf: Tensor  # in [0, b**d); its base-b digits are the decisions taken, the first one leading
+    goal_leaf: Tensor
+    branching_factor: Tensor
+    depth: Tensor
+    max_depth: int  # the largest depth of the batch
+
+    def differences(self) -> Tensor:
+        """|decision taken - decision of the goal|, last decision first, 0 beyond a row's depth: [N, max_depth]."""
+        place = torch.arange(self.max_depth, device=self.leaf.device)
+        base = self.branching_factor.unsqueeze(-1)
+        valid = place < self.depth.unsqueeze(-1)
+        power = base ** torch.where(valid, place, 0)
+        taken, wanted = (leaf.unsqueeze(-1) // power % base for leaf in (self.leaf, self.goal_leaf))
+        return torch.where(valid, (taken - wanted).abs(), 0)
+
+
 class RewardFn(Protocol):
     """A reward over end states."""
 
-    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
-        """The share of ``goal_reward`` that each row's end state pays.
-
-        Args:
-            leaf: end state reached, int64 [N] in [0, b**d); its base-b digits are the decisions taken.
-            goal_leaf: end state with the goal, int64 [N].
-            branching_factor: b of each row, int64 [N].
-            depth: d of each row, int64 [N].
-
-        Returns:
-            float32 [N]. Rows that have not arrived are computed too and ignored.
-        """
+    def __call__(self, arrival: Arrival) -> Tensor:
+        """The share of ``goal_reward`` that each row's end state pays, float32 [N]."""
         ...
 
 
@@ -35,6 +47,38 @@ class RewardFn(Protocol):
 class Needle:
     """1 at the goal and 0 at every other end state: the needle in a haystack of the paper, section 2.4."""
 
-    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
+    def __call__(self, arrival: Arrival) -> Tensor:
         """See `RewardFn`."""
-        return (leaf == goal_leaf).to(torch.float32)
+        return (arrival.leaf == arrival.goal_leaf).to(torch.float32)
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Reward that shrinks with the weighted distance between the decisions taken and the goal's, in [0, 1].
+
+    1 - sum_k b^(d-k) |D_k - G_k| / (b^d - 1), k = 1..d: an early wrong decision costs more than a late one. The
+    paper's equation "gradient" with its weights corrected to b^(d-1)..b^0.
+    """
+
+    def __call__(self, arrival: Arrival) -> Tensor:
+        """See `RewardFn`."""
+        place = torch.arange(arrival.max_depth, device=arrival.leaf.device)
+        base, depth = arrival.branching_factor.unsqueeze(-1).double(), arrival.depth
+        weight = base ** (place - depth.unsqueeze(-1))  # b^(k-d): a share of b^d, so no large depth overflows
+        largest = 1 - arrival.branching_factor.double() ** -depth
+        return (1 - (weight * arrival.differences()).sum(-1) / largest).float()
+
+
+@dataclass(frozen=True)
+class ReferenceLinear:
+    """The linear reward of the authors' implementation: weights d, d-1, .., 1 and no bound below for b > 2.
+
+    sum_k (d-k+1) (1 - |D_k - G_k|) / sum_k (d-k+1). In thirds for b=2, d=2; down to -1 for b=3, d=2.
+    """
+
+    def __call__(self, arrival: Arrival) -> Tensor:
+        """See `RewardFn`."""
+        place = torch.arange(1, arrival.max_depth + 1, device=arrival.leaf.device)
+        depth = arrival.depth
+        lost = (place * arrival.differences()).sum(-1)  # the last decision weighs 1, the first one d
+        return (1 - lost.double() / (depth * (depth + 1) / 2)).float()

@@ -9,8 +9,12 @@ from torch import Tensor
 from ctgraph_rl import values
 from ctgraph_rl.checks import as_tuple, is_int, is_real, require
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.observations import ImageSet, Observations, PaperImages
+from ctgraph_rl.images import ImageSet
+from ctgraph_rl.observations import Observations
 from ctgraph_rl.rewards import Needle, RewardFn
+
+REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
+NOISES = ("additive", "multiplicative")
 
 LARGEST_REWARD = 3.4e38
 """Rewards are float32."""
@@ -30,6 +34,12 @@ class Task:
         reward_fn: the share of ``goal_reward`` that each end state pays, g.
         goal_reward: reward at the goal, high_r of the paper.
         fail_reward: reward on entering the fail state, fail_r.
+        step_reward: reward of every step, in addition.
+        reward_std: standard deviation of the noise on what end states pay, std_r.
+        reward_noise: ``additive``, N(c, reward_std) as in the paper, or ``multiplicative``, c (1 + N(0, reward_std)) as
+            in the authors' implementation.
+        goal_change: (first, last): a goal lasts for a number of episodes drawn from first..last, then another is drawn
+            from all end states, the same one among them; per row, from the environment's own randomness. None: never.
 
     Raises:
         ValueError: names every field that breaks a rule.
@@ -42,22 +52,42 @@ class Task:
     reward_fn: RewardFn = field(default_factory=Needle)
     goal_reward: float = 1.0
     fail_reward: float = 0.0
+    step_reward: float = 0.0
+    reward_std: float = 0.0
+    reward_noise: str = "additive"
+    goal_change: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "goal", as_tuple(self.goal))
+        object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
         one_hot = len(self.images.shape) == 1
-        varies = self.observations.read_noise or self.observations.read_rotation
+        x = self.observations
+        varies = x.read_noise or x.read_rotation or x.reward_cue
         room, last_id = self.images.num_images, self.observations.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
             self._goal_rule(),
             *self.observations.rules(self.graph),
             (last_id < room, too_few),
-            (not (one_hot and varies), "read_noise and read_rotation must be 0 with one-hot observations"),
-            *(_reward_rule(name, getattr(self, name)) for name in ("goal_reward", "fail_reward")),
+            (
+                not (one_hot and varies),
+                "read_noise, read_rotation and reward_cue need images, not one-hot observations",
+            ),
+            *self._reward_rules(),
         )
-        object.__setattr__(self, "goal_reward", float(self.goal_reward))
-        object.__setattr__(self, "fail_reward", float(self.fail_reward))
+        for name in REWARDS:
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    def _reward_rules(self) -> list[tuple[bool, str]]:
+        cue, change = self.observations.reward_cue, self.goal_change
+        lasts = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1) and is_int(change[1], change[0])
+        return [
+            *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
+            (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
+            (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
+            (change is None or lasts, f"goal_change must be (first, last) with 1 <= first <= last, got {change!r}"),
+            (not cue or self.goal_reward > 0, f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}"),
+        ]
 
     def _goal_rule(self) -> tuple[bool, str]:
         b, d = self.graph.branching_factor, self.graph.depth
@@ -91,8 +121,8 @@ class Task:
 
     @property
     def image_seed(self) -> int | None:
-        """The image seed of a `PaperImages` set, None for other sets."""
-        return self.images.seed if isinstance(self.images, PaperImages) else None
+        """The seed of a generated image set, None for sets without."""
+        return getattr(self.images, "seed", None)
 
     @property
     def label_parts(self) -> dict[str, str]:

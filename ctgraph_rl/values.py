@@ -4,12 +4,13 @@ The tree has no cycles but the waiting in place, so values follow from the end s
 reward r_(t+1) for step t (the first step has t = 0) a return is sum_t gamma^t r_(t+1); every episode ends, so gamma
 may be 1. A wait state is left with probability 1 - p per wait; with V' the value of where it leads,
 
-    V(wait) = a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
+    V(wait) = s + a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
 
 which is solved for V(wait). Rewards are those of `CTGraphEnv`: ``goal_reward`` times the share of ``reward_fn`` on
-entering an end state, ``fail_reward`` on entering the fail state. The environment rounds them to float32; here they are
-float64. Policies see observation ids, which is what they see of images where no two are equal and nothing varies on
-read.
+entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step. The noise of
+rewards has mean 0 and changes nothing; a goal that changes stays as it is. The environment rounds rewards to float32;
+here they are float64. Policies see observation ids, which is what they see of images where no two are equal and
+nothing varies on read.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from ctgraph_rl.checks import fraction, require
 from ctgraph_rl.graph import WAIT_ACTION, StateType
-from ctgraph_rl.rewards import Needle
+from ctgraph_rl.rewards import Arrival, Needle
 
 if TYPE_CHECKING:
     from ctgraph_rl.task import Task
@@ -77,15 +78,15 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
 
 def success_prob(task: Task, policy: Tensor) -> float:
     """The probability that a memoryless policy reaches the goal, whatever the rewards; arguments as `policy_value`."""
-    return policy_value(replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0), policy)
+    return policy_value(replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0), policy)
 
 
 def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     """The best mean return of a policy that sees an observation id and remembers nothing.
 
-    Exact for needles with goal_reward > 0 and fail_reward <= 0. No way on is then worse than failing, so waiting at
-    wait states and deciding at decision states loses nothing, whether wait ids are unique or not. What is left is the
-    choice of decisions; with c_a the number of times that the goal takes decision a:
+    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. No way on is then worse than failing,
+    so waiting at wait states and deciding at decision states loses nothing, whether wait ids are unique or not. What is
+    left is the choice of decisions; with c_a the number of times that the goal takes decision a:
 
     - unique decisions: every decision can be the right one; goal_reward.
     - stochastic: decisions are drawn with the same probabilities q at every decision state, drawn ids or not, and
@@ -133,7 +134,7 @@ def _value_at_home(tree: _EveryNode | _GoalPath, chooser: _Optimal | _Memoryless
     for level in reversed(range(tree.task.graph.depth)):
         decided = chooser.at_decision(tree.children(values, level), level)
         values = chooser.at_wait(chooser.gamma * decided, level)
-    return chooser.gamma * values[0].item()
+    return tree.task.step_reward + chooser.gamma * values[0].item()
 
 
 def _tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
@@ -157,7 +158,9 @@ class _EveryNode:
         task = self.task
         leaf = torch.arange(task.graph.num_end_states)
         of_task = (task.goal_leaf, task.graph.branching_factor, task.graph.depth)
-        share = task.reward_fn(leaf, *(torch.full_like(leaf, value) for value in of_task))
+        goal, b, depth = (torch.full_like(leaf, value) for value in of_task)
+        arrival = Arrival(leaf, goal, b, depth, task.graph.depth)
+        share = task.reward_fn(arrival)
         return task.goal_reward * share.to(torch.float64)
 
     def children(self, values: Tensor, level: int) -> Tensor:
@@ -191,12 +194,12 @@ class _Optimal:
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is best once stays best. float64, as ``arrival``."""
-        p = self.task.graph.wait_prob
-        return ((1 - p) / (1 - self.gamma * p) * arrival).clamp_min(self.task.fail_reward)
+        p, s = self.task.graph.wait_prob, self.task.step_reward
+        return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_min(s + self.task.fail_reward)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """Decide for the best child or fail. float64 [n] of [n, b]."""
-        return (self.gamma * children.amax(-1)).clamp_min(self.task.fail_reward)
+        return self.task.step_reward + (self.gamma * children.amax(-1)).clamp_min(self.task.fail_reward)
 
 
 @dataclass(frozen=True)
@@ -211,13 +214,15 @@ class _Memoryless:
         """The module's V(wait), solved. float64, as ``arrival``."""
         probs, p = self._action_probs(StateType.WAIT, level), self.task.graph.wait_prob
         waits, fails = probs[:, WAIT_ACTION], probs[:, 1:].sum(-1)
-        return (waits * (1 - p) * arrival + fails * self.task.fail_reward) / (1 - self.gamma * p * waits)
+        leaves = self.task.step_reward + waits * (1 - p) * arrival + fails * self.task.fail_reward
+        return leaves / (1 - self.gamma * p * waits)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """The mean over decisions and failing. float64 [n] of [n, b]."""
         probs, b = self._action_probs(StateType.DECISION, level), self.task.graph.branching_factor
         fails = probs[:, WAIT_ACTION] + probs[:, b + 1 :].sum(-1)
-        return self.gamma * (probs[:, 1 : b + 1] * children).sum(-1) + fails * self.task.fail_reward
+        decided = self.gamma * (probs[:, 1 : b + 1] * children).sum(-1)
+        return self.task.step_reward + decided + fails * self.task.fail_reward
 
     def _action_probs(self, kind: StateType, level: int) -> Tensor:
         """float64 [b^level, A] by node where ids are unique, else [1, A]: the mean over the ids that are drawn."""
@@ -247,9 +252,11 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
 
 def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
     name, goal, fail = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward
+    step = task.step_reward
     only = "the memoryless ceiling is exact only for"
     return [
         (_is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
         (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
         (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
+        (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),
     ]

@@ -9,7 +9,8 @@ from itertools import product
 
 from ctgraph_rl.curriculum import Block, Curriculum
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.observations import Observations, PaperImages
+from ctgraph_rl.images import PaperImages
+from ctgraph_rl.observations import Observations
 from ctgraph_rl.task import Task
 
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.observations import ImageSet, Observations, OneHot, PaperImages
+from ctgraph_rl.images import ImageSet, OneHot, PaperImages
+from ctgraph_rl.observations import Observations
 from ctgraph_rl.task import Task
 
 HOME, WAIT, DECISION, END, FAIL = StateType

@@ -10,7 +10,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Observations, OneHot, Task, evaluate, learn_curriculum
-from ctgraph_rl.env import OUTCOME_GOAL
+from ctgraph_rl.dynamics import OUTCOME_GOAL
 from ctgraph_rl.lifelong import collect
 from ctgraph_rl.run import conf_dir
 from curricula.paper import ct_su_b1

@@ -32,7 +32,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv, check_env_specs
 
 from ctgraph_rl import CTGraphEnv, OneHot, PaperImages
-from ctgraph_rl.env import NO_LEAF, OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_RUNNING
+from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_RUNNING
 from curricula.paper import ct_su_b1
 
 MIXED = [
@@ -68,8 +68,8 @@ STATE = ("state_type", "node", "observation_id", "_tick", "_step_count", "_episo
 class PathReward:
     """A user's own reward: the leaf's number."""
 
-    def __call__(self, leaf, goal_leaf, branching_factor, depth):
-        return leaf.to(torch.float32)
+    def __call__(self, arrival):
+        return arrival.leaf.to(torch.float32)
 
 
 @pytest.mark.parametrize("tasks", FAMILIES.values(), ids=FAMILIES)

@@ -11,7 +11,7 @@ import torch
 
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, evaluate, learn_curriculum
-from ctgraph_rl.env import OUTCOME_GOAL
+from ctgraph_rl.dynamics import OUTCOME_GOAL
 from curricula.paper import ct_su_b1
 
 pytestmark = pytest.mark.slow

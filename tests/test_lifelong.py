@@ -25,7 +25,7 @@ from ctgraph_rl import (
     learn_curriculum,
     lifelong,
 )
-from ctgraph_rl.env import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
+from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 
 DECISION_ID = 2
 OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))

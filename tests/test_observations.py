@@ -24,7 +24,7 @@ from oracles import (
 )
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, OneHot, PaperImages, StateType, Task
-from ctgraph_rl.observations import rotate
+from ctgraph_rl.images import rotate
 
 RANGES = {"wait_ids": (2, 2), "decision_ids": (3, 3), "end_ids": (4, 4)}
 
@@ -34,6 +34,7 @@ class Black:
     """A user's own image set: black images."""
 
     num_images: int = 5
+    num_variants: int = 1
     shape: tuple[int, ...] = (1, 8, 8)
 
     def bank(self, read_rotation):

@@ -106,7 +106,7 @@ def test_an_integer_reward_equals_the_float():
 def test_one_hot_observations_with_variation_on_read_are_refused(variation):
     x = dataclasses.replace(X, **variation)
 
-    with pytest.raises(ValueError, match="read_noise and read_rotation must be 0 with one-hot observations"):
+    with pytest.raises(ValueError, match="read_noise, read_rotation and reward_cue need images"):
         Task(CTGraph(2, 2), (1, 1), x, OneHot(5))
 
 

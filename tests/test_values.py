@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ctgraph_rl import CTGraph, Needle, Observations, OneHot, StateType, Task
 from ctgraph_rl.dynamics import State, TreeParams, transition
+from ctgraph_rl.rewards import Arrival
 from ctgraph_rl.values import MAX_ENUMERATED_STATES
 from curricula.paper import ct_su_b1
 
@@ -27,24 +28,24 @@ REWARDS = [(1.0, 0.0), (2.5, -0.5), (1.0, 0.3), (-1.0, 0.0), (-1.0, -0.25), (0.0
 class OneAtTheGoal:
     """Needle under another name, so that every state is visited."""
 
-    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
-        return (leaf == goal_leaf).to(torch.float32)
+    def __call__(self, arrival: Arrival) -> Tensor:
+        return (arrival.leaf == arrival.goal_leaf).to(torch.float32)
 
 
 @dataclass(frozen=True)
 class Mixed:
     """Other end states pay too, some of them less than nothing: exact in float32."""
 
-    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
-        return torch.where(leaf == goal_leaf, 1.0, (leaf * 5 % 7 - 2) / 8)
+    def __call__(self, arrival: Arrival) -> Tensor:
+        return torch.where(arrival.leaf == arrival.goal_leaf, 1.0, (arrival.leaf * 5 % 7 - 2) / 8)
 
 
 @dataclass(frozen=True)
 class LastDecision:
     """Pays by the last decision and the depth."""
 
-    def __call__(self, leaf: Tensor, goal_leaf: Tensor, branching_factor: Tensor, depth: Tensor) -> Tensor:
-        return leaf % branching_factor / (4 * depth).float()
+    def __call__(self, arrival: Arrival) -> Tensor:
+        return arrival.leaf % branching_factor / (4 * depth).float()
 
 
 def make_task(

@@ -1,0 +1,95 @@
+"""Reference policies that know the hidden state: what can be reached, and what luck gives.
+
+Each is built on the environment that it acts in, takes the data of its rows and writes ``action``, so it goes wherever
+a TorchRL policy goes: ``env.rollout(100, OptimalPolicy(env))``. Draws come from torch's global generator.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.graph import WAIT_ACTION, StateType
+
+
+class RandomPolicy:
+    """Every action of a row's graph is equally likely; it reaches the goal with probability P_R.
+
+    Args:
+        env: where it acts.
+    """
+
+    def __init__(self, env: CTGraphEnv) -> None:
+        self.env = env
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``, int64 [N]."""
+        return tensordict.set("action", self.action(tensordict))
+
+    def action(self, tensordict: TensorDictBase) -> Tensor:
+        """The actions of all rows."""
+        return self._random_below(self.env.branching_factor + 1)
+
+    def _random_below(self, high: Tensor) -> Tensor:
+        """An integer in [0, high) per row."""
+        return (torch.rand(high.shape, dtype=torch.float64, device=high.device) * high).long()
+
+
+class NavigationPolicy(RandomPolicy):
+    """Waits where it must and decides at random; it reaches the goal with probability b^-d."""
+
+    def action(self, tensordict: TensorDictBase) -> Tensor:
+        """The actions of all rows."""
+        decides = self.env.state_type == StateType.DECISION
+        return torch.where(decides, self.decision(tensordict), WAIT_ACTION)
+
+    def decision(self, tensordict: TensorDictBase) -> Tensor:
+        """What a row decides if it is at a decision state, in 1..b."""
+        return 1 + self._random_below(self.env.branching_factor)
+
+
+class OptimalPolicy(NavigationPolicy):
+    """Goes straight to the goal: return 1 in 2(d+1) steps at p = 0."""
+
+    def decision(self, tensordict: TensorDictBase) -> Tensor:
+        """What a row decides if it is at a decision state, in 1..b."""
+        return self._towards(self.env.goal_leaf)
+
+    def _towards(self, leaf: Tensor) -> Tensor:
+        """The decision on the way from each row's node to an end state; 1 where the node is not on the way."""
+        b, node = self.env.branching_factor, self.env.node
+        child, decision = self.env.first_leaf + leaf, torch.ones_like(node)
+        for _ in range(self.env.max_depth):
+            parent = (child - 1) // b
+            decision = torch.where(parent == node, child - b * parent, decision)
+            child = parent
+        return decision
+
+
+class SearchPolicy(OptimalPolicy):
+    """Tries end states without replacement until it finds the goal, then stays with it.
+
+    Each row goes through the end states in order from a random one on, so the number of the episode that finds the goal
+    is uniform on 1..b^d and has the mean E[kappa] = (b^d + 1) / 2.
+    """
+
+    def __init__(self, env: CTGraphEnv) -> None:
+        super().__init__(env)
+        self.target: Tensor | None = None
+
+    def decision(self, tensordict: TensorDictBase) -> Tensor:
+        """What a row decides if it is at a decision state, in 1..b."""
+        assert self.target is not None
+        return self._towards(self.target)
+
+    def action(self, tensordict: TensorDictBase) -> Tensor:
+        """The actions of all rows; a new episode tries the next end state, unless the last one was the goal."""
+        starts = tensordict.get("is_init").squeeze(-1)
+        if self.target is None:
+            self.target = self._random_below(self.env.num_end_states)
+        else:
+            following = (self.target + 1) % self.env.num_end_states
+            self.target = torch.where(starts & (self.target != self.env.goal_leaf), following, self.target)
+        return super().action(tensordict)
