@@ -45,7 +45,7 @@ class LastDecision:
     """Pays by the last decision and the depth."""
 
     def __call__(self, arrival: Arrival) -> Tensor:
-        return arrival.leaf % branching_factor / (4 * depth).float()
+        return arrival.leaf % arrival.branching_factor / (4 * arrival.depth).float()
 
 
 def make_task(
