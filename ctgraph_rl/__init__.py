@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
+    from ctgraph_rl.rewards import Gradient as Gradient
     from ctgraph_rl.rewards import Needle as Needle
+    from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
     from ctgraph_rl.task import Task as Task
 
 __version__ = "0.1.0"
@@ -40,7 +42,9 @@ _HOMES = {
     "Evaluation": "curriculum",
     "GroupedImages": "images",
     "ImageFile": "images",
+    "Gradient": "rewards",
     "Needle": "rewards",
+    "ReferenceLinear": "rewards",
     "Observations": "observations",
     "OneHot": "images",
     "PaperImages": "images",

@@ -173,6 +173,9 @@ class CTGraphEnv(EnvBase):
             ValueError: if a goal is not one of its row's tree.
         """
         if not isinstance(goals, Tensor):
+            goals = list(goals)
+            n = len(self.tasks)
+            require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
             changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, goals, strict=True)]
             goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
         fits = goals.shape == self.batch_size and goals.dtype == torch.int64
@@ -285,7 +288,8 @@ class CTGraphEnv(EnvBase):
         """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
 
         It holds the hidden Markov state: a planner may see it, a policy may not. Rows of it may be put in any order, to
-        branch several rows off one; their further randomness is that of their own row numbers.
+        branch several rows off one; their further randomness is that of their own row numbers. With a ``_reset`` mask,
+        give a clone: TorchRL writes into the TensorDict of a partial reset.
         """
         fields = {field: value.clone() for field, value in self._state()._asdict().items()}
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)

@@ -1,0 +1,134 @@
+"""The functional core: the same results alone, under vmap, compiled, and restored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from oracles import act, confounding, scripts, surjective
+from tensordict import TensorDict
+
+from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, ReferenceLinear, dynamics
+
+EVERYTHING = replace(
+    confounding(p=0.5, read_noise=20, read_rotation=5, reward_cue=True),
+    reward_fn=Gradient(),
+    reward_std=0.3,
+    step_reward=0.01,
+    goal_change=(1, 3),
+)
+OTHER = replace(
+    EVERYTHING, graph=CTGraph(3, 3, 0.2), goal=(1, 2, 3), reward_fn=ReferenceLinear(), reward_noise="multiplicative"
+)
+
+
+def make_env(seed: int = 0) -> CTGraphEnv:
+    return CTGraphEnv([EVERYTHING] * 3 + [OTHER] * 3, seed=seed)
+
+
+def flat(pair) -> list[torch.Tensor]:
+    state, shown = pair
+    return [*state, *shown]
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_the_core_compiles_into_one_graph_with_the_same_bits(backend):
+    env = make_env()
+    env.reset()
+    step = torch.compile(dynamics.step, fullgraph=True, backend=backend)
+    state = env._state()
+
+    for action in scripts(12, 6, 4):
+        expected = dynamics.step(state, action, env._params, env._uses)
+        found = step(state, action, env._params, env._uses)
+        assert all(torch.equal(x, y) for x, y in zip(flat(found), flat(expected), strict=True))
+        state, _ = dynamics.reset(expected[0], expected[1].done, env._params, env._uses)
+
+
+def test_the_core_maps_over_a_further_dimension_with_vmap():
+    env = make_env()
+    env.reset()
+    actions = scripts(5, 6, 4)
+
+    state, shown = torch.vmap(lambda a: dynamics.step(env._state(), a, env._params, env._uses))(actions)
+
+    alone = [flat(dynamics.step(env._state(), action, env._params, env._uses)) for action in actions]
+    assert all(torch.equal(x, torch.stack(y)) for x, y in zip([*state, *shown], zip(*alone, strict=True), strict=True))
+
+
+def test_a_step_of_the_core_changes_nothing_in_place():
+    env = make_env()
+    env.reset()
+    before = [value.clone() for value in env._state()]
+
+    dynamics.step(env._state(), torch.zeros(6, dtype=torch.int64), env._params, env._uses)
+
+    assert all(torch.equal(x, y) for x, y in zip(env._state(), before, strict=True))
+
+
+def test_what_has_no_use_changes_nothing_when_it_is_computed_all_the_same():
+    env = CTGraphEnv([surjective()] * 4)
+    env.reset()
+    everything = dynamics.Uses(reward_fns=env._uses.reward_fns)
+
+    for action in scripts(12, 4):
+        lean = dynamics.step(env._state(), action, env._params, env._uses)
+        full = dynamics.step(env._state(), action, env._params, everything)
+        assert all(torch.equal(x, y) for x, y in zip(flat(lean), flat(full), strict=True))
+        act(env, action)
+        env.reset(TensorDict({"_reset": lean[1].done.unsqueeze(-1)}, [4]))
+
+
+def test_a_planner_can_go_back_to_a_state_and_sees_the_same_future():
+    env = make_env()
+    env.reset()
+    act(env, [0] * 6)
+    saved = env.get_state()
+    first = [act(env, [0] * 6).clone() for _ in range(2)]
+
+    data = env.reset(TensorDict({"state": saved}, [6]), set_state=True)
+    again = [act(env, [0] * 6).clone() for _ in range(2)]
+
+    assert data["step_count"].unique().tolist() == [1]
+    assert not data["is_init"].any()
+    assert all((x == y).all() for x, y in zip(first, again, strict=True))
+
+
+def test_a_planner_can_branch_all_rows_off_one():
+    env = CTGraphEnv([surjective()] * 3)
+    env.reset()
+    for _ in range(2):
+        act(env, [0, 0, 0])
+
+    env.reset(TensorDict({"state": env.get_state()[torch.tensor([1, 1, 1])]}, [3]), set_state=True)
+    data = act(env, [0, 1, 2])
+
+    assert data["outcome"].flatten().tolist() == [1, 0, 0]
+    assert env.node.tolist() == [0, 1, 2]
+
+
+def test_setting_the_state_of_some_rows_leaves_the_others():
+    env = make_env()
+    env.reset()
+    saved = env.get_state()
+    act(env, [0] * 6)
+    mask = torch.tensor([True, False, False, True, False, False])
+    before = env.get_state()
+
+    env.reset(TensorDict({"state": saved.clone(), "_reset": mask.unsqueeze(-1)}, [6]), set_state=True)
+
+    now = env.get_state()
+    assert (now[mask] == saved[mask]).all()
+    assert (now[~mask] == before[~mask]).all()
+
+
+def test_a_state_is_a_copy():
+    env = make_env()
+    env.reset()
+    saved = env.get_state()
+    copy = saved.clone()
+
+    act(env, [0] * 6)
+
+    assert (saved == copy).all()
