@@ -176,7 +176,7 @@ class CTGraphEnv(EnvBase):
             goals = list(goals)
             n = len(self.tasks)
             require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
-            changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, goals, strict=True)]
+            changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, map(tuple, goals), strict=True)]
             goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
         fits = goals.shape == self.batch_size and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape {list(self.batch_size)}, got {goals.dtype} {list(goals.shape)}"))
