@@ -105,7 +105,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     from ctgraph_rl.report import print_summary
 
     print_summary(run_dir)
-    print(f"results: {os.path.relpath(run_dir)}")
+    here = Path.cwd()
+    print(f"results: {run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir}")
 
 
 def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
