@@ -10,9 +10,6 @@ from itertools import pairwise
 
 from ctgraph_rl.checks import as_tuple, is_int, require
 from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.images import OneHot as OneHot
-from ctgraph_rl.images import PaperImages as PaperImages
-from ctgraph_rl.images import rotate as rotate
 
 Ids = tuple[int, int]
 """First and last id of a subset, both included."""
