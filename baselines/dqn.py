@@ -84,12 +84,12 @@ class DQN(Learner):
             *at_least_one(annealing_num_steps=annealing_num_steps),
             *positive(learning_rate=learning_rate, gamma=gamma),
             *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end),
-            (eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"),
             (
                 replay_on_task_change in choices,
                 f"replay_on_task_change must be one of {', '.join(choices)}, got {replay_on_task_change!r}",
             ),
         )
+        require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
         self.num_updates, self.replay_on_task_change = num_updates, replay_on_task_change
         head = MLP(
             in_features=hidden_size, out_features=action_spec.space.n, num_cells=[hidden_size], activation_class=nn.ReLU
@@ -126,7 +126,8 @@ class DQN(Learner):
         return {**mean_measurements(steps), "exploration": self.exploration.eps.item()}
 
     def _update(self) -> dict[str, Tensor]:
-        measured = self.gradient_step(self.replay.sample())
+        device = next(self.parameters()).device  # the buffer stays on the CPU
+        measured = self.gradient_step(self.replay.sample().to(device))
         self.target_update.step()
         return measured
 

@@ -65,7 +65,7 @@ class LSTMPPO(Learner):
         splits = is_int(num_envs, 1) and is_int(num_minibatches, 1) and num_envs % num_minibatches == 0
         require(
             *at_least_one(hidden_size=hidden_size, num_epochs=num_epochs, num_minibatches=num_minibatches),
-            *positive(learning_rate=learning_rate, clip_epsilon=clip_epsilon),
+            *positive(learning_rate=learning_rate, clip_epsilon=clip_epsilon, gamma=gamma, gae_lambda=gae_lambda),
             *fraction(gamma=gamma, gae_lambda=gae_lambda),
             (is_real(entropy_coeff, 0), f"entropy_coeff must be a number >= 0, got {entropy_coeff!r}"),
             (is_real(critic_coeff, 0), f"critic_coeff must be a number >= 0, got {critic_coeff!r}"),

@@ -29,7 +29,10 @@ def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bo
     """True for a finite ``int`` or ``float`` (not a ``bool``) in [low, high]."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    return math.isfinite(value) and low <= value <= high
+    try:
+        return math.isfinite(value) and low <= value <= high
+    except OverflowError:  # an integer beyond float64
+        return False
 
 
 def at_least_one(**values: object) -> list[tuple[bool, str]]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import at_least_one, is_int, require
 from ctgraph_rl.task import Task
 
 FINGERPRINT_SCHEMA = 1
@@ -64,15 +64,30 @@ class Evaluation:
     Args:
         num_episodes: episodes per task.
         greedy: take the most likely action; False samples as in training.
+        episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``.
     """
 
     num_episodes: int = 100
     greedy: bool = True
+    episodes_per_row: int = 1
 
     def __post_init__(self) -> None:
+        n, per_row = self.num_episodes, self.episodes_per_row
         require(
-            (is_int(self.num_episodes, 1), f"num_episodes must be an integer >= 1, got {self.num_episodes!r}"),
+            *at_least_one(num_episodes=n, episodes_per_row=per_row),
             (isinstance(self.greedy, bool), f"greedy must be true or false, got {self.greedy!r}"),
+        )
+        require((n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"))
+
+    def check(self, tasks: Iterable[Task]) -> None:
+        """Refuse to measure changing goals by first episodes, which all have the first goal.
+
+        Raises:
+            ValueError: for one episode a row and a task with ``goal_change``.
+        """
+        changing = self.episodes_per_row == 1 and any(task.goal_change for task in tasks)
+        require(
+            (not changing, "tasks with goal_change need episodes_per_row > 1: a row's first goal is the task's own")
         )
 
 
@@ -146,10 +161,15 @@ def _canonical(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         compared = [f for f in fields(value) if f.compare]
         given = {f.name: getattr(value, f.name) for f in compared if getattr(value, f.name) != _default(f)}
-        return {"type": type(value).__name__, **{name: _canonical(item) for name, item in given.items()}}
+        return {"type": _type_name(type(value)), **{name: _canonical(item) for name, item in given.items()}}
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]
     return value
+
+
+def _type_name(kind: type) -> str:
+    """Our own types by name alone, so that they may move between modules; a user's with the module."""
+    return kind.__qualname__ if kind.__module__.startswith("ctgraph_rl.") else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _default(field_: Any) -> Any:

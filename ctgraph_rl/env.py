@@ -92,6 +92,7 @@ class CTGraphEnv(EnvBase):
             (num_rows > 0, "tasks must hold at least one task, got none"),
             (len(pool) > 0, "task_pool must hold at least one task, got none"),
             _seed_rule(seed),
+            (isinstance(check_actions, bool), f"check_actions must be true or false, got {check_actions!r}"),
             (is_int(first_row, 0, 2**32 - num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
         )
         super().__init__(device=device, batch_size=torch.Size([num_rows]))
@@ -159,12 +160,13 @@ class CTGraphEnv(EnvBase):
             return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
 
         self._params, self._uses = self._make_params(different, rows)
-        self.goal_leaf.copy_(rows([task.goal_leaf for task in different]))
-        self.state_type.fill_(int(StateType.FAIL))
-        self._episodes_left.zero_()
+        self._task_goals = rows([task.goal_leaf for task in different])
+        self._begin()
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
+
+        ``goal_leaf`` changes and ``tasks`` does not: `set_tasks` and `set_seed` go back to the tasks' own goals.
 
         Args:
             goals: for every row its decisions in 1..b, or the numbers of end states, int64 [N].
@@ -297,15 +299,27 @@ class CTGraphEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         resets = torch.ones_like(self.state_type, dtype=torch.bool) if mask is None else mask.view(-1)
-        given = tensordict.get("state", None) if set_state and tensordict is not None else None
-        if given is None:
-            state, shown = dynamics.reset(self._state(), resets, self._params, self._uses)
-        else:
-            kept = zip(self._state(), (given[field] for field in RowState._fields), strict=True)
-            state = RowState(*(torch.where(resets, new, old) for old, new in kept))
+        if set_state:
+            given = self._given_state(tensordict)
+            state = RowState(*(torch.where(resets, new, old) for old, new in zip(self._state(), given, strict=True)))
             shown = dynamics.show(state, self._params, self._uses)
+        else:
+            state, shown = dynamics.reset(self._state(), resets, self._params, self._uses)
         self._keep(state)
         return self._data(state, shown, is_init=(state.step_count == 0) & resets)
+
+    def _given_state(self, tensordict: TensorDictBase | None) -> RowState:
+        """The state to go back to; refuses what no state of the rows' trees can be."""
+        given = TensorDict() if tensordict is None else tensordict.get("state", TensorDict())
+        complete = set(RowState._fields) <= set(given.keys())
+        require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
+        state = RowState(*(given[field] for field in RowState._fields))
+        nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
+        running = (state.state_type >= StateType.HOME) & (state.state_type <= StateType.DECISION)
+        inside = (state.node >= 0) & (state.node < nodes) & (state.goal_leaf >= 0) & (state.goal_leaf < leaves)
+        wrong = (~(running & inside)).nonzero().flatten()[:5].tolist()
+        require((not wrong, f"rows {wrong} of the given state are finished or no states of their trees"))
+        return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict.get("action", None)
@@ -366,10 +380,16 @@ class CTGraphEnv(EnvBase):
             )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start all rows anew with another seed; the next `reset` gives their first episodes."""
+        """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(_seed_rule(seed))
-        self._seed_key.fill_(seed or 0)
+        self._seed_key.fill_(seed)  # type: ignore[arg-type]
         self._tick.zero_()
+        self._begin()
+
+    def _begin(self) -> None:
+        """End all episodes; the next one of every row is the first with its task's goal."""
+        self.goal_leaf.copy_(self._task_goals)
+        self.state_type.fill_(int(StateType.FAIL))
         self._episodes_left.zero_()
 
 

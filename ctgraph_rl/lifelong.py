@@ -12,11 +12,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.checks import at_least_one, is_int, require
+from ctgraph_rl.curriculum import Curriculum, Evaluation
 from ctgraph_rl.dynamics import OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
+from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.task import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -86,6 +87,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     Raises:
         ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
     """
+    curriculum.evaluation.check(curriculum.tasks)
     for block in curriculum.blocks:
         block.rows(num_envs)
     require(*(block.frame_rule(num_envs, f"block {i}") for i, block in enumerate(curriculum.blocks, 1)))
@@ -107,7 +109,15 @@ def collect(
         num_frames: frames in all, a multiple of the rows.
         num_steps: steps in a batch.
         initial_state: gives the recurrent state that the rows start with.
+
+    Raises:
+        ValueError: for a number of frames that is not a multiple of the rows, and less than one step.
     """
+    whole = is_int(num_frames, 1) and num_frames % env.numel() == 0
+    require(
+        (whole, f"num_frames must be a multiple of the {env.numel()} rows, got {num_frames!r}"),
+        *at_least_one(num_steps=num_steps),
+    )
     start = _start(env, initial_state)
     carried = env.reset().update(start)
     steps_left = num_frames // env.numel()
@@ -130,45 +140,59 @@ def evaluate(
     greedy: bool = True,
     initial_state: InitialState | None = None,
     device: torch.device | str = "cpu",
+    episodes_per_row: int = 1,
 ) -> TensorDict:
-    """Play the same number of episodes on every task, all in one batch: a row for each episode.
+    """Play the same number of episodes on every task, all in one batch; every row plays equally many.
 
     The environment is its own, and torch's global generator is left as it was found.
 
     Args:
-        policy: who plays.
+        policy: who plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment.
         tasks: what is played.
         num_episodes: episodes per task.
         seed: decides the environment and, if not greedy, the policy's draws.
         greedy: most likely actions; False samples and explores as in training.
         initial_state: gives a recurrent policy's state for a number of rows.
         device: where the environment lives.
+        episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``. More than one is
+            needed where the goal changes from episode to episode.
 
     Returns:
         ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
-        [tasks, num_episodes, 1], as they are at the end of the episodes.
+        [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other.
+
+    Raises:
+        ValueError: for values out of range, a task with changing goals and one episode a row, and a reference policy
+            that was built on another environment.
     """
-    require((is_int(num_episodes, 1), f"num_episodes must be an integer >= 1, got {num_episodes!r}"))
-    env = CTGraphEnv([task for task in tasks for _ in range(num_episodes)], seed=seed, device=device)
+    Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
+    bound = isinstance(policy, RandomPolicy)
+    require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
+    num_rows = num_episodes // episodes_per_row
+    env = CTGraphEnv([task for task in tasks for _ in range(num_rows)], seed=seed, device=device)
+    acts = policy(env) if isinstance(policy, type) else policy
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
         torch.manual_seed(seed)
         with set_exploration_type(exploration):
-            result = _first_episodes(env, policy, initial_state)
+            result = _first_episodes(env, acts, initial_state, episodes_per_row)
     return result.view(len(tasks), num_episodes)
 
 
-def _first_episodes(env: CTGraphEnv, policy: Policy, initial_state: InitialState | None) -> TensorDict:
-    """The end of each row's first episode."""
+def _first_episodes(
+    env: CTGraphEnv, policy: Policy, initial_state: InitialState | None, num_episodes: int
+) -> TensorDict:
+    """The ends of each row's first episodes, [rows, num_episodes]."""
     start = _start(env, initial_state)
     carried = env.reset().update(start)
-    keys = ("episode_reward", "step_count", "outcome", "leaf")
-    running, result = torch.ones(env.batch_size, dtype=torch.bool, device=env.device), None
-    while running.any():
+    result = carried.select("episode_reward", "step_count", "outcome", "leaf")
+    result = result.unsqueeze(-1).expand(env.numel(), num_episodes).clone()
+    played = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
+    while (played < num_episodes).any():
         step, carried = _act(env, policy, carried, start)
-        now = step["next"].select(*keys)
-        result = now if result is None else torch.where(running, now, result)
-        running &= ~step["next", "done"].squeeze(-1)
+        ends = (step["next", "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
+        result[ends, played[ends]] = step["next"].select(*result.keys())[ends]
+        played[ends] += 1
     return result
 
 
@@ -220,6 +244,7 @@ def _evaluate_all(
         how.greedy,
         agent.initial_state,
         device,
+        how.episodes_per_row,
     )
     for number, (label, episodes) in enumerate(zip(curriculum.labels, result, strict=True), 1):
         log.append("evaluation", block=block, frames=frames, task=number, label=label, **episode_means(episodes))

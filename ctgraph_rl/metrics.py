@@ -43,6 +43,7 @@ def backward_transfer(performance: Tensor) -> float:
     The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
     NaN for a single task.
     """
+    _require_a_block_per_task(performance)
     own = performance[1:].diagonal()
     return (performance[-1] - own)[:-1].mean().item()
 
@@ -53,6 +54,7 @@ def forward_transfer(performance: Tensor) -> float:
     What training on the tasks before it gave a task before its own block, against the untrained agent.
     NaN for a single task.
     """
+    _require_a_block_per_task(performance)
     before_own = performance[:-1].diagonal()
     return (before_own - performance[0])[1:].mean().item()
 
@@ -63,10 +65,18 @@ def forgetting(performance: Tensor) -> float:
     The drop on each earlier task from its best after any earlier block to the end; the untrained agent (row 0) is no
     candidate for the best. NaN for a single task.
     """
+    _require_a_block_per_task(performance)
     if performance.shape[1] == 1:
         return math.nan
     best = performance[1:-1].amax(dim=0)
     return (best - performance[-1])[:-1].mean().item()
+
+
+def _require_a_block_per_task(performance: Tensor) -> None:
+    """Refuse a matrix that is not [T + 1, T]; `summary` says why such a metric is undefined."""
+    blocks, tasks = performance.shape[0] - 1, performance.shape[1]
+    if blocks != tasks:
+        raise ValueError(f"the definition needs one block per task, got {blocks} blocks and {tasks} tasks")
 
 
 _LOPEZ_PAZ = "Lopez-Paz & Ranzato 2017, Gradient Episodic Memory (arXiv 1706.08840)"

@@ -1,7 +1,8 @@
 """Reference policies that know the hidden state: what can be reached, and what luck gives.
 
-Each is built on the environment that it acts in, takes the data of its rows and writes ``action``, so it goes wherever
-a TorchRL policy goes: ``env.rollout(100, OptimalPolicy(env))``. Draws come from torch's global generator.
+Each is built on the environment that it acts in, takes the data of its rows and writes ``action``:
+``env.rollout(100, OptimalPolicy(env))``, and ``evaluate(OptimalPolicy, tasks)``, which builds it on its own environment.
+Draws come from torch's global generator.
 """
 
 from __future__ import annotations
@@ -72,12 +73,14 @@ class SearchPolicy(OptimalPolicy):
     """Tries end states without replacement until it finds the goal, then stays with it.
 
     Each row goes through the end states in order from a random one on, so the number of the episode that finds the goal
-    is uniform on 1..b^d and has the mean E[kappa] = (b^d + 1) / 2.
+    is uniform on 1..b^d and has the mean E[kappa] = (b^d + 1) / 2. An episode that is cut before it has passed the last
+    wait state is tried again.
     """
 
     def __init__(self, env: CTGraphEnv) -> None:
         super().__init__(env)
         self.target: Tensor | None = None
+        self.tried = torch.zeros_like(env.node, dtype=torch.bool)
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
         """What a row decides if it is at a decision state, in 1..b."""
@@ -86,10 +89,9 @@ class SearchPolicy(OptimalPolicy):
 
     def action(self, tensordict: TensorDictBase) -> Tensor:
         """The actions of all rows; a new episode tries the next end state, unless the last one was the goal."""
-        starts = tensordict.get("is_init").squeeze(-1)
         if self.target is None:
             self.target = self._random_below(self.env.num_end_states)
-        else:
-            following = (self.target + 1) % self.env.num_end_states
-            self.target = torch.where(starts & (self.target != self.env.goal_leaf), following, self.target)
+        over = tensordict.get("is_init").squeeze(-1) & self.tried & (self.target != self.env.goal_leaf)
+        self.target = torch.where(over, (self.target + 1) % self.env.num_end_states, self.target)
+        self.tried = (self.env.state_type == StateType.WAIT) & (self.env.node == self.env.first_leaf + self.target)
         return super().action(tensordict)

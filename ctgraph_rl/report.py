@@ -68,13 +68,21 @@ def draw_figure(run_dir: Path | str, path: Path | str) -> None:
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     curve, matrix = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_curve(curve, log)
-    image = matrix.imshow(performance, cmap="viridis", vmin=0, vmax=1, aspect="auto")
+    low, high = min(0.0, performance.min().item()), max(1.0, performance.max().item())
+    image = matrix.imshow(performance, cmap="viridis", vmin=low, vmax=high, aspect="auto")
     matrix.set_xticks(range(len(labels)), labels, rotation=30, ha="right", fontsize=7)
     matrix.set(ylabel="after block", yticks=range(len(performance)))
     matrix.set_title("Mean return on each task", fontsize=9)
     for i, row in enumerate(performance.tolist()):
         for j, value in enumerate(row):
-            matrix.text(j, i, f"{value:.2f}", ha="center", va="center", color="white" if value < 0.6 else "black")
+            matrix.text(
+                j,
+                i,
+                f"{value:.2f}",
+                ha="center",
+                va="center",
+                color="white" if value < low + 0.6 * (high - low) else "black",
+            )
     figure.colorbar(image, ax=matrix)
     figure.savefig(path, dpi=160)
 
@@ -86,7 +94,9 @@ def _draw_curve(axes: Any, log: RunLog) -> None:
         curve = [(m["frames"], m["return_mean"]) for m in training if m["block"] == block]
         axes.plot(*zip(*curve, strict=True), color="black", linewidth=1)
         axes.axvline(curve[-1][0], color="grey", linestyle="--", linewidth=0.8)
-    axes.set(xlabel="frames", ylabel="return while training", ylim=(-0.03, 1.03))
+    axes.set(xlabel="frames", ylabel="return while training")
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, -0.03), max(high, 1.03))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.tick_params(axis="x", labelsize=7)
     axes.set_title("Learning, task after task", fontsize=9)

@@ -62,11 +62,11 @@ class Gradient:
 
     def __call__(self, arrival: Arrival) -> Tensor:
         """See `RewardFn`."""
-        place = torch.arange(arrival.max_depth, device=arrival.leaf.device)
-        base, depth = arrival.branching_factor.unsqueeze(-1).double(), arrival.depth
-        weight = base ** (place - depth.unsqueeze(-1))  # b^(k-d): a share of b^d, so no large depth overflows
-        largest = 1 - arrival.branching_factor.double() ** -depth
-        return (1 - (weight * arrival.differences()).sum(-1) / largest).float()
+        b, depth = arrival.branching_factor, arrival.depth
+        place = torch.arange(arrival.max_depth, device=b.device)
+        weight = b.unsqueeze(-1) ** torch.where(place < depth.unsqueeze(-1), place, 0)
+        lost = (weight * arrival.differences()).sum(-1)  # exact: at most b^d - 1
+        return (1 - lost.double() / (b**depth - 1).double()).float()
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,9 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     """
     check_packages()
     require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
-    require((is_int(cfg.num_threads, 1), f"num_threads must be an integer >= 1, got {cfg.num_threads!r}"))
+    cores = os.cpu_count() or 1
+    threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
+    require((is_int(cfg.num_threads, 1, cores), threads_rule))
     require((isinstance(cfg.overwrite, bool), f"overwrite must be true or false, got {cfg.overwrite!r}"))
     if not is_finished(cfg, run_dir):
         learn(cfg, run_dir)
@@ -259,9 +261,10 @@ def main() -> None:
     """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
+    sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
         _job()
-    except (HydraException, OmegaConfBaseException, ValueError, FileExistsError, FloatingPointError) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError) as error:
         if full_error:
             raise
         print(f"error: {explain(error)}", file=sys.stderr)

@@ -16,6 +16,9 @@ from ctgraph_rl.rewards import Needle, RewardFn
 REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
 NOISES = ("additive", "multiplicative")
 
+MAX_EPISODES = 2**31
+"""Episodes are drawn with 32-bit words."""
+
 LARGEST_REWARD = 3.4e38
 """Rewards are float32."""
 
@@ -58,6 +61,10 @@ class Task:
     goal_change: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
+        parts = {"graph": CTGraph, "observations": Observations}
+        require(*((isinstance(getattr(self, name), kind), _part_rule(name, kind)) for name, kind in parts.items()))
+        has_images = hasattr(self.images, "bank") and not isinstance(self.images, type)
+        require((has_images, f"images must be an image set such as PaperImages(5), got {self.images!r}"))
         object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
         one_hot = len(self.images.shape) == 1
@@ -80,13 +87,21 @@ class Task:
 
     def _reward_rules(self) -> list[tuple[bool, str]]:
         cue, change = self.observations.reward_cue, self.goal_change
-        lasts = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1) and is_int(change[1], change[0])
+        pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
+        lasts = pair and is_int(change[1], change[0], MAX_EPISODES)  # type: ignore[index]
         return [
             *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
             (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
-            (change is None or lasts, f"goal_change must be (first, last) with 1 <= first <= last, got {change!r}"),
-            (not cue or self.goal_reward > 0, f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}"),
+            (
+                change is None or lasts,
+                f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}",
+            ),
+            (callable(self.reward_fn) and not isinstance(self.reward_fn, type), _reward_fn_rule(self.reward_fn)),
+            (
+                not cue or (is_real(self.goal_reward, 0) and self.goal_reward != 0),
+                f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}",
+            ),
         ]
 
     def _goal_rule(self) -> tuple[bool, str]:
@@ -140,3 +155,11 @@ class Task:
 def _reward_rule(name: str, value: object) -> tuple[bool, str]:
     holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
     return holds, f"{name} must be a finite number, got {value!r}; rewards are float32"
+
+
+def _reward_fn_rule(value: object) -> str:
+    return f"reward_fn must be an instance such as Needle(), got {value!r}"
+
+
+def _part_rule(name: str, kind: type) -> str:
+    return f"{name} must be a {kind.__name__}"

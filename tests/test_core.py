@@ -132,3 +132,39 @@ def test_a_state_is_a_copy():
     act(env, [0] * 6)
 
     assert (saved == copy).all()
+
+
+def test_a_checkpoint_is_a_few_integers_per_row_without_images():
+    state = make_env().state_dict()
+
+    public, hidden = {"state_type", "node", "goal_leaf", "observation_id"}, dynamics.RowState._fields[2:]
+    hidden = {f"_{field}" for field in hidden if field != "goal_leaf"}
+    assert set(state) == public | hidden | {"_seed_key", "_row"}
+    assert all(value.numel() in (1, 6) for value in state.values())
+
+
+def test_a_picture_is_192_pixels_high_when_no_size_is_given():
+    env = make_env()
+    env.reset()
+
+    assert env.render().shape == (6, 192, 384, 3)
+
+
+def test_a_reset_clears_all_of_the_episode_in_its_rows_and_leaves_the_others():
+    env = CTGraphEnv([replace(surjective(), step_reward=0.5, goal_change=(2, 2))] * 2)
+    env.reset()
+    for action in (0, 0, 2):
+        act(env, [action] * 2)
+
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+
+    assert {field: value.tolist() for field, value in env.get_state().items()} == {
+        "state_type": [0, 1],
+        "node": [0, 2],
+        "tick": [5, 4],
+        "step_count": [0, 3],
+        "episode_reward": [0.0, 1.5],
+        "goal_leaf": [0, 0],
+        "episodes_left": [1, 2],
+        "reward": [0.0, 0.5],
+    }

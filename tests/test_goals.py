@@ -9,7 +9,7 @@ import torch
 from oracles import act, optimal, surjective
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.dynamics import randint_wide
+from ctgraph_rl.dynamics import STREAM_GOAL, draw, randint_wide
 
 
 def goals_of_episodes(env: CTGraphEnv, num_episodes: int) -> torch.Tensor:
@@ -151,3 +151,42 @@ def test_wide_draws_are_the_exact_product_of_sixty_four_bits():
 
     words = [int(u) << 32 | int(w) for u, w in zip(upper, lower, strict=True)]
     assert found == [[word * int(h) >> 64 for h in high] for word in words]
+
+
+def test_a_goals_duration_and_the_next_goal_are_three_different_words_of_the_rows_stream():
+    task = replace(surjective(2, 20, goal=(1,) * 20), goal_change=(2, 4))
+    expected = []
+    for row in (7, 8, 9):
+        goal = left = 0
+        for tick in range(1, 31):
+            words = list(map(int, draw(*map(torch.tensor, (5, row, tick)), STREAM_GOAL)))
+            goal = ((words[1] << 32) + words[2]) >> 44 if left == 1 else goal
+            left = left - 1 if left > 1 else 2 + (words[0] * 3 >> 32)
+            expected.append(goal)
+
+    goals = goals_of_episodes(CTGraphEnv([task] * 3, seed=5, first_row=7), 30)
+
+    assert goals.T.flatten().tolist() == expected
+
+
+def test_new_tasks_start_the_count_of_episodes_anew():
+    tasks = [replace(surjective(2, 20, goal=(1,) * 20), goal_change=(3, 3))] * 5
+    env = CTGraphEnv(tasks)
+    goals_of_episodes(env, 2)
+
+    env.set_tasks(tasks)
+    goals = goals_of_episodes(env, 4)
+
+    assert not goals[:3].any()
+    assert goals[3].all()
+
+
+def test_a_seed_starts_the_goals_and_the_count_of_episodes_anew():
+    env = CTGraphEnv([replace(surjective(2, 20, goal=(1,) * 20), goal_change=(3, 3))] * 5, seed=4)
+    expected = goals_of_episodes(env, 8)
+
+    env.set_seed(4)
+    goals = goals_of_episodes(env, 8)
+
+    assert not goals[:3].any()
+    assert torch.equal(goals, expected)

@@ -381,3 +381,10 @@ def test_the_number_of_cells_that_an_error_proposes_is_the_least_that_works():
         GroupedImages((2, 3), within=0.01, between=0.2, size=8, cells=8)
 
     assert images.num_images == 5
+
+
+def test_a_wrong_number_of_cells_is_not_blamed_on_the_size():
+    with pytest.raises(ValueError, match="cells must be an integer >= 1, got 0") as error:
+        GroupedImages((2, 3), within=0.1, between=0.2, size=3, cells=0)
+
+    assert "size" not in str(error.value)

@@ -174,6 +174,10 @@ def test_a_range_that_is_not_first_to_last_is_refused(value):
         ({"wait_ids": (0, 0)}, r"_ids=\(0, 0\) overlaps .*_ids=\(0, 0\); let it start at 1 or later"),
         ({"wait_ids": (1, 1)}, r"_ids=\(1, 1\) overlaps .*_ids=\(1, 1\); let it start at 2 or later"),
         ({"fail_ids": (1, 4)}, r"wait_ids=\(2, 2\) overlaps fail_ids=\(1, 4\); let it start at 5 or later"),
+        (
+            {"wait_ids": (2, 5), "decision_ids": (4, 9), "end_ids": (10, 10)},
+            r"decision_ids=\(4, 9\) overlaps wait_ids=\(2, 5\); let it start at 6 or later",
+        ),
     ],
 )
 def test_ranges_that_overlap_are_refused_with_a_place_to_start(ranges, message):
@@ -436,3 +440,19 @@ def test_noise_is_added_after_rotation():
 
     added = observations.unsqueeze(1) - turned
     assert ((added >= 0) & (added <= 1)).flatten(2).all(-1).any(1).all()
+
+
+@pytest.mark.parametrize("kind", [HOME, WAIT, DECISION, END, FAIL])
+def test_both_ids_of_a_range_of_two_are_shown_where_nothing_else_is_random(kind):
+    ranges = {f"{each.name.lower()}_ids": (2 * each, 2 * each + (each == kind)) for each in StateType}
+    env = CTGraphEnv([Task(CTGraph(2, 1), (1,), Observations(**ranges), OneHot(10))] * 64)
+    env.reset()
+
+    ids = [env.observation_id.clone()]
+    for action in (0, 0, 1, 1 if kind == FAIL else 0):
+        act(env, [action] * 64)
+        ids.append(env.observation_id.clone())
+
+    shown = torch.stack(ids).unique().tolist()
+    passed = [HOME, WAIT, DECISION, FAIL if kind == FAIL else END]
+    assert shown == sorted([2 * each for each in passed] + [2 * kind + 1])

@@ -11,7 +11,7 @@ import torch
 from oracles import ALPHA, act, optimal, play, surjective
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, Needle, ReferenceLinear, Task
-from ctgraph_rl.dynamics import normal, normal_table
+from ctgraph_rl.dynamics import STREAM_REWARD, draw, normal, normal_table
 from ctgraph_rl.rewards import Arrival
 
 CLT_BOUND = 5.0
@@ -219,3 +219,16 @@ def test_gradient_rewards_of_rows_with_other_trees_are_their_own():
 
     assert env.max_depth == 4
     assert paid.flatten().tolist() == [0.0, 0.0]
+
+
+def test_the_noise_is_the_normal_number_of_the_steps_word_added_or_times_the_reward():
+    additive = replace(surjective(), reward_std=0.5, goal_reward=3.0)
+    env = CTGraphEnv([additive, replace(additive, reward_noise="multiplicative")], seed=3, first_row=5)
+    ticks = torch.tensor([7, 7])  # the first observation and six steps
+    z = normal(draw(torch.tensor(3), torch.tensor([5, 6]), ticks, STREAM_REWARD)[0], normal_table())
+
+    paid = play(env, optimal)["reward"].squeeze(-1).double()
+
+    expected = torch.stack([3 + 0.5 * z[0], 3 * (1 + 0.5 * z[1])])
+    torch.testing.assert_close(paid, expected, atol=1e-6, rtol=0)
+    assert z.abs().min() > 0.01
