@@ -12,6 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 class Agent(Protocol):
     """A learner. One module acts and learns, one method gives the loss; any class with these members is an agent.
 
+    `ctgraph_rl.run` builds it as ``Class(observation_spec, action_spec, **yaml)``, with the environment's
+    ``observation_spec_unbatched`` and ``action_spec_unbatched``.
+
     Exploration and sampling draw from torch's global generator, which the run seeds.
     """
 
@@ -50,6 +53,10 @@ class Agent(Protocol):
         Raises:
             FloatingPointError: if a loss or a weight is not finite; names it.
         """
+        ...
+
+    def to(self, device: Any) -> Any:
+        """Move to a device and return itself, as ``torch.nn.Module`` does."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

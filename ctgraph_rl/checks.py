@@ -55,6 +55,22 @@ def fraction(**values: object) -> list[tuple[bool, str]]:
 
 def as_tuple(value: object) -> object:
     """A list-like value as a tuple (yaml has only lists); anything else unchanged."""
-    if isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict)):
-        return tuple(value)
+    if isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict, set, frozenset)):
+        try:
+            return tuple(value)
+        except TypeError:  # an array without dimensions
+            return value
     return value
+
+
+def require_all(kind: type, name: str, values: object) -> tuple:
+    """The items of a list-like value, all of one kind.
+
+    Raises:
+        ValueError: for anything else, or no item.
+    """
+    items = as_tuple(values)
+    holds = isinstance(items, tuple) and len(items) > 0 and all(isinstance(item, kind) for item in items)
+    kinds = sorted({type(item).__name__ for item in items}) if isinstance(items, tuple) else [type(values).__name__]
+    require((holds, f"{name} must be a list with at least one {kind.__name__}, got {', '.join(kinds) or 'none'}"))
+    return items  # type: ignore[return-value]

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from ctgraph_rl.checks import at_least_one, is_int, require
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require
 from ctgraph_rl.task import Task
 
 FINGERPRINT_SCHEMA = 1
@@ -31,9 +31,9 @@ class Block:
     num_frames: int
 
     def __post_init__(self) -> None:
-        tasks = (self.tasks,) if isinstance(self.tasks, Task) else tuple(self.tasks)
+        tasks = (self.tasks,) if isinstance(self.tasks, Task) else as_tuple(self.tasks)
         object.__setattr__(self, "tasks", tasks)
-        only_tasks = bool(tasks) and all(isinstance(task, Task) for task in tasks)
+        only_tasks = isinstance(tasks, tuple) and bool(tasks) and all(isinstance(task, Task) for task in tasks)
         require(
             (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
             (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
@@ -50,7 +50,7 @@ class Block:
         return list(self.tasks) * (num_envs // count)
 
     def frame_rule(self, num_envs: int, name: str) -> tuple[bool, str]:
-        """What must hold for ``num_envs`` rows: whole steps only."""
+        """What must hold for ``num_envs`` rows: whole steps only. ``name`` says which block it is."""
         below = self.num_frames - self.num_frames % num_envs
         near = f"{below} or {below + num_envs}" if below else f"{num_envs}"
         message = f"num_frames={self.num_frames} of {name} must be a multiple of num_envs={num_envs}; nearest: {near}"
@@ -116,8 +116,12 @@ class Curriculum:
     evaluation: Evaluation = field(default_factory=Evaluation)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "blocks", tuple(self.blocks))
-        only_blocks = bool(self.blocks) and all(isinstance(block, Block) for block in self.blocks)
+        object.__setattr__(self, "blocks", as_tuple(self.blocks))
+        only_blocks = (
+            isinstance(self.blocks, tuple)
+            and bool(self.blocks)
+            and all(isinstance(block, Block) for block in self.blocks)
+        )
         require(
             (bool(self.name), "a curriculum needs a name, got an empty one"),
             (is_int(self.version, 1), f"version must be an integer >= 1, got {self.version!r}"),

@@ -302,7 +302,7 @@ def add_cue(images: Tensor, share: Tensor, shows: Tensor) -> Tensor:
 
 
 def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, Shown]:
-    """One step of every row: a pure function, for any shape of rows, under ``torch.vmap`` and ``torch.compile``.
+    """One step of every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
 
     Args:
         state: the rows' states.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +15,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl import dynamics
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Uses
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import ImageSet
@@ -84,13 +86,10 @@ class CTGraphEnv(EnvBase):
         device: torch.device | str = "cpu",
         check_actions: bool = True,
     ) -> None:
-        require((not isinstance(tasks, Task), "tasks must be a list with one Task per row, such as [task] * 512"))
-        tasks = tuple(tasks)
-        pool = tuple(dict.fromkeys(tasks if task_pool is None else task_pool))
+        tasks = require_all(Task, "tasks", tasks)
+        pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
         num_rows = len(tasks)
         require(
-            (num_rows > 0, "tasks must hold at least one task, got none"),
-            (len(pool) > 0, "task_pool must hold at least one task, got none"),
             _seed_rule(seed),
             (isinstance(check_actions, bool), f"check_actions must be true or false, got {check_actions!r}"),
             (is_int(first_row, 0, 2**32 - num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
@@ -144,7 +143,7 @@ class CTGraphEnv(EnvBase):
         Raises:
             ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
         """
-        tasks = tuple(tasks)
+        tasks = require_all(Task, "tasks", tasks)
         different = tuple(dict.fromkeys(tasks))
         unknown = [task for task in different if task not in self._pool]
         n = self.batch_size[0]
@@ -410,6 +409,16 @@ def _bank_key(task: Task) -> tuple[ImageSet, int]:
     return task.images, task.observations.read_rotation
 
 
+def _require_memory(pool: tuple[Task, ...], bytes_each: int) -> None:
+    """Refuse image sets that cannot be held, before anything is allocated."""
+    sets = dict.fromkeys(map(_bank_key, pool))
+    needed = bytes_each * sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    require(
+        (needed < memory, f"the image sets need {needed:,} bytes, and this machine has {memory:,}; use fewer images")
+    )
+
+
 def _shared_bank(pool: tuple[Task, ...]) -> tuple[tuple[int, ...], dict[tuple[ImageSet, int], int], Tensor]:
     """One bank with each different image set of the pool once.
 
@@ -420,6 +429,7 @@ def _shared_bank(pool: tuple[Task, ...]) -> tuple[tuple[int, ...], dict[tuple[Im
     one_hot = all(len(shape) == 1 for shape in shapes)
     require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
     shape = max(shapes)
+    _require_memory(pool, math.prod(shape))
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(_bank_key, pool)):
         images, rotation = key

@@ -48,14 +48,15 @@ class CTGraph:
 
     def __post_init__(self) -> None:
         b, d, p = self.branching_factor, self.depth, self.wait_prob
+        shape_ok = is_int(b, 2) and is_int(d, 1)
+        # 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
+        fits = not shape_ok or (d < 64 and self.num_states <= MAX_STATES)
         require(
             (is_int(b, 2), f"branching_factor must be an integer >= 2, got {b!r}"),
             (is_int(d, 1), f"depth must be an integer >= 1, got {d!r}"),
             (is_real(p, 0) and p < 1, f"wait_prob must be in [0, 1), got {p!r}"),
+            (fits, f"depth={d} with branching_factor={b} gives more than 2**63 - 1 states; use a smaller depth"),
         )
-        # 3**64 > 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
-        fits = d < 64 and self.num_states <= MAX_STATES
-        require((fits, f"depth={d} with branching_factor={b} gives more than 2**63 - 1 states; use a smaller depth"))
         object.__setattr__(self, "wait_prob", float(p))
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, is_int, is_real, require
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require
 from ctgraph_rl.dynamics import STREAM_IMAGES, draw, randint
 
 WHITE = 254
@@ -178,29 +178,34 @@ class GroupedImages(_Generated):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", as_tuple(self.groups))
-        groups, sizes = self.groups, isinstance(self.groups, tuple) and all(is_int(size, 1) for size in self.groups)
-        cells_ok = is_int(self.cells, 1)
+        groups = self.groups
+        groups_ok = isinstance(groups, tuple) and bool(groups) and all(is_int(size, 1) for size in groups)
+        cells = self.cells if is_int(self.cells, 1) else 1
+        most = WHITE * cells**2 // 2  # half the images that differ from a blueprint in one cell
+        wanted = len(groups) * max(groups) if groups_ok else 0
         require(
-            (bool(sizes and groups), f"groups must be the numbers of images of each group, >= 1, got {groups!r}"),
-            (cells_ok, f"cells must be an integer >= 1, got {self.cells!r}"),
+            (groups_ok, f"groups must be the numbers of images of each group, >= 1, got {groups!r}"),
+            *at_least_one(cells=self.cells),
             _seed_rule(self.seed),
-            _size_rule(self.size, self.cells if cells_ok else 1),
+            _size_rule(self.size, cells),
+            (wanted <= most, f"groups need {wanted} images, more than {most}; use more cells"),
+            *self._distance_rules(),
         )
-        most = WHITE * self.cells**2 // 2  # half the images that differ from a blueprint in one cell
-        wanted = len(groups) * max(groups)
-        lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2)
+        object.__setattr__(self, "within", float(self.within))
+        object.__setattr__(self, "between", float(self.between))
+
+    def _distance_rules(self) -> list[tuple[bool, str]]:
+        """What distances can be reached; any up to that of unrelated images as long as the cells are in question."""
+        lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
         within_ok = is_real(self.within, lowest, UNRELATED)
         reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"
         if is_real(self.within, 1e-9, lowest):
             reach += f" for cells={self.cells} (use cells={_cells_for(self.within)} or more)"
         between_ok = is_real(self.between, self.within if within_ok else lowest, UNRELATED)
-        require(
-            (wanted <= most, f"{len(groups)} groups times {max(groups)} images must be <= {most}; use more cells"),
+        return [
             (within_ok, f"within must be in {reach}, got {self.within!r}"),
             (between_ok, f"between must be in [within, {UNRELATED:.5f}], got {self.between!r}"),
-        )
-        object.__setattr__(self, "within", float(self.within))
-        object.__setattr__(self, "between", float(self.between))
+        ]
 
     @property
     def num_images(self) -> int:

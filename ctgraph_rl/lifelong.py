@@ -90,7 +90,12 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     curriculum.evaluation.check(curriculum.tasks)
     for block in curriculum.blocks:
         block.rows(num_envs)
-    require(*(block.frame_rule(num_envs, f"block {i}") for i, block in enumerate(curriculum.blocks, 1)))
+    numbers: dict[int, list[str]] = {}
+    for number, block in enumerate(curriculum.blocks, 1):
+        numbers.setdefault(block.num_frames, []).append(str(number))
+    named = {block.num_frames: f"block {', '.join(numbers[block.num_frames])}" for block in curriculum.blocks}
+    blocks = {block.num_frames: block for block in curriculum.blocks}.values()
+    require(*(block.frame_rule(num_envs, named[block.num_frames]) for block in blocks))
 
 
 @torch.no_grad()

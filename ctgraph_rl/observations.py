@@ -6,7 +6,7 @@ Section 2.3 of the paper. The id ranges are inclusive, as in the paper's JSON (W
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import pairwise
+from itertools import combinations
 
 from ctgraph_rl.checks import as_tuple, is_int, require
 from ctgraph_rl.graph import CTGraph, StateType
@@ -61,6 +61,7 @@ class Observations:
             object.__setattr__(self, "unique_ends", bool(self.unique_decisions or self.unique_waits))
         require(
             *((_is_range(getattr(self, name)), _range_rule(name, getattr(self, name))) for name in ranges),
+            *_overlap_rules({name: getattr(self, name) for name in ranges if _is_range(getattr(self, name))}),
             *_flag_rules(self),
             (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
             (
@@ -68,7 +69,6 @@ class Observations:
                 f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {self.read_rotation!r}",
             ),
         )
-        require(*_overlap_rules({name: getattr(self, name) for name in ranges}))
 
     def ids(self, kind: StateType) -> Ids:
         """First and last id of a kind of state."""
@@ -124,5 +124,5 @@ def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:
     ordered = sorted(ranges.items(), key=lambda item: item[1])
     return [
         (high[0] > low[1], f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later")
-        for (low_name, low), (high_name, high) in pairwise(ordered)
+        for (low_name, low), (high_name, high) in combinations(ordered, 2)
     ]

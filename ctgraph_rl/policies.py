@@ -1,8 +1,8 @@
 """Reference policies that know the hidden state: what can be reached, and what luck gives.
 
 Each is built on the environment that it acts in, takes the data of its rows and writes ``action``:
-``env.rollout(100, OptimalPolicy(env))``, and ``evaluate(OptimalPolicy, tasks)``, which builds it on its own environment.
-Draws come from torch's global generator.
+``env.rollout(100, OptimalPolicy(env))``, and ``evaluate(OptimalPolicy, tasks)``, which builds it on an environment of
+its own. Draws come from torch's global generator.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def performance_table(run_dir: Path | str) -> Table:
     """The performance matrix: mean return on each task after each block."""
     with open(Path(run_dir) / "performance.csv", newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file))
-    table = Table(title="Performance: mean return on each task after each block")
+    table = Table(title=f"{Path(run_dir).name}: mean return on each task after each block")
     for name in header:
         table.add_column(name, justify="right")
     for block, frames, *values in rows:
@@ -112,7 +112,11 @@ def main() -> None:
         parser.error(f"{arguments.run} is no finished run: it has no metrics.json")
     print_summary(arguments.run)
     if arguments.figure is not None:
-        draw_figure(arguments.run, arguments.figure)
+        try:
+            draw_figure(arguments.run, arguments.figure)
+        except (ModuleNotFoundError, OSError, ValueError) as error:
+            parser.error(str(error))
+        print(f"figure: {arguments.figure}")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -82,7 +83,13 @@ OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 @hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
-    run(cfg, Path(HydraConfig.get().runtime.output_dir))
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        run(cfg, run_dir)
+    except BaseException:
+        with suppress(OSError):
+            run_dir.rmdir()  # only a directory that nothing was written into
+        raise
 
 
 def run(cfg: DictConfig, run_dir: Path) -> None:
@@ -130,7 +137,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     different = [key for key in config if runs[0]["config"].get(key) != config[key]]
     if different:
         raise FileExistsError(f"{run_dir} holds a run with another {', '.join(different)}; {advice}")
-    print("this run is complete; overwrite=true runs it again")
+    print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
     return True
 
 
@@ -269,6 +276,9 @@ def main() -> None:
             raise
         print(f"error: {explain(error)}", file=sys.stderr)
         sys.exit(1)
+    except KeyboardInterrupt:
+        print("interrupted; the run cannot be resumed, overwrite=true starts it again", file=sys.stderr)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

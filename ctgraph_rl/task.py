@@ -19,8 +19,8 @@ NOISES = ("additive", "multiplicative")
 MAX_EPISODES = 2**31
 """Episodes are drawn with 32-bit words."""
 
-LARGEST_REWARD = 3.4e38
-"""Rewards are float32."""
+LARGEST_REWARD = 1e30
+"""Rewards are float32, and their sums and noise must stay finite."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,7 @@ class Task:
     goal_change: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        parts = {"graph": CTGraph, "observations": Observations}
-        require(*((isinstance(getattr(self, name), kind), _part_rule(name, kind)) for name, kind in parts.items()))
-        has_images = hasattr(self.images, "bank") and not isinstance(self.images, type)
-        require((has_images, f"images must be an image set such as PaperImages(5), got {self.images!r}"))
+        self._check_parts()
         object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
         one_hot = len(self.images.shape) == 1
@@ -85,6 +82,20 @@ class Task:
         for name in REWARDS:
             object.__setattr__(self, name, float(getattr(self, name)))
 
+    def _check_parts(self) -> None:
+        images, reward_fn = self.images, self.reward_fn
+        has_images = hasattr(images, "bank") and not isinstance(images, type)
+        pays = callable(reward_fn) and not isinstance(reward_fn, type)
+        require(
+            (isinstance(self.graph, CTGraph), f"graph must be a CTGraph, got {self.graph!r}"),
+            (
+                isinstance(self.observations, Observations),
+                f"observations must be Observations, got {self.observations!r}",
+            ),
+            (has_images, f"images must be an image set such as PaperImages(5), got {images!r}"),
+            (pays, f"reward_fn must be a reward such as Needle(), got {reward_fn!r}"),
+        )
+
     def _reward_rules(self) -> list[tuple[bool, str]]:
         cue, change = self.observations.reward_cue, self.goal_change
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
@@ -97,7 +108,6 @@ class Task:
                 change is None or lasts,
                 f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}",
             ),
-            (callable(self.reward_fn) and not isinstance(self.reward_fn, type), _reward_fn_rule(self.reward_fn)),
             (
                 not cue or (is_real(self.goal_reward, 0) and self.goal_reward != 0),
                 f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}",
@@ -154,12 +164,4 @@ class Task:
 
 def _reward_rule(name: str, value: object) -> tuple[bool, str]:
     holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
-    return holds, f"{name} must be a finite number, got {value!r}; rewards are float32"
-
-
-def _reward_fn_rule(value: object) -> str:
-    return f"reward_fn must be an instance such as Needle(), got {value!r}"
-
-
-def _part_rule(name: str, kind: type) -> str:
-    return f"{name} must be a {kind.__name__}"
+    return holds, f"{name} must be a finite number, got {value!r}; at most 1e30 in size"

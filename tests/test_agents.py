@@ -294,7 +294,7 @@ def test_lstm_ppo_remembers_within_an_episode(small_agent):
 
 def test_lstm_ppo_advantages_equal_the_generalised_estimate_by_hand(small_agent):
     sizes = ["agent.num_envs=3", "agent.num_steps=2", "agent.num_minibatches=1", "agent.num_epochs=1"]
-    agent = small_agent("lstm_ppo", [ct_su_b1()], *sizes, "agent.gamma=0.5", "agent.gae_lambda=0.5")
+    agent = small_agent("lstm_ppo", [ct_su_b1()], *sizes, "agent.gamma=0.5", "agent.gae_lambda=0.25")
     batch = batches(agent, ct_su_b1(), 1)[0]
     ended = torch.tensor([[False, False], [True, False], [False, True]]).unsqueeze(-1)
     batch["state_value"] = torch.tensor([1.0, 2.0]).expand(3, 2).unsqueeze(-1).clone()
@@ -308,9 +308,9 @@ def test_lstm_ppo_advantages_equal_the_generalised_estimate_by_hand(small_agent)
     agent._minibatches = lambda batch: (torch.arange(3),)
     learnt = learnt_from(agent, batch)[0]
 
-    # Running on: 1 + 0.5 * 4 - 2 = 1, and (0 + 0.5 * 2 - 1) + 0.25 * 1 = 0.25.
-    # Ended by the first step: 0 - 1 = -1, then as above. Ended by the last: 1 - 2 = -1, and 0 + 0.25 * -1 = -0.25.
-    expected = torch.tensor([[0.25, 1.0], [-1.0, 1.0], [-0.25, -1.0]]).unsqueeze(-1)
+    # Running on: 1 + 0.5 * 4 - 2 = 1, and (0 + 0.5 * 2 - 1) + 0.125 * 1 = 0.125.
+    # Ended by the first step: 0 - 1 = -1, then as above. Ended by the last: 1 - 2 = -1, and 0 + 0.125 * -1 = -0.125.
+    expected = torch.tensor([[0.125, 1.0], [-1.0, 1.0], [-0.125, -1.0]]).unsqueeze(-1)
     torch.testing.assert_close(learnt["advantage"], expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(learnt["value_target"], expected + batch["state_value"], atol=1e-6, rtol=0)
 

@@ -168,3 +168,26 @@ def test_a_reset_clears_all_of_the_episode_in_its_rows_and_leaves_the_others():
         "episodes_left": [1, 2],
         "reward": [0.0, 0.5],
     }
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("state_type", -1), ("state_type", 3), ("node", -1), ("node", 7), ("goal_leaf", 4)]
+)
+def test_a_state_that_its_tree_does_not_have_is_refused_and_changes_nothing(field, value):
+    env = CTGraphEnv([surjective()] * 2)
+    env.reset()
+    before, given = env.get_state(), env.get_state()
+    given[field][1] = value
+
+    with pytest.raises(ValueError, match=r"rows \[1\] of the given state are finished or no states of their trees"):
+        env.reset(TensorDict({"state": given}, [2]), set_state=True)
+
+    assert (env.get_state() == before).all()
+
+
+@pytest.mark.parametrize("given", [None, TensorDict(batch_size=[2]), TensorDict({"state": TensorDict()}, [2])])
+def test_going_back_without_a_whole_state_is_refused(given):
+    env = CTGraphEnv([surjective()] * 2)
+
+    with pytest.raises(ValueError, match="set_state=True needs the rows' state under 'state'"):
+        env.reset(given, set_state=True)

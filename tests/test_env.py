@@ -483,7 +483,7 @@ def test_set_tasks_ends_all_episodes():
         ([FORKS[0], surjective(2, 3)], "set_tasks got tasks that are not in task_pool: .*name them at construction"),
         ([FORKS[0]], "set_tasks needs one task per row, 2 in all, got 1"),
         ([FORKS[0]] * 3, "set_tasks needs one task per row, 2 in all, got 3"),
-        ([], "set_tasks needs one task per row, 2 in all, got 0"),
+        ([], "tasks must be a list with at least one Task, got none"),
     ],
 )
 def test_set_tasks_refuses_what_does_not_fit(tasks, message):
@@ -507,7 +507,7 @@ def test_a_refused_set_tasks_leaves_the_environment_as_it_was():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"tasks": []}, "tasks must hold at least one task, got none"),
+        ({"tasks": []}, "tasks must be a list with at least one Task, got none"),
         ({"task_pool": []}, "task_pool"),
         ({"task_pool": FORKS[1:]}, "set_tasks got tasks that are not in task_pool"),
         ({"seed": -1}, r"seed must be an integer in \[0, 2\*\*63\), got -1"),

@@ -358,7 +358,7 @@ def test_lists_and_whole_numbers_are_equal_to_tuples_and_floats():
         ({"within": 0.0}, "within must be in [0.04053, 0.33464], got 0.0"),
         ({"between": 0.09}, "between must be in [within, 0.33464], got 0.09"),
         ({"between": 0.5}, "between must be in [within, 0.33464], got 0.5"),
-        ({"groups": (700, 1, 1)}, "3 groups times 700 images must be <= 2032; use more cells"),
+        ({"groups": (700, 1, 1)}, "groups need 2100 images, more than 2032; use more cells"),
         ({"groups": (2, 0)}, "groups must be the numbers of images of each group, >= 1, got (2, 0)"),
         ({"groups": ()}, "groups must be the numbers of images of each group, >= 1, got ()"),
         ({"groups": 5}, "groups must be the numbers of images of each group, >= 1, got 5"),
