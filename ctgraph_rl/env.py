@@ -98,7 +98,7 @@ class CTGraphEnv(EnvBase):
         self.check_actions = check_actions
         self._pool = frozenset(pool)
         self._max_branching = max(task.graph.branching_factor for task in pool)
-        self._image_shape, self._bank_start, bank = _shared_bank(pool)
+        self._image_shape, self._bank_start, bank = _shared_bank(pool, num_rows)
         self._make_specs()
         self._register_state(seed)
         self.register_buffer("_row", torch.arange(first_row, first_row + num_rows, device=self.device))
@@ -409,17 +409,19 @@ def _bank_key(task: Task) -> tuple[ImageSet, int]:
     return task.images, task.observations.read_rotation
 
 
-def _require_memory(pool: tuple[Task, ...], bytes_each: int) -> None:
-    """Refuse image sets that cannot be held, before anything is allocated."""
+def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
+    """Refuse image sets and observations that cannot be held, before anything is allocated."""
     sets = dict.fromkeys(map(_bank_key, pool))
-    needed = bytes_each * sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    images_held = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    needed = bytes_each * (images_held + 2 * num_rows)  # a step holds two observations of every row
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    require(
-        (needed < memory, f"the image sets need {needed:,} bytes, and this machine has {memory:,}; use fewer images")
-    )
+    message = f"images and observations need {needed:,} bytes, this machine has {memory:,}; use fewer images or rows"
+    require((needed < memory, message))
 
 
-def _shared_bank(pool: tuple[Task, ...]) -> tuple[tuple[int, ...], dict[tuple[ImageSet, int], int], Tensor]:
+def _shared_bank(
+    pool: tuple[Task, ...], num_rows: int
+) -> tuple[tuple[int, ...], dict[tuple[ImageSet, int], int], Tensor]:
     """One bank with each different image set of the pool once.
 
     Returns:
@@ -429,7 +431,7 @@ def _shared_bank(pool: tuple[Task, ...]) -> tuple[tuple[int, ...], dict[tuple[Im
     one_hot = all(len(shape) == 1 for shape in shapes)
     require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
     shape = max(shapes)
-    _require_memory(pool, math.prod(shape))
+    _require_memory(pool, math.prod(shape), num_rows)
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(_bank_key, pool)):
         images, rotation = key

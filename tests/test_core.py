@@ -8,8 +8,11 @@ import pytest
 import torch
 from oracles import act, confounding, scripts, surjective
 from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv, check_env_specs
+from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
-from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, ReferenceLinear, dynamics
+from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, OneHot, ReferenceLinear, dynamics
+from ctgraph_rl.policies import OptimalPolicy
 
 EVERYTHING = replace(
     confounding(p=0.5, read_noise=20, read_rotation=5, reward_cue=True),
@@ -191,3 +194,27 @@ def test_going_back_without_a_whole_state_is_refused(given):
 
     with pytest.raises(ValueError, match="set_state=True needs the rows' state under 'state'"):
         env.reset(given, set_state=True)
+
+
+def test_torchrl_finds_the_specs_of_rows_that_use_everything_in_order():
+    check_env_specs(make_env(), break_when_any_done="both")
+
+
+def test_torchrls_recorder_makes_a_video_of_the_rows(tmp_path):
+    env = make_env()
+    video = VideoRecorder(CSVLogger("run", log_dir=str(tmp_path), video_format="pt"), "rows", in_keys=["pixels"])
+    recorded = TransformedEnv(env, Compose(PixelRenderTransform(out_keys=["pixels"]), video))
+
+    pixels = recorded.rollout(5, OptimalPolicy(env), break_when_any_done=False)["next", "pixels"]
+    recorded.transform.dump()
+
+    assert pixels.shape == (6, 5, 192, 384, 3)
+    assert pixels.dtype == torch.uint8
+    assert len(list(tmp_path.rglob("*.pt"))) == 1
+
+
+def test_an_observation_that_no_machine_can_hold_is_refused_before_it_is_made():
+    many = replace(surjective(), images=OneHot(10**7))
+
+    with pytest.raises(ValueError, match=r"images and observations need 100,0.* bytes, this machine has"):
+        CTGraphEnv([many])

@@ -301,3 +301,37 @@ def test_a_folder_that_shadows_our_curricula_is_refused_with_its_path(checkout, 
     assert f"'curricula' was found in {tmp_path / 'curricula'}" in result.stderr
     assert "Traceback" not in result.stderr and result.stdout == ""
     assert not any(path.endswith("run.jsonl") for path in files_in(tmp_path))
+
+
+def test_a_users_own_reward_plugs_in_through_yaml(monkeypatch, tmp_path, capsys):
+    (tmp_path / "my_rewards.py").write_text(
+        "from dataclasses import dataclass\n\n@dataclass(frozen=True)\nclass Flat:\n"
+        "    def __call__(self, arrival):\n        return arrival.leaf.float() * 0 + 0.5\n"
+    )
+    (tmp_path / "my_conf" / "curriculum").mkdir(parents=True)
+    (tmp_path / "my_conf" / "curriculum" / "mine.yaml").write_text(
+        """
+_target_: ctgraph_rl.Curriculum
+name: mine
+version: 1
+source: here
+blocks:
+  - _target_: ctgraph_rl.Block
+    num_frames: 1024
+    tasks:
+      _target_: ctgraph_rl.Task
+      graph: {_target_: ctgraph_rl.CTGraph, branching_factor: 2, depth: 1}
+      goal: [2]
+      observations: {_target_: ctgraph_rl.Observations, wait_ids: [2, 2], decision_ids: [3, 3], end_ids: [4, 4]}
+      images: {_target_: ctgraph_rl.PaperImages, num_images: 5}
+      reward_fn: {_target_: my_rewards.Flat}
+"""
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    code = command_line(monkeypatch, "--config-dir=my_conf", "curriculum=mine", *SHORT[1:], "hydra.run.dir=out")
+
+    training = RunLog.read("out/run.jsonl").of_kind("training")
+    assert code == 0
+    assert all(m["return_mean"] <= 0.5 for m in training) and training[0]["return_mean"] > 0
