@@ -382,12 +382,11 @@ def _reward(before: State, after: State, state: RowState, params: RowParams, use
     Products are of two float32 numbers in float64, hence exact: fused multiply-add changes nothing.
     """
     g, entered = params.g, after.state_type != before.state_type
-    paid = (_share(after, state.goal_leaf, params, uses).double() * g.goal_reward).float()
+    paid = (_share(after, state.goal_leaf, params, uses).double() * g.goal_reward).float().double()
     if uses.reward_noise:
         word = draw(params.seed, params.row, state.tick, STREAM_REWARD)[0]
         noise = (normal(word, params.normal_table) * g.reward_std).float()
-        paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
-    paid = paid.double()
+        paid = paid + noise.double() * torch.where(g.multiplicative, paid, 1.0)
     at_end = entered & (after.state_type == _END)
     failed = entered & (after.state_type == _FAIL)
     return (torch.where(at_end, paid, torch.where(failed, g.fail_reward, 0.0).double()) + g.step_reward).float()

@@ -410,7 +410,9 @@ def _bank_key(task: Task) -> tuple[ImageSet, int]:
 
 
 def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
-    """Refuse image sets and observations that cannot be held, before anything is allocated."""
+    """Refuse image sets and observations that cannot be held, before anything is allocated; POSIX systems only."""
+    if not hasattr(os, "sysconf"):
+        return
     sets = dict.fromkeys(map(_bank_key, pool))
     images_held = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
     needed = bytes_each * (images_held + 2 * num_rows)  # a step holds two observations of every row

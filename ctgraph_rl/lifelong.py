@@ -88,14 +88,12 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
         ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
     """
     curriculum.evaluation.check(curriculum.tasks)
+    rules = {}
     for block in curriculum.blocks:
         block.rows(num_envs)
-    numbers: dict[int, list[str]] = {}
-    for number, block in enumerate(curriculum.blocks, 1):
-        numbers.setdefault(block.num_frames, []).append(str(number))
-    named = {block.num_frames: f"block {', '.join(numbers[block.num_frames])}" for block in curriculum.blocks}
-    blocks = {block.num_frames: block for block in curriculum.blocks}.values()
-    require(*(block.frame_rule(num_envs, named[block.num_frames]) for block in blocks))
+        alike = [str(i) for i, other in enumerate(curriculum.blocks, 1) if other.num_frames == block.num_frames]
+        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike)}")
+    require(*rules.values())
 
 
 @torch.no_grad()
