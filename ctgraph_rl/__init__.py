@@ -21,11 +21,14 @@ if TYPE_CHECKING:
     from ctgraph_rl.images import ImageFile as ImageFile
     from ctgraph_rl.images import OneHot as OneHot
     from ctgraph_rl.images import PaperImages as PaperImages
+    from ctgraph_rl.images import count_repeats as count_repeats
     from ctgraph_rl.images import distances as distances
     from ctgraph_rl.lifelong import evaluate as evaluate
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
+    from ctgraph_rl.reference import ReferenceImages as ReferenceImages
+    from ctgraph_rl.reference import ReferenceOneHot as ReferenceOneHot
     from ctgraph_rl.rewards import Gradient as Gradient
     from ctgraph_rl.rewards import Needle as Needle
     from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
@@ -44,13 +47,16 @@ _HOMES = {
     "ImageFile": "images",
     "Gradient": "rewards",
     "Needle": "rewards",
+    "ReferenceImages": "reference",
     "ReferenceLinear": "rewards",
+    "ReferenceOneHot": "reference",
     "Observations": "observations",
     "OneHot": "images",
     "PaperImages": "images",
     "RunLog": "log",
     "StateType": "graph",
     "Task": "task",
+    "count_repeats": "images",
     "distances": "images",
     "evaluate": "lifelong",
     "learn_curriculum": "lifelong",

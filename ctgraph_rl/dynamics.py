@@ -3,12 +3,7 @@
 A state is two integers per row, ``state_type`` and ``node``: the heap index of the position in the tree
 (the root is 0, branch a of node n is b * n + a). A wait state carries the node that it leads to.
 
-Randomness is Philox4x32-10 in counter mode (Salmon et al. 2011). The 128-bit counter holds (ticks of the
-row, row, stream and block), the 64-bit key holds the seed. Different (seed, row, stream, tick) are different
-inputs of a bijection per key, so no two rows share a block by construction, and a row's draws depend on nothing
-but its seed, its number and how many observations it has had.
-
-Shapes: N rows; every tensor is [N] unless said otherwise. Unsigned 32-bit words are held in int64.
+Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is drawn by counter, see `philox`.
 """
 
 from __future__ import annotations
@@ -19,99 +14,27 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.graph import WAIT_ACTION, StateType
+from ctgraph_rl.philox import (
+    STREAM_GOAL,
+    STREAM_NOISE,
+    STREAM_REWARD,
+    STREAM_STEP,
+    draw,
+    normal,
+    randint,
+    randint_wide,
+)
 from ctgraph_rl.rewards import Arrival, RewardFn
+from ctgraph_rl.rotation import turn
 
 _HOME, _WAIT, _DECISION, _END, _FAIL = map(int, StateType)  # plain integers: torch.compile knows no IntEnum
-
-_WORD = 0xFFFFFFFF
-_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
-_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
-_ROUNDS = 10
-
-STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL = range(5)
-"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal."""
-_STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
-
-
-def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-    """Philox4x32-10: four random words for a counter of four words and a key of two.
-
-    Args:
-        counter: four int64 tensors of broadcastable shapes with values in [0, 2**32).
-        key: two int64 tensors, likewise.
-
-    Returns:
-        Four int64 tensors with values in [0, 2**32).
-    """
-    c0, c1, c2, c3 = counter
-    k0, k1 = key
-    for _ in range(_ROUNDS):
-        even, odd = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]  # the low 64 bits are exact
-        c0, c1 = ((odd >> 32) ^ c1 ^ k0) & _WORD, odd & _WORD
-        c2, c3 = ((even >> 32) ^ c3 ^ k1) & _WORD, even & _WORD
-        k0, k1 = (k0 + _KEY_STEPS[0]) & _WORD, (k1 + _KEY_STEPS[1]) & _WORD
-    return c0, c1, c2, c3
-
-
-def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> tuple[Tensor, ...]:
-    """Four random words per element for (seed, row, tick, stream, block).
-
-    Args:
-        seed: int64 >= 0, any shape that broadcasts with the others.
-        row: int64 in [0, 2**32).
-        tick: int64 >= 0.
-        stream: one of the ``STREAM_*`` constants.
-        block: number of the block in [0, 2**28), for uses that need more than four words.
-    """
-    last = torch.as_tensor(block, device=tick.device) + (stream << _STREAM_SHIFT)
-    return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
-
-
-def randint(word: Tensor, high: Tensor | int) -> Tensor:
-    """A word as an integer in [0, high); each value's probability is off by less than 2**-32."""
-    return (word * high) >> 32
-
-
-def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
-    """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
-    upper, lower = words
-    high_upper, high_lower = high >> 32, high & _WORD
-    middle = upper * high_lower  # up to 64 bits: only its halves are used
-    carry = (((lower * high_lower) >> 32) & _WORD) + (middle & _WORD) + lower * high_upper
-    return upper * high_upper + ((middle >> 32) & _WORD) + (carry >> 32)
-
-
-_NORMAL_CELLS = 256
-_NORMAL_UNIT = 2.0**-20
-
-
-def normal_table() -> Tensor:
-    """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30, for `normal`; float64."""
-    cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64)
-    octave = (cell / _NORMAL_CELLS).floor()
-    tail = (1 + cell / _NORMAL_CELLS - octave) * 2 ** (octave - 1 - 32)
-    return (-torch.special.ndtri(tail) / _NORMAL_UNIT).round() * _NORMAL_UNIT
-
-
-def normal(word: Tensor, table: Tensor) -> Tensor:
-    """A word as a standard normal number, a multiple of 2**-20 up to 6.3 in size; float64.
-
-    The inverse distribution function by linear interpolation in 256 cells per octave of the tail probability. Every
-    operation is exact in float64, so devices and compiled code agree bit by bit.
-    """
-    tail = ((word >> 1).to(torch.float64) + 0.5).view(torch.int64)  # the bits of a double: octave, cell, place in it
-    cell = (tail >> 44) - (1022 << 8)
-    place = (tail & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
-    low, high = table[cell], table[cell + 1]
-    size = ((low + (high - low) * place) / _NORMAL_UNIT).round() * _NORMAL_UNIT
-    return torch.where((word & 1).bool(), size, -size)
 
 
 class State(NamedTuple):
     """Where each row is."""
 
-    state_type: Tensor
-    node: Tensor
+    state_type: Tensor  # uint8
+    node: Tensor  # int64
 
 
 class TreeParams(NamedTuple):
@@ -120,19 +43,37 @@ class TreeParams(NamedTuple):
     branching_factor: Tensor
     first_leaf: Tensor  # heap index of the first end state, the number of decision states
     stay_below: Tensor  # wait_prob * 2**63
+    extra_end_step: Tensor | None = None  # bool: an end state takes one more action; None for no row
+
+
+class LegacyIndex(NamedTuple):
+    """How `Observations.legacy_index` numbers the states of each row's task; int64."""
+
+    level_first: Tensor  # [N, D + 1]: first node of a level, in rows of less depth 2**63 - 1 beyond it
+    level_shift: Tensor  # [N, D + 1]: what is added to a node of the level
+    num_ids: Tensor  # [N, 5]: the number is taken modulo it; 1 where ids are not unique or not legacy
 
 
 class ObservationParams(NamedTuple):
-    """What the observation process X needs to know of each row's task; int64 but for ``unique``."""
+    """What the observation process X and the reading of images need to know of each row's task; int64 if not said.
 
-    first_id: Tensor  # [N, 5], by state type
-    num_ids: Tensor  # [N, 5]
-    unique: Tensor  # [N, 5] bool: the id follows from the node instead of a draw
-    node_offset: Tensor  # [N, 5]: the node that shows the first id
+    An image is a row of the bank: the first view of the state's kind, plus the node's where ids are unique, plus a draw
+    of an id, plus a draw of a view, which is one of the id's instances in one of its rotations.
+    """
+
+    first_view: Tensor  # [N, 5], by state type: bank row of the first id; where unique, of node 0
+    views_per_node: Tensor  # [N, 5]: bank rows from one node to the next, 0 where ids are not unique
+    num_ids: Tensor  # [N, 5]: how many ids are drawn from; 1 where they are unique
     bank_start: Tensor  # first bank row of the task's image set
-    num_views: Tensor  # bank rows of one id: its instances, each in all rotations
+    num_views: Tensor  # bank rows of one id
+    num_angles: Tensor  # rotations that are not in the bank but come after the noise, at least 1
     read_noise: Tensor
     reward_cue: Tensor  # bool: end states show the reward
+    cue_wraps: Tensor  # bool
+    cue_element: Tensor  # which element of a vector shows it
+    white: Tensor  # float64: brightness of the cue for the goal's reward
+    legacy: LegacyIndex | None = None
+    taps: tuple[Tensor, Tensor] | None = None  # of `num_angles` rotations, see `rotation.taps_of`
 
 
 class RewardParams(NamedTuple):
@@ -148,12 +89,13 @@ class RewardParams(NamedTuple):
     multiplicative: Tensor  # bool: the noise is a share of the reward
     change_first: Tensor  # int64: a goal lasts at least so many episodes; 0 for ever
     change_last: Tensor  # int64: and at most so many
+    legacy_change: Tensor  # bool: the first goal lasts one episode less
 
 
 class RowParams(NamedTuple):
     """Everything that stays the same between two changes of tasks."""
 
-    seed: Tensor  # int64 scalar
+    seed: Tensor  # int64 [1], or [N] for rows with seeds of their own
     row: Tensor  # numbers of the rows
     tree: TreeParams
     x: ObservationParams
@@ -165,19 +107,29 @@ class RowParams(NamedTuple):
 class Uses(NamedTuple):
     """What the rows of a batch have use for, as plain Python values; the rest is not computed."""
 
-    draws: bool = True
+    waits: bool = True  # p > 0
+    unique_ids: bool = True
+    drawn_ids: bool = True
+    views: bool = True
     pixel_noise: bool = True
     reward_noise: bool = True
+    fail_reward: bool = True
+    step_reward: bool = True
     reward_cue: bool = True
     goal_change: bool = True
     max_depth: int = 63
     reward_fns: tuple[RewardFn, ...] = ()
 
+    @property
+    def draws(self) -> bool:
+        """Whether a tick needs random words."""
+        return self.waits or self.drawn_ids or self.views
+
 
 class RowState(NamedTuple):
-    """All that changes in a row; int64 but for ``episode_reward``."""
+    """All that changes in a row; int64 if not said."""
 
-    state_type: Tensor
+    state_type: Tensor  # uint8
     node: Tensor
     tick: Tensor  # observations so far, of all episodes
     step_count: Tensor
@@ -191,7 +143,6 @@ class Shown(NamedTuple):
     """What a row shows."""
 
     observation: Tensor  # uint8 [N, *shape]
-    observation_id: Tensor  # int64
     outcome: Tensor  # uint8
     leaf: Tensor  # int64
     done: Tensor  # bool
@@ -204,30 +155,43 @@ NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
 
 
-def transition(state: State, action: Tensor, stays: Tensor, tree: TreeParams) -> State:
+def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams) -> State:
     """One step of the tree, sections 2.1 and 2.2 of the paper.
 
     Args:
         state: current state; an end or fail state is absorbing.
         action: int64, 0 waits and 1..b decides; above a row's b it fails as a wrong action does.
-        stays: bool, the row's draw with probability p.
+        stays: bool, the row's draw with probability p; None if no row ever stays.
         tree: the rows' trees.
 
     Returns:
-        The next state. ``node`` of a fail state is where it failed.
+        The next state. ``node`` of a fail state is where it failed. An episode with an extra end step is over in a home
+        state whose node is an end state's.
     """
     kind, node = state
     at_home, at_wait, at_decision = kind == _HOME, kind == _WAIT, kind == _DECISION
     waits = action == WAIT_ACTION
     decides = at_decision & (action > WAIT_ACTION) & (action <= tree.branching_factor)
-    arrival = torch.where(node >= tree.first_leaf, _END, _DECISION)
-    after_wait = torch.where(waits, torch.where(stays, kind, arrival), _FAIL)
-    after_decision = torch.where(decides, _WAIT, _FAIL)
-    next_kind = torch.where(at_home, _WAIT, kind)
-    next_kind = torch.where(at_wait, after_wait, next_kind)
-    next_kind = torch.where(at_decision, after_decision, next_kind)
+    arrival = torch.where(node >= tree.first_leaf, _END, _DECISION).to(torch.uint8)
+    leaves = at_wait & waits
+    fails = (at_wait & ~waits) | (at_decision & ~decides)
+    if stays is not None:
+        leaves = leaves & ~stays
+    next_kind = torch.where(leaves, arrival, kind).masked_fill(at_home | decides, _WAIT).masked_fill(fails, _FAIL)
     next_node = torch.where(decides, node * tree.branching_factor + action, node)
+    if tree.extra_end_step is not None:
+        over = ((kind == _END) & tree.extra_end_step) | (at_home & (node > 0))
+        next_kind = next_kind.masked_fill(over, _HOME)
     return State(next_kind, next_node)
+
+
+def is_done(state: State | RowState, tree: TreeParams) -> Tensor:
+    """bool: the episode is over, so the row needs a reset."""
+    done = state.state_type >= _END
+    if tree.extra_end_step is None:
+        return done
+    waits_for_one_more = (state.state_type == _END) & tree.extra_end_step
+    return (done & ~waits_for_one_more) | ((state.state_type == _HOME) & (state.node > 0))
 
 
 def stays(words: tuple[Tensor, ...], tree: TreeParams) -> Tensor:
@@ -235,32 +199,54 @@ def stays(words: tuple[Tensor, ...], tree: TreeParams) -> Tensor:
     return ((words[0] << 31) | (words[1] >> 1)) < tree.stay_below
 
 
-def observation_id(state: State, word: Tensor, params: ObservationParams) -> Tensor:
-    """X: the id that a state shows, by its node where ids are unique, else drawn from its subset."""
-    kind = state.state_type.unsqueeze(-1)
+def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
+    """X: the first view in the bank of the id that a state shows, by its node or drawn with a word."""
+    kind = state.state_type.long().unsqueeze(-1)
 
     def of_kind(table: Tensor) -> Tensor:
         return table.gather(-1, kind).squeeze(-1)
 
-    by_node = state.node - of_kind(params.node_offset)
-    drawn = randint(word, of_kind(params.num_ids))
-    return of_kind(params.first_id) + torch.where(of_kind(params.unique), by_node, drawn)
+    rows = of_kind(x.first_view)
+    if uses.unique_ids:
+        rows = rows + state.node * of_kind(x.views_per_node)
+    if x.legacy is not None:
+        level = (state.node.unsqueeze(-1) >= x.legacy.level_first).sum(-1, keepdim=True) - 1
+        number = state.node + x.legacy.level_shift.gather(-1, level).squeeze(-1)
+        rows = rows + number % of_kind(x.legacy.num_ids) * x.num_views
+    if uses.drawn_ids:
+        rows = rows + randint(word, of_kind(x.num_ids)) * x.num_views
+    return rows
 
 
-def read_images(bank: Tensor, ids: Tensor, word: Tensor, params: ObservationParams) -> Tensor:
-    """The images of observation ids: a random instance, rotated by random whole degrees in 0..read_rotation.
+def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """The ids that rows show, int64 [N]."""
+    rows = bank_rows(state, _words(state, params, uses)[2], params.x, uses)
+    return (rows - params.x.bank_start) // params.x.num_views
+
+
+def observe(state: RowState, words: tuple[Tensor, ...], params: RowParams, uses: Uses) -> Tensor:
+    """The images that rows show: a random view of the id, with noise, late rotation and reward cue. uint8 [N, *shape].
 
     Args:
-        bank: uint8 [B, *shape], per image set and id all instances and rotations in a row.
-        ids: observation ids.
-        word: random words that choose the view.
-        params: the rows' observation processes.
-
-    Returns:
-        uint8 [N, *shape].
+        state: the rows' states.
+        words: the small draws of the states' ticks; word 2 draws the id and word 3 the view.
+        params: the rows' tasks.
+        uses: what the rows have use for.
     """
-    index = params.bank_start + ids * params.num_views + randint(word, params.num_views)
-    return bank.index_select(0, index)
+    x = params.x
+    rows, angle = bank_rows(state, words[2], x, uses), None
+    if uses.views:
+        view = randint(words[3], x.num_views * x.num_angles)
+        rows, angle = rows + view // x.num_angles, view % x.num_angles
+    images = params.bank.index_select(0, rows)
+    if uses.pixel_noise:
+        images = add_noise(images, params.seed, params.row, state.tick, x.read_noise)
+    if x.taps is not None and angle is not None:
+        images = turn(images, angle, x.taps)
+    if uses.reward_cue:
+        level = cue_level((state.reward - params.g.step_reward).double() / params.g.goal_reward, x.white, x.cue_wraps)
+        images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
+    return images
 
 
 def add_noise(images: Tensor, seed: Tensor, row: Tensor, tick: Tensor, read_noise: Tensor) -> Tensor:
@@ -278,27 +264,44 @@ def add_noise(images: Tensor, seed: Tensor, row: Tensor, tick: Tensor, read_nois
     """
     pixels = images[0].numel()
     blocks = torch.arange((pixels + 3) // 4, device=images.device)
-    words = draw(seed, row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_NOISE, blocks)
+    words = draw(seed.unsqueeze(-1), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_NOISE, blocks)
     noise = randint(torch.stack(words, -1).flatten(1)[:, :pixels], read_noise.unsqueeze(-1) + 1)
     return (images + noise.view(images.shape)).clamp_max(255).to(torch.uint8)
 
 
-def add_cue(images: Tensor, share: Tensor, shows: Tensor) -> Tensor:
-    """Show the reward in the images of end states: the middle half becomes a square as bright as the reward.
+def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:
+    """The brightness of a reward: white for the goal's, 0 for none, in between cut off; uint8.
 
     Args:
-        images: uint8 [N, 1, r, r].
-        share: float32 reward as a share of the goal's, shown as 0 (black) for 0 or less to 254 for 1 or more.
+        share: float64, the reward as a share of the goal's.
+        white: float64.
+        wraps: bool, the rows where a level out of range is taken modulo 256; in the others it saturates.
+    """
+    level = (share * white).trunc()
+    saturated = torch.minimum(level.clamp_min(0), white.trunc())
+    return torch.where(wraps, level.remainder(256), saturated).to(torch.uint8)
+
+
+def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Tensor:
+    """Show a brightness as a square in the middle half of images, or as an element of vectors.
+
+    Args:
+        images: uint8 [N, 1, r, r] or [N, K].
+        level: uint8.
         shows: bool, the rows that show it.
+        element: int64, which element of a vector shows it.
 
     Returns:
-        uint8 [N, 1, r, r].
+        uint8 of the shape of ``images``.
     """
-    size = images.shape[-1]
-    inside = torch.zeros(size, dtype=torch.bool, device=images.device)
-    inside[size // 4 : size - size // 4] = True
-    level = (share.clamp(0, 1) * 254).to(torch.uint8).view(-1, 1, 1, 1)
-    return torch.where(shows.view(-1, 1, 1, 1) & inside & inside.unsqueeze(-1), level, images)
+    size, ones = images.shape[-1], (1,) * (images.ndim - 1)
+    place = torch.arange(size, device=images.device)
+    if images.ndim == 2:
+        inside = place == element.unsqueeze(-1)
+    else:
+        middle = (place >= size // 4) & (place < size - size // 4)
+        inside = middle & middle.unsqueeze(-1)
+    return torch.where(shows.view(-1, *ones) & inside, level.view(-1, *ones), images)
 
 
 def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, Shown]:
@@ -313,10 +316,16 @@ def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tupl
     Returns:
         The next states, with the step's reward, and what they show.
     """
+    state, words = advance(state, action, params, uses)
+    return state, _show(state, words, params, uses)
+
+
+def advance(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, tuple[Tensor, ...]]:
+    """The step without what it shows: the next states, with the step's reward, and the draws of the tick."""
     state = state._replace(tick=state.tick + 1)
     words = _words(state, params, uses)
     before = State(state.state_type, state.node)
-    after = transition(before, action, stays(words, params.tree), params.tree)
+    after = transition(before, action, stays(words, params.tree) if uses.waits else None, params.tree)
     reward = _reward(before, after, state, params, uses)
     state = state._replace(
         state_type=after.state_type,
@@ -325,7 +334,7 @@ def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tupl
         episode_reward=state.episode_reward + reward,
         reward=reward,
     )
-    return state, _show(state, words, params, uses)
+    return state, words
 
 
 def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, Shown]:
@@ -340,6 +349,12 @@ def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> tuple
     Returns:
         The states, and what all rows show (the others show what they showed before).
     """
+    state = begin(state, mask, params, uses)
+    return state, show(state, params, uses)
+
+
+def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowState:
+    """The reset without what it shows."""
     state = state._replace(
         state_type=state.state_type.masked_fill(mask, _HOME),
         node=state.node.masked_fill(mask, 0),
@@ -350,7 +365,7 @@ def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> tuple
     )
     if uses.goal_change:
         state = _count_episode(state, mask, params)
-    return state, show(state, params, uses)
+    return state
 
 
 def show(state: RowState, params: RowParams, uses: Uses) -> Shown:
@@ -369,27 +384,32 @@ def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState
     """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
     g, left = params.g, state.episodes_left
     words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
-    lasts = g.change_first + randint(words[0], g.change_last - g.change_first + 1)
-    over = mask & (left == 1)
+    span = g.change_last - g.change_first + 1
+    first, second = (g.change_first + randint(word, span) for word in (words[0], words[3]))
+    begins = mask & (left == 0)
+    left = torch.where(begins, first - g.legacy_change.long(), left - mask.long())
+    over = mask & (left == 0) & (g.change_first > 0)
     goal = torch.where(over, randint_wide((words[1], words[2]), g.num_leaves), state.goal_leaf)
-    left = torch.where(mask, torch.where(left <= 1, lasts, left - 1), left)
-    return state._replace(goal_leaf=goal, episodes_left=left)
+    return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
 
 
 def _reward(before: State, after: State, state: RowState, params: RowParams, uses: Uses) -> Tensor:
     """float32: the step's own reward, and what is paid on entering an end or a fail state.
 
-    Products are of two float32 numbers in float64, hence exact: fused multiply-add changes nothing.
+    Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
     g, entered = params.g, after.state_type != before.state_type
-    paid = (_share(after, state.goal_leaf, params, uses).double() * g.goal_reward).float().double()
+    paid = _share(after, state.goal_leaf, params, uses) * g.goal_reward
     if uses.reward_noise:
         word = draw(params.seed, params.row, state.tick, STREAM_REWARD)[0]
         noise = (normal(word, params.normal_table) * g.reward_std).float()
-        paid = paid + noise.double() * torch.where(g.multiplicative, paid, 1.0)
-    at_end = entered & (after.state_type == _END)
-    failed = entered & (after.state_type == _FAIL)
-    return (torch.where(at_end, paid, torch.where(failed, g.fail_reward, 0.0).double()) + g.step_reward).float()
+        paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
+    reward = torch.where(entered & (after.state_type == _END), paid, 0.0)
+    if uses.fail_reward:
+        reward = torch.where(entered & (after.state_type == _FAIL), g.fail_reward, reward)
+    if uses.step_reward:
+        reward = reward.double() + g.step_reward
+    return reward.float()
 
 
 def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
@@ -404,16 +424,11 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
 
 def _show(state: RowState, words: tuple[Tensor, ...], params: RowParams, uses: Uses) -> Shown:
     """Observation, outcome, leaf and done of states."""
-    x, at_end = params.x, state.state_type == _END
-    ids = observation_id(State(state.state_type, state.node), words[2], x)
-    images = read_images(params.bank, ids, words[3], x)
-    if uses.pixel_noise:
-        images = add_noise(images, params.seed, params.row, state.tick, x.read_noise)
-    if uses.reward_cue:
-        share = (state.reward - params.g.step_reward) / params.g.goal_reward
-        images = add_cue(images, share, at_end & x.reward_cue)
-    failed = state.state_type == _FAIL
-    leaf = torch.where(at_end, state.node - params.tree.first_leaf, NO_LEAF)
-    arrived = torch.where(leaf == state.goal_leaf, OUTCOME_GOAL, OUTCOME_OTHER_END)
-    outcome = torch.where(at_end, arrived, torch.where(failed, OUTCOME_FAIL, OUTCOME_RUNNING))
-    return Shown(images, ids, outcome.to(torch.uint8), leaf, at_end | failed)
+    done = is_done(state, params.tree)
+    leaf = torch.where(done & (state.state_type != _FAIL), state.node - params.tree.first_leaf, NO_LEAF)
+    return Shown(observe(state, words, params, uses), outcome(state, leaf, done), leaf, done)
+
+
+def outcome(state: RowState, leaf: Tensor, done: Tensor) -> Tensor:
+    """The ``OUTCOME_*`` of rows, uint8."""
+    return done.to(torch.uint8) + (leaf != NO_LEAF) + (leaf == state.goal_leaf)

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require
-from ctgraph_rl.dynamics import STREAM_IMAGES, draw, randint
+from ctgraph_rl.philox import STREAM_IMAGES, draw, randint
+from ctgraph_rl.rotation import rotate, rotations
 
 WHITE = 254
 """Brightest level of the generated sets, and the unit of distances."""
@@ -31,13 +32,14 @@ UNRELATED = (WHITE + 2) / (3 * (WHITE + 1))
 """256/765: the expected distance of two images whose cells are independent and uniform over 0..254."""
 
 _GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperImages` uses block 0
-_ROTATED_AT_ONCE = 256
 
 
 class ImageSet(Protocol):
     """What is behind the observation ids: a frozen dataclass, equal and hashable by value.
 
     An id has ``num_variants`` images. Every observation shows one of them, drawn uniformly together with its rotation.
+    Two more attributes are optional: ``white``, the brightest level (254 if missing), and ``cue_element``, True for
+    vectors whose last element is free to show the reward.
     """
 
     @property
@@ -63,6 +65,16 @@ class ImageSet(Protocol):
         ...
 
 
+def has_cue_element(images: ImageSet) -> bool:
+    """Whether observations are vectors whose last element shows the reward of end states."""
+    return getattr(images, "cue_element", False)
+
+
+def white_level(images: ImageSet) -> float:
+    """The brightest level of an image set."""
+    return getattr(images, "white", WHITE)
+
+
 @dataclass(frozen=True)
 class OneHot:
     """Ids as one-hot vectors, the paper's 1D observations.
@@ -74,6 +86,7 @@ class OneHot:
     num_images: int
 
     num_variants = 1
+    white = 1
 
     def __post_init__(self) -> None:
         require((is_int(self.num_images, 1), f"num_images must be an integer >= 1, got {self.num_images!r}"))
@@ -106,7 +119,7 @@ class _Generated:
 
     def bank(self, read_rotation: int) -> Tensor:
         """See `ImageSet`."""
-        return _rotations(self.images, read_rotation)
+        return rotations(self.images, read_rotation)
 
 
 @dataclass(frozen=True)
@@ -280,7 +293,7 @@ class ImageFile:
 
     def bank(self, read_rotation: int) -> Tensor:
         """See `ImageSet`."""
-        return _rotations(self.images, read_rotation)
+        return rotations(self.images, read_rotation)
 
 
 class Distances(NamedTuple):
@@ -326,49 +339,11 @@ def _counts_up_to_level(images: Tensor) -> Tensor:
     return torch.bincount(place.flatten(), minlength=256 * count).view(count, 256).cumsum(1).flatten()
 
 
-def rotate(images: Tensor, degrees: int) -> Tensor:
-    """Rotate images counter-clockwise about their centre, bilinear, black outside.
-
-    Args:
-        images: uint8 [n, r, r].
-        degrees: whole degrees.
-
-    Returns:
-        uint8 [n, r, r], rounded to the nearest level. Integer arithmetic with 16-bit weights: equal on every machine.
-    """
-    if degrees % 360 == 0:
-        return images
-    index, weight = _rotation_taps(images.shape[-1], degrees)
-    taps = images.flatten(1).to(torch.int64)[:, index]
-    return (((taps * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view_as(images)
-
-
-@lru_cache(maxsize=512)
-def _rotation_taps(size: int, degrees: int) -> tuple[Tensor, Tensor]:
-    """For each pixel the four source pixels and their weights * 2**16; both int64 [r * r, 4]."""
-    angle, centre = math.radians(degrees), (size - 1) / 2
-    grid = torch.arange(size, dtype=torch.float64) - centre
-    y, x = torch.meshgrid(grid, grid, indexing="ij")
-    source_x = math.cos(angle) * x - math.sin(angle) * y + centre
-    source_y = math.sin(angle) * x + math.cos(angle) * y + centre
-    taps, weights = [], []
-    for step_y in (0, 1):
-        for step_x in (0, 1):
-            tap_y, tap_x = source_y.floor() + step_y, source_x.floor() + step_x
-            weight = (1 - (source_y - tap_y).abs()) * (1 - (source_x - tap_x).abs())
-            inside = (tap_y >= 0) & (tap_y < size) & (tap_x >= 0) & (tap_x < size)
-            taps.append((tap_y * size + tap_x).where(inside, 0.0).long().flatten())
-            weights.append((weight.where(inside, 0.0) * 2**16).round().long().flatten())
-    return torch.stack(taps, -1), torch.stack(weights, -1)
-
-
-def _rotations(images: Tensor, read_rotation: int) -> Tensor:
-    """uint8 [n * (read_rotation + 1), 1, r, r]: each image's rotations by 0, 1, ... degrees in a row."""
-    views = images.new_empty(len(images), read_rotation + 1, 1, *images.shape[1:])
-    for part, out in zip(images.split(_ROTATED_AT_ONCE), views.split(_ROTATED_AT_ONCE), strict=True):
-        for angle in range(read_rotation + 1):
-            out[:, angle, 0] = rotate(part, angle)
-    return views.flatten(0, 1)
+def count_repeats(images: Tensor) -> int:
+    """How many of uint8 [n, r, r] images equal an earlier one."""
+    fits = images.dtype == torch.uint8 and images.ndim == 3 and len(images) > 0
+    require((fits, f"images must be uint8 [n, r, r] with n >= 1, got {images.dtype} {list(images.shape)}"))
+    return len(images) - len(_first_of_each(images))
 
 
 def _resize(images: Tensor, size: int) -> Tensor:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from itertools import combinations
 
 from ctgraph_rl.checks import as_tuple, is_int, require
-from ctgraph_rl.graph import CTGraph, StateType
+from ctgraph_rl.graph import MAX_STATES, CTGraph, StateType
 
 Ids = tuple[int, int]
 """First and last id of a subset, both included."""
@@ -36,6 +36,11 @@ class Observations:
         read_noise: each pixel gets an integer drawn from 0..read_noise added, saturating at 255.
         read_rotation: images are rotated by a whole number of degrees drawn from 0..read_rotation.
         reward_cue: the images of end states show what was paid, as the brightness of a square in their middle.
+        legacy_index: number unique ids as the authors' implementation does: a state after k decisions, number j of the
+            b^k of its level, gets id (b^k - 1 + j) modulo the size of its range. For b >= 3 states share ids in ranges
+            of exactly their number, and end states begin with another id than the first.
+        noise_before_rotation: read as the authors' implementation does: first noise, then rotation.
+        cue_wraps: the brightness of the cue is taken modulo 256, as there, instead of saturating.
 
     Raises:
         ValueError: for ranges that are reversed or overlap, and values out of range.
@@ -52,6 +57,9 @@ class Observations:
     read_noise: int = 0
     read_rotation: int = 0
     reward_cue: bool = False
+    legacy_index: bool = False
+    noise_before_rotation: bool = False
+    cue_wraps: bool = False
 
     def __post_init__(self) -> None:
         ranges = [field.name for field in fields(self) if field.name.endswith("_ids")]
@@ -88,9 +96,16 @@ class Observations:
         """Whether any kind of state shows an id drawn from several."""
         return any(not self.is_unique(kind) and self.ids(kind)[0] < self.ids(kind)[1] for kind in StateType)
 
+    def first_of_level(self, level: int, branching_factor: int) -> int:
+        """What a level of the tree adds to the unique ids of its states: the ids before it, or the legacy number."""
+        before = branching_factor**level - 1
+        return before if self.legacy_index else before // (branching_factor - 1)
+
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
         """What must hold on a graph: unique ids need as many ids as there are states."""
-        return [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
+        rooms = [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
+        fits = not self.legacy_index or 2 * graph.num_end_states < MAX_STATES
+        return [*rooms, (fits, f"legacy_index needs 2 b^d < 2**63, got a graph of {graph.num_end_states} end states")]
 
     def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:
         name, (first, last) = f"{kind.name.lower()}_ids", self.ids(kind)
@@ -115,7 +130,7 @@ def _range_rule(name: str, value: object) -> str:
 
 
 def _flag_rules(observations: Observations) -> list[tuple[bool, str]]:
-    names = ("unique_waits", "unique_decisions", "unique_ends", "reward_cue")
+    names = [field.name for field in fields(observations) if field.type in ("bool", "bool | None")]
     flags = [(name, getattr(observations, name)) for name in names]
     return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in flags]
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any, Self
 
 from torch import Tensor
 
-from ctgraph_rl import values
+from ctgraph_rl import reference, values
 from ctgraph_rl.checks import as_tuple, is_int, is_real, require
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.images import ImageSet
+from ctgraph_rl.images import ImageSet, has_cue_element
 from ctgraph_rl.observations import Observations
 from ctgraph_rl.rewards import Needle, RewardFn
 
@@ -43,6 +46,9 @@ class Task:
             in the authors' implementation.
         goal_change: (first, last): a goal lasts for a number of episodes drawn from first..last, then another is drawn
             from all end states, the same one among them; per row, from the environment's own randomness. None: never.
+        extra_end_step: end as the authors' implementation does: an end state takes one more action, any one, and the
+            last observation of the episode is one of the home state. The reward still comes on entering the end state.
+        legacy_goal_change: count as the authors' implementation does: the first goal lasts one episode less than drawn.
 
     Raises:
         ValueError: names every field that breaks a rule.
@@ -59,6 +65,8 @@ class Task:
     reward_std: float = 0.0
     reward_noise: str = "additive"
     goal_change: tuple[int, int] | None = None
+    extra_end_step: bool = False
+    legacy_goal_change: bool = False
 
     def __post_init__(self) -> None:
         self._check_parts()
@@ -66,7 +74,7 @@ class Task:
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
         one_hot = len(self.images.shape) == 1
         x = self.observations
-        varies = x.read_noise or x.read_rotation or x.reward_cue
+        varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
         room, last_id = self.images.num_images, self.observations.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
@@ -81,6 +89,44 @@ class Task:
         )
         for name in REWARDS:
             object.__setattr__(self, name, float(getattr(self, name)))
+
+    @classmethod
+    def from_json(
+        cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None = None
+    ) -> Self:
+        """The task of a configuration file of the authors' implementation, to behave as it does there.
+
+        The keys may be those of 2019 (``delay_prob``), of 2021 (``wait_prob``) or of 2023 (``p``). Where a file has
+        ``stochastic_sampling``, the standard deviation of rewards counts only if that is true. The ``general_seed`` is
+        not of the task: give it to ``CTGraphEnv(seed=...)``, whose random numbers are other ones.
+
+        Args:
+            path_or_dict: the file, or its content.
+            goal: d decisions in 1..b; the file has none. A path for ``set_high_reward_path`` counts from 0: add 1.
+
+        Raises:
+            ValueError: for a missing goal, a file that cannot be read, keys that are missing, unknown or of several
+                dialects, and values out of range, those that the authors' implementation silently repairs among them.
+        """
+        return cls(**reference.read_task(path_or_dict, goal))
+
+    def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
+        """This task as a configuration file of the authors' implementation, with the keys of 2023.
+
+        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for the goal (2, 1).
+        ``Task.from_json(task.to_json(), goal=task.goal)`` equals every task that `from_json` made.
+
+        Args:
+            path: where to write the file; None: nowhere.
+            general_seed: seed of the authors' environment, in [0, 2**32).
+
+        Returns:
+            The content of the file.
+
+        Raises:
+            ValueError: lists everything of the task that the file cannot express.
+        """
+        return reference.write_task(self, path, general_seed)
 
     def _check_parts(self) -> None:
         images, reward_fn = self.images, self.reward_fn
@@ -100,8 +146,10 @@ class Task:
         cue, change = self.observations.reward_cue, self.goal_change
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
         lasts = pair and is_int(change[1], change[0], MAX_EPISODES)  # type: ignore[index]
+        switches = [(name, getattr(self, name)) for name in ("extra_end_step", "legacy_goal_change")]
         return [
             *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
+            *((isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in switches),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
             (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
             (

@@ -113,7 +113,7 @@ def rollout(env: CTGraphEnv, seed: int, steps: int, data: TensorDictBase | None 
 def unchanged(env: CTGraphEnv, before: dict[str, torch.Tensor], rows: torch.Tensor | slice = slice(None)) -> bool:
     """Whether these rows of all buffers are the same."""
     now = ((value, before[name]) for name, value in env.state_dict().items())
-    return all(torch.equal(*(x[rows] if x.ndim else x for x in pair)) for pair in now)
+    return all(torch.equal(*(x[rows] if x.numel() > 1 else x for x in pair)) for pair in now)
 
 
 def within_specs(env: CTGraphEnv, data: TensorDictBase) -> bool:

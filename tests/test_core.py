@@ -40,13 +40,13 @@ def test_the_core_compiles_into_one_graph_with_the_same_bits(backend):
     env = make_env()
     env.reset()
     step = torch.compile(dynamics.step, fullgraph=True, backend=backend)
-    state = env._state()
+    state = env.rows.state
 
     for action in scripts(12, 6, 4):
-        expected = dynamics.step(state, action, env._params, env._uses)
-        found = step(state, action, env._params, env._uses)
+        expected = dynamics.step(state, action, env.rows._params, env.rows._uses)
+        found = step(state, action, env.rows._params, env.rows._uses)
         assert all(torch.equal(x, y) for x, y in zip(flat(found), flat(expected), strict=True))
-        state, _ = dynamics.reset(expected[0], expected[1].done, env._params, env._uses)
+        state, _ = dynamics.reset(expected[0], expected[1].done, env.rows._params, env.rows._uses)
 
 
 def test_the_core_maps_over_a_further_dimension_with_vmap():
@@ -54,30 +54,30 @@ def test_the_core_maps_over_a_further_dimension_with_vmap():
     env.reset()
     actions = scripts(5, 6, 4)
 
-    state, shown = torch.vmap(lambda a: dynamics.step(env._state(), a, env._params, env._uses))(actions)
+    state, shown = torch.vmap(lambda a: dynamics.step(env.rows.state, a, env.rows._params, env.rows._uses))(actions)
 
-    alone = [flat(dynamics.step(env._state(), action, env._params, env._uses)) for action in actions]
+    alone = [flat(dynamics.step(env.rows.state, action, env.rows._params, env.rows._uses)) for action in actions]
     assert all(torch.equal(x, torch.stack(y)) for x, y in zip([*state, *shown], zip(*alone, strict=True), strict=True))
 
 
 def test_a_step_of_the_core_changes_nothing_in_place():
     env = make_env()
     env.reset()
-    before = [value.clone() for value in env._state()]
+    before = [value.clone() for value in env.rows.state]
 
-    dynamics.step(env._state(), torch.zeros(6, dtype=torch.int64), env._params, env._uses)
+    dynamics.step(env.rows.state, torch.zeros(6, dtype=torch.int64), env.rows._params, env.rows._uses)
 
-    assert all(torch.equal(x, y) for x, y in zip(env._state(), before, strict=True))
+    assert all(torch.equal(x, y) for x, y in zip(env.rows.state, before, strict=True))
 
 
 def test_what_has_no_use_changes_nothing_when_it_is_computed_all_the_same():
     env = CTGraphEnv([surjective()] * 4)
     env.reset()
-    everything = dynamics.Uses(reward_fns=env._uses.reward_fns)
+    everything = dynamics.Uses(reward_fns=env.rows._uses.reward_fns)
 
     for action in scripts(12, 4):
-        lean = dynamics.step(env._state(), action, env._params, env._uses)
-        full = dynamics.step(env._state(), action, env._params, everything)
+        lean = dynamics.step(env.rows.state, action, env.rows._params, env.rows._uses)
+        full = dynamics.step(env.rows.state, action, env.rows._params, everything)
         assert all(torch.equal(x, y) for x, y in zip(flat(lean), flat(full), strict=True))
         act(env, action)
         env.reset(TensorDict({"_reset": lean[1].done.unsqueeze(-1)}, [4]))
@@ -140,9 +140,7 @@ def test_a_state_is_a_copy():
 def test_a_checkpoint_is_a_few_integers_per_row_without_images():
     state = make_env().state_dict()
 
-    public, hidden = {"state_type", "node", "goal_leaf", "observation_id"}, dynamics.RowState._fields[2:]
-    hidden = {f"_{field}" for field in hidden if field != "goal_leaf"}
-    assert set(state) == public | hidden | {"_seed_key", "_row"}
+    assert set(state) == {f"rows.{name}" for name in (*dynamics.RowState._fields, "seed", "row")}
     assert all(value.numel() in (1, 6) for value in state.values())
 
 

@@ -5,20 +5,9 @@ import pytest
 import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
-from ctgraph_rl.dynamics import (
-    STREAM_IMAGES,
-    STREAM_NOISE,
-    STREAM_STEP,
-    State,
-    TreeParams,
-    add_noise,
-    draw,
-    philox,
-    randint,
-    stays,
-    transition,
-)
+from ctgraph_rl.dynamics import State, TreeParams, add_noise, stays, transition
 from ctgraph_rl.graph import CTGraph
+from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint
 
 SHAPES = list(product((2, 3), (1, 2, 3)))
 
@@ -220,7 +209,8 @@ def test_the_deepest_tree_has_no_overflow_on_the_way_to_its_last_leaf():
 def test_the_transition_can_be_vmapped():
     b, d = 2, 2
     states, actions, stay = zip(*states_and_actions(b, d), strict=True)
-    arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree_params(b, d, len(states)))
+    tree = tree_params(b, d, len(states))._replace(extra_end_step=torch.arange(len(states)) % 2 == 0)
+    arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree)
 
     mapped = torch.vmap(transition)(*arguments)
 

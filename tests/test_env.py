@@ -61,7 +61,7 @@ FORKS = [surjective(2, 2, goal=goal) for goal in product((1, 2), repeat=2)]
 """The four goals of one graph."""
 
 KEYS = ("observation", "step_count", "episode_reward", "outcome", "leaf", "done", "terminated", "truncated", "is_init")
-STATE = ("state_type", "node", "observation_id", "_tick", "_step_count", "_episode_reward")
+STATE = ("state_type", "node", "observation_id", "tick", "step_count", "episode_reward")
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def test_every_image_set_is_held_once():
     tasks = [surjective(goal=goal, image_seed=seed) for goal in ((1, 1), (2, 2)) for seed in (1, 2)]
     turned = surjective(image_seed=1, read_rotation=3)
 
-    rows = [len(CTGraphEnv(pool)._bank) for pool in (tasks[:1] * 9, tasks, [*tasks, turned])]
+    rows = [len(CTGraphEnv(pool).rows.bank) for pool in (tasks[:1] * 9, tasks, [*tasks, turned])]
 
     assert rows == [5, 10, 10 + 5 * 4]
 
@@ -399,13 +399,13 @@ def test_a_partial_reset_leaves_the_other_rows_bit_identical():
     env = CTGraphEnv([confounding(p=0.5, read_noise=50, read_rotation=40)] * 4, seed=1)
     env.reset()
     data = act(env, [0] * 4)
-    state = {name: getattr(env, name).clone() for name in STATE}
+    state = {name: getattr(env.rows, name).clone() for name in STATE}
     mask = torch.tensor([True, False, False, True])
 
     after = env.reset(data.clone().set("_reset", mask.unsqueeze(-1)))
 
     assert all((after[key] == data[key])[~mask].all() for key in KEYS)
-    assert all(torch.equal(getattr(env, name)[~mask], state[name][~mask]) for name in STATE)
+    assert all(torch.equal(getattr(env.rows, name)[~mask], state[name][~mask]) for name in STATE)
     assert env.state_type[mask].tolist() == [HOME, HOME] and env.state_type[~mask].tolist() == [WAIT, WAIT]
     assert after["is_init"].flatten().tolist() == [True, False, False, True]
 
@@ -444,7 +444,7 @@ def test_a_reset_at_any_moment_starts_a_whole_new_episode(steps):
 
 def test_set_tasks_changes_the_tasks_in_place():
     env = CTGraphEnv([FORKS[0], FORKS[3]], task_pool=FORKS)
-    buffers = {name: buffer.data_ptr() for name, buffer in env.named_buffers()}
+    rows, bank = env.rows, env.rows.bank
 
     env.set_tasks([FORKS[1], FORKS[2]])
     last = play(env, optimal)
@@ -452,7 +452,8 @@ def test_set_tasks_changes_the_tasks_in_place():
     assert env.tasks == (FORKS[1], FORKS[2])
     assert last["leaf"].flatten().tolist() == [1, 2]
     assert last["episode_reward"].flatten().tolist() == [1.0, 1.0]
-    assert {name: buffer.data_ptr() for name, buffer in env.named_buffers()} == buffers
+    assert env.rows is rows
+    assert env.rows.bank is bank
 
 
 def test_set_tasks_may_change_every_field_that_a_batch_may_mix():
@@ -577,12 +578,12 @@ def test_a_step_of_a_finished_row_is_refused():
 def test_an_action_of_a_wrong_range_shape_or_type_is_refused_and_changes_nothing(action, got):
     env = CTGraphEnv([surjective()] * 2)
     env.reset()
-    state = {name: getattr(env, name).clone() for name in STATE}
+    state = {name: getattr(env.rows, name).clone() for name in STATE}
 
     with pytest.raises(ValueError, match=r"action must be int64 of shape \[2\] with values in 0\.\.2, " + got):
         act(env, action)
 
-    assert all(torch.equal(getattr(env, name), value) for name, value in state.items())
+    assert all(torch.equal(getattr(env.rows, name), value) for name, value in state.items())
 
 
 def test_a_missing_action_is_refused():

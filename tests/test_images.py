@@ -12,8 +12,9 @@ import torch
 
 from ctgraph_rl.curriculum import Block, Curriculum
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.images import UNRELATED, GroupedImages, ImageFile, OneHot, PaperImages, distances, rotate
+from ctgraph_rl.images import UNRELATED, GroupedImages, ImageFile, OneHot, PaperImages, distances
 from ctgraph_rl.observations import Observations
+from ctgraph_rl.rotation import rotate
 from ctgraph_rl.task import Task
 
 FIVE_IDS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))

@@ -11,7 +11,7 @@ import torch
 from oracles import ALPHA, act, optimal, play, surjective
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, Needle, ReferenceLinear, Task
-from ctgraph_rl.dynamics import STREAM_REWARD, draw, normal, normal_table
+from ctgraph_rl.philox import STREAM_REWARD, draw, normal, normal_table
 from ctgraph_rl.rewards import Arrival
 
 CLT_BOUND = 5.0

@@ -1,0 +1,95 @@
+"""Random numbers by counter: Philox4x32-10 (Salmon et al. 2011), as pure tensor functions.
+
+The 128-bit counter holds (ticks of the row, row, stream and block), the 64-bit key holds the seed. Different (seed,
+row, stream, tick) are different inputs of a bijection per key, so no two rows share a block by construction, and a
+row's draws depend on nothing but its seed, its number and how many observations it has had. Unsigned 32-bit words are
+held in int64.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_WORD = 0xFFFFFFFF
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_ROUNDS = 10
+
+STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL = range(5)
+"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal."""
+_STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
+
+
+def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+    """Philox4x32-10: four random words for a counter of four words and a key of two.
+
+    Args:
+        counter: four int64 tensors of broadcastable shapes with values in [0, 2**32).
+        key: two int64 tensors, likewise.
+
+    Returns:
+        Four int64 tensors with values in [0, 2**32).
+    """
+    c0, c1, c2, c3 = counter
+    k0, k1 = key
+    for _ in range(_ROUNDS):
+        even, odd = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]  # the low 64 bits are exact
+        c0, c1 = ((odd >> 32) ^ c1 ^ k0) & _WORD, odd & _WORD
+        c2, c3 = ((even >> 32) ^ c3 ^ k1) & _WORD, even & _WORD
+        k0, k1 = (k0 + _KEY_STEPS[0]) & _WORD, (k1 + _KEY_STEPS[1]) & _WORD
+    return c0, c1, c2, c3
+
+
+def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> tuple[Tensor, ...]:
+    """Four random words per element for (seed, row, tick, stream, block).
+
+    Args:
+        seed: int64 >= 0, any shape that broadcasts with the others.
+        row: int64 in [0, 2**32).
+        tick: int64 >= 0.
+        stream: one of the ``STREAM_*`` constants.
+        block: number of the block in [0, 2**28), for uses that need more than four words.
+    """
+    last = torch.as_tensor(block, device=tick.device) + (stream << _STREAM_SHIFT)
+    return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
+
+
+def randint(word: Tensor, high: Tensor | int) -> Tensor:
+    """A word as an integer in [0, high); each value's probability is off by less than 2**-32."""
+    return (word * high) >> 32
+
+
+def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
+    """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
+    upper, lower = words
+    high_upper, high_lower = high >> 32, high & _WORD
+    middle = upper * high_lower  # up to 64 bits: only its halves are used
+    carry = (((lower * high_lower) >> 32) & _WORD) + (middle & _WORD) + lower * high_upper
+    return upper * high_upper + ((middle >> 32) & _WORD) + (carry >> 32)
+
+
+_NORMAL_CELLS = 256
+_NORMAL_UNIT = 2.0**-20
+
+
+def normal_table() -> Tensor:
+    """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30, for `normal`; float64."""
+    cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64)
+    octave = (cell / _NORMAL_CELLS).floor()
+    tail = (1 + cell / _NORMAL_CELLS - octave) * 2 ** (octave - 1 - 32)
+    return (-torch.special.ndtri(tail) / _NORMAL_UNIT).round() * _NORMAL_UNIT
+
+
+def normal(word: Tensor, table: Tensor) -> Tensor:
+    """A word as a standard normal number, a multiple of 2**-20 up to 6.3 in size; float64.
+
+    The inverse distribution function by linear interpolation in 256 cells per octave of the tail probability. Every
+    operation is exact in float64, so devices and compiled code agree bit by bit.
+    """
+    tail = ((word >> 1).to(torch.float64) + 0.5).view(torch.int64)  # the bits of a double: octave, cell, place in it
+    cell = (tail >> 44) - (1022 << 8)
+    place = (tail & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
+    low, high = table[cell], table[cell + 1]
+    size = ((low + (high - low) * place) / _NORMAL_UNIT).round() * _NORMAL_UNIT
+    return torch.where((word & 1).bool(), size, -size)
