@@ -169,20 +169,21 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
         state whose node is an end state's.
     """
     kind, node = state
-    at_home, at_wait, at_decision = kind == _HOME, kind == _WAIT, kind == _DECISION
-    waits = action == WAIT_ACTION
-    decides = at_decision & (action > WAIT_ACTION) & (action <= tree.branching_factor)
-    arrival = torch.where(node >= tree.first_leaf, _END, _DECISION).to(torch.uint8)
-    leaves = at_wait & waits
-    fails = (at_wait & ~waits) | (at_decision & ~decides)
+    at_wait, waits = kind == _WAIT, action == WAIT_ACTION
+    in_tree = kind.bool() & (kind < _END)  # at a wait or decision state
+    fails = in_tree & ((at_wait ^ waits) | (action > tree.branching_factor))
+    before_end = at_wait & (node >= tree.first_leaf)
+    next_kind = (at_wait.view(torch.uint8) + before_end.view(torch.uint8) + 1).masked_fill(fails, _FAIL)
     if stays is not None:
-        leaves = leaves & ~stays
-    next_kind = torch.where(leaves, arrival, kind).masked_fill(at_home | decides, _WAIT).masked_fill(fails, _FAIL)
+        next_kind = next_kind.masked_fill(at_wait & waits & stays, _WAIT)
+    decides = in_tree & ~(at_wait | fails)
     next_node = torch.where(decides, node * tree.branching_factor + action, node)
+    over = kind >= _END
     if tree.extra_end_step is not None:
-        over = ((kind == _END) & tree.extra_end_step) | (at_home & (node > 0))
-        next_kind = next_kind.masked_fill(over, _HOME)
-    return State(next_kind, next_node)
+        ended = (kind == _HOME) & (node > 0)
+        next_kind = next_kind.masked_fill(ended | ((kind == _END) & tree.extra_end_step), _HOME)
+        over = over & ~((kind == _END) & tree.extra_end_step)
+    return State(torch.where(over, kind, next_kind), next_node)
 
 
 def is_done(state: State | RowState, tree: TreeParams) -> Tensor:
@@ -220,11 +221,11 @@ def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses:
 
 def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
     """The ids that rows show, int64 [N]."""
-    rows = bank_rows(state, _words(state, params, uses)[2], params.x, uses)
+    rows = bank_rows(state, words_of(state.tick, params, uses)[2], params.x, uses)
     return (rows - params.x.bank_start) // params.x.num_views
 
 
-def observe(state: RowState, words: tuple[Tensor, ...], params: RowParams, uses: Uses) -> Tensor:
+def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Tensor:
     """The images that rows show: a random view of the id, with noise, late rotation and reward cue. uint8 [N, *shape].
 
     Args:
@@ -304,7 +305,13 @@ def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Te
     return torch.where(shows.view(-1, *ones) & inside, level.view(-1, *ones), images)
 
 
-def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, Shown]:
+Words = tuple[Tensor, ...]
+"""The four small draws of a tick: two for waiting, one for the id, one for the view."""
+
+
+def step(
+    state: RowState, action: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Shown]:
     """One step of every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
 
     Args:
@@ -312,32 +319,35 @@ def step(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tupl
         action: int64, see `transition`.
         params: the rows' tasks.
         uses: what the rows have use for.
+        words: the draws of the next tick, if they are at hand.
 
     Returns:
         The next states, with the step's reward, and what they show.
     """
-    state, words = advance(state, action, params, uses)
+    words = words_of(state.tick + 1, params, uses) if words is None else words
+    state = advance(state, action, words, params, uses)
     return state, _show(state, words, params, uses)
 
 
-def advance(state: RowState, action: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, tuple[Tensor, ...]]:
-    """The step without what it shows: the next states, with the step's reward, and the draws of the tick."""
-    state = state._replace(tick=state.tick + 1)
-    words = _words(state, params, uses)
+def advance(state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses) -> RowState:
+    """The step without what it shows: the next states, with the step's reward."""
     before = State(state.state_type, state.node)
     after = transition(before, action, stays(words, params.tree) if uses.waits else None, params.tree)
-    reward = _reward(before, after, state, params, uses)
-    state = state._replace(
+    tick = state.tick + 1
+    reward = _reward(before, after, state.goal_leaf, tick, params, uses)
+    return state._replace(
         state_type=after.state_type,
         node=after.node,
+        tick=tick,
         step_count=state.step_count + 1,
         episode_reward=state.episode_reward + reward,
         reward=reward,
     )
-    return state, words
 
 
-def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> tuple[RowState, Shown]:
+def reset(
+    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Shown]:
     """Start an episode in the rows of a mask; a pure function like `step`.
 
     Args:
@@ -345,12 +355,13 @@ def reset(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> tuple
         mask: bool, the rows that start anew; the others stay as they are.
         params: the rows' tasks.
         uses: what the rows have use for.
+        words: the draws of the ticks after the reset, if they are at hand.
 
     Returns:
         The states, and what all rows show (the others show what they showed before).
     """
     state = begin(state, mask, params, uses)
-    return state, show(state, params, uses)
+    return state, show(state, params, uses, words)
 
 
 def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowState:
@@ -368,16 +379,26 @@ def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowSt
     return state
 
 
-def show(state: RowState, params: RowParams, uses: Uses) -> Shown:
+def step_or_reset(
+    state: RowState, action: Tensor, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Shown]:
+    """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
+    words = words_of(state.tick + 1, params, uses) if words is None else words
+    stepped = advance(state, action, words, params, uses)
+    state = begin(stepped._replace(tick=stepped.tick - mask.long()), mask, params, uses)
+    return state, _show(state, words, params, uses)
+
+
+def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = None) -> Shown:
     """What rows show in given states; a pure function like `step`."""
-    return _show(state, _words(state, params, uses), params, uses)
+    return _show(state, words_of(state.tick, params, uses) if words is None else words, params, uses)
 
 
-def _words(state: RowState, params: RowParams, uses: Uses) -> tuple[Tensor, ...]:
-    """The small draws of a tick: two words for waiting, one for the id, one for the view; zeros without use."""
+def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
+    """The small draws of a tick, int64 of its shape; zeros without use."""
     if not uses.draws:
-        return (torch.zeros_like(state.tick),) * 4
-    return draw(params.seed, params.row, state.tick, STREAM_STEP)
+        return (torch.zeros_like(tick),) * 4
+    return draw(params.seed, params.row, tick, STREAM_STEP)
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
@@ -393,15 +414,15 @@ def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState
     return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
 
 
-def _reward(before: State, after: State, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+def _reward(before: State, after: State, goal_leaf: Tensor, tick: Tensor, params: RowParams, uses: Uses) -> Tensor:
     """float32: the step's own reward, and what is paid on entering an end or a fail state.
 
     Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
     g, entered = params.g, after.state_type != before.state_type
-    paid = _share(after, state.goal_leaf, params, uses) * g.goal_reward
+    paid = _share(after, goal_leaf, params, uses) * g.goal_reward
     if uses.reward_noise:
-        word = draw(params.seed, params.row, state.tick, STREAM_REWARD)[0]
+        word = draw(params.seed, params.row, tick, STREAM_REWARD)[0]
         noise = (normal(word, params.normal_table) * g.reward_std).float()
         paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
     reward = torch.where(entered & (after.state_type == _END), paid, 0.0)
@@ -422,13 +443,11 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
     return share
 
 
-def _show(state: RowState, words: tuple[Tensor, ...], params: RowParams, uses: Uses) -> Shown:
+def _show(state: RowState, words: Words, params: RowParams, uses: Uses) -> Shown:
     """Observation, outcome, leaf and done of states."""
     done = is_done(state, params.tree)
-    leaf = torch.where(done & (state.state_type != _FAIL), state.node - params.tree.first_leaf, NO_LEAF)
-    return Shown(observe(state, words, params, uses), outcome(state, leaf, done), leaf, done)
-
-
-def outcome(state: RowState, leaf: Tensor, done: Tensor) -> Tensor:
-    """The ``OUTCOME_*`` of rows, uint8."""
-    return done.to(torch.uint8) + (leaf != NO_LEAF) + (leaf == state.goal_leaf)
+    arrived = done & (state.state_type != _FAIL)
+    leaf = state.node - params.tree.first_leaf
+    hits = arrived & (leaf == state.goal_leaf)
+    outcome = done.view(torch.uint8) + arrived.view(torch.uint8) + hits.view(torch.uint8)
+    return Shown(observe(state, words, params, uses), outcome, leaf.masked_fill(~arrived, NO_LEAF), done)

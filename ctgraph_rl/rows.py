@@ -22,6 +22,7 @@ from ctgraph_rl.dynamics import (
     Shown,
     TreeParams,
     Uses,
+    Words,
 )
 from ctgraph_rl.graph import MAX_STATES, StateType
 from ctgraph_rl.images import ImageSet, white_level
@@ -87,6 +88,8 @@ class Rows(nn.Module):
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field in RowState._fields:
             self.register_buffer(field, zeros.to(_STATE_DTYPES.get(field, torch.int64), copy=True))
+        self._stock: _Stock | None = None
+        self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
         self.set_tasks(tasks)
 
     @property
@@ -102,6 +105,7 @@ class Rows(nn.Module):
 
     @state.setter
     def state(self, state: RowState) -> None:
+        self._stock = None
         self._buffers.update(zip(RowState._fields, state, strict=True))
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
@@ -130,6 +134,7 @@ class Rows(nn.Module):
 
         self._params, self._uses = self._make_params(different, rows)
         self._task_goals = rows([task.goal_leaf for task in different])
+        self._stock = None
         self._begin()
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
@@ -169,19 +174,35 @@ class Rows(nn.Module):
         """
         self.seed, self.row = seed, row
         self.tick = torch.zeros_like(self.row)
+        self._stock = None
         self._params = self._row_params(self._params.tree, self._params.x, self._params.g)
         self._begin()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
-        self.state, shown = dynamics.reset(self.state, mask, self._params, self._uses)
-        return shown
+        return self._keep(*dynamics.reset(self.state, mask, self._params, self._uses, self._words(self.tick + mask)))
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        self.state, shown = dynamics.step(self.state, action, self._params, self._uses)
+        return self._keep(*dynamics.step(self.state, action, self._params, self._uses, self._words(self.tick + 1)))
+
+    def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
+        """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
+        words = self._words(self.tick + 1)
+        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self._params, self._uses, words))
+
+    def _keep(self, state: RowState, shown: Shown) -> Shown:
+        self._buffers.update(zip(RowState._fields, state, strict=True))
         return shown
+
+    def _words(self, tick: Tensor) -> Words | None:
+        """The draws of ticks, at most one ahead of the present; from a stock that is drawn for many ticks at once."""
+        if self._stock_ticks < 2 or not self._uses.draws:
+            return None
+        if self._stock is None or self._stock.left == 0:
+            self._stock = _Stock(self._params, self._uses, self.tick, self._stock_ticks)
+        return self._stock.at(tick)
 
     def show(self) -> Shown:
         """What all rows show now."""
@@ -245,7 +266,7 @@ class Rows(nn.Module):
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
-        self.state = RowState(*(value.clone() for value in self.state))
+        self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
         super()._load_from_state_dict(*args, **kwargs)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
@@ -321,6 +342,27 @@ class Rows(nn.Module):
         )
 
 
+class _Stock:
+    """The small draws of all rows for many ticks, drawn in one call: many small calls would cost more."""
+
+    def __init__(self, params: RowParams, uses: Uses, tick: Tensor, num_ticks: int) -> None:
+        num_rows = len(tick)
+        self.left = num_ticks - 1
+        self._tick = tick
+        self._place = torch.arange(num_rows, device=tick.device)
+        ticks = tick + torch.arange(num_ticks, device=tick.device).unsqueeze(-1)
+        self._words = [word.flatten() for word in dynamics.words_of(ticks, params, uses)]
+
+    def at(self, tick: Tensor) -> Words:
+        """The draws of ticks that are at most one ahead of those of the last call."""
+        self.left -= 1
+        index = (tick - self._tick) * len(tick) + self._place
+        return tuple(word.take(index) for word in self._words)
+
+
+MAX_STOCK = 2**14
+MAX_STOCK_TICKS = 256
+
 _STATE_DTYPES = {"state_type": torch.uint8, "episode_reward": torch.float32, "reward": torch.float32}
 
 
@@ -340,22 +382,24 @@ def _tree_params(tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> TreePa
 
 
 def _legacy_index(tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> LegacyIndex:
-    """Nodes of a level start at (b^k - 1) / (b - 1), their legacy numbers at b^k - 1."""
-    levels = range(max(task.graph.depth for task in tasks) + 1)
+    """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
-    def table(task: Task, beyond: int, value: Callable[[int], int]) -> list[int]:
-        return [value(task.graph.branching_factor**k) if k <= task.graph.depth else beyond for k in levels]
+    def level(task: Task, k: int) -> tuple[int, int]:
+        if k > task.graph.depth:
+            return MAX_STATES, 0
+        number = task.graph.branching_factor**k - 1
+        first = number // (task.graph.branching_factor - 1)
+        return first, number - first
 
     def num_ids(task: Task, kind: StateType) -> int:
         first, last = task.observations.ids(kind)
         return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
 
-    def before(task: Task) -> Callable[[int], int]:
-        return lambda power: (power - 1) // (task.graph.branching_factor - 1)
-
+    levels = range(max(task.graph.depth for task in tasks) + 1)
+    tables = [[level(task, k) for k in levels] for task in tasks]
     return LegacyIndex(
-        level_first=rows([table(task, MAX_STATES, before(task)) for task in tasks]),
-        level_shift=rows([table(task, 0, lambda power, task=task: power - 1 - before(task)(power)) for task in tasks]),  # type: ignore[misc]
+        level_first=rows([[first for first, _ in table] for table in tables]),
+        level_shift=rows([[shift for _, shift in table] for table in tables]),
         num_ids=rows([[num_ids(task, kind) for kind in StateType] for task in tasks]),
     )
 

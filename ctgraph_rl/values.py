@@ -7,8 +7,8 @@ may be 1. A wait state is left with probability 1 - p per wait; with V' the valu
     V(wait) = s + a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
 
 which is solved for V(wait). Rewards are those of `CTGraphEnv`: ``goal_reward`` times the share of ``reward_fn`` on
-entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step. The noise of
-rewards has mean 0 and changes nothing; a goal that changes stays as it is. The environment rounds rewards to float32;
+entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step, one more of
+them after an end state where ``extra_end_step`` is set. The noise of rewards has mean 0 and changes nothing; a goal that changes stays as it is. The environment rounds rewards to float32;
 here they are float64. Policies see observation ids, which is what they see of images where no two are equal and
 nothing varies on read.
 """
@@ -130,7 +130,8 @@ def _divided(num_ids: int, counts: list[int]) -> list[float]:
 
 def _value_at_home(tree: _EveryNode | _GoalPath, chooser: _Optimal | _Memoryless) -> float:
     """Backward induction from the end states to home, whose step is not rewarded and leads to the root's wait state."""
-    values = chooser.at_wait(tree.end_rewards(), tree.task.graph.depth)
+    after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
+    values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
     for level in reversed(range(tree.task.graph.depth)):
         decided = chooser.at_decision(tree.children(values, level), level)
         values = chooser.at_wait(chooser.gamma * decided, level)
@@ -229,8 +230,8 @@ class _Memoryless:
         b, (first, last) = self.task.graph.branching_factor, self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
             return self.policy[first : last + 1].mean(0, keepdim=True)
-        start = first + (b**level - 1) // (b - 1)
-        return self.policy[start : start + b**level]
+        number = self.task.observations.first_of_level(level, b) + torch.arange(b**level)
+        return self.policy[first + number % (last - first + 1)]
 
 
 def _is_needle(task: Task) -> bool:
@@ -252,11 +253,13 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
 
 def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
     name, goal, fail = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward
-    step = task.step_reward
+    step, b = task.step_reward, task.graph.branching_factor
+    shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
     only = "the memoryless ceiling is exact only for"
     return [
         (_is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
         (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
         (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
         (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),
+        (not shares, f"{only} ids of their own, not a legacy_index with branching_factor={b}, where states share ids"),
     ]

@@ -1,0 +1,112 @@
+"""The baseline configurations of the CT-graph paper, and tasks of any size in their manner.
+
+Soltoggio et al. 2023 (arXiv 2302.10887).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ctgraph_rl.graph import CTGraph
+from ctgraph_rl.images import OneHot, PaperImages
+from ctgraph_rl.observations import Observations
+from ctgraph_rl.task import Task
+
+
+def ct_graph(
+    branching_factor: int = 2,
+    depth: int = 2,
+    wait_prob: float = 0.0,
+    goal: tuple[int, ...] | None = None,
+    fully_observable: bool = True,
+    one_hot: bool = False,
+    image_seed: int = 1,
+) -> Task:
+    """A task of any size, observed fully or through one image for each kind of state.
+
+    Args:
+        branching_factor: b >= 2.
+        depth: d >= 1.
+        wait_prob: p in [0, 1).
+        goal: d decisions in 1..b; None: always the first branch.
+        fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective, the
+            images 0 to 4 for home, fail, decision, wait and end states.
+        one_hot: vectors instead of images.
+        image_seed: seed of the image set.
+    """
+    graph = CTGraph(branching_factor, depth, wait_prob)
+    observations = _one_id_per_state(graph) if fully_observable else _ONE_ID_PER_KIND
+    num_images = observations.last_id + 1
+    images = OneHot(num_images) if one_hot else PaperImages(num_images, image_seed)
+    return Task(graph, (1,) * depth if goal is None else goal, observations, images)
+
+
+_ONE_ID_PER_KIND = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
+
+
+def _one_id_per_state(graph: CTGraph) -> Observations:
+    decisions, ends = 2 + graph.num_wait_states, 2 + graph.num_wait_states + graph.num_decision_states
+    return Observations(
+        wait_ids=(2, decisions - 1),
+        decision_ids=(decisions, ends - 1),
+        end_ids=(ends, ends + graph.num_end_states - 1),
+        unique_waits=True,
+        unique_decisions=True,
+    )
+
+
+def ct_fo_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-FO-B1: fully observable, b=2, d=2, p=0; one of 16 images for each state.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 2, 0.0, goal, image_seed=image_seed)
+
+
+def ct_fo_b2(goal: tuple[int, ...] = (1, 1, 1), image_seed: int = 1) -> Task:
+    """CT-FO-B2: fully observable, b=2, d=3, p=0.5; one of 32 images for each state.
+
+    Args:
+        goal: three decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 3, 0.5, goal, image_seed=image_seed)
+
+
+def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-SU-B1: surjective, b=2, d=2, p=0; one image for all decision states, one for all wait states.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 2, 0.0, goal, fully_observable=False, image_seed=image_seed)
+
+
+def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-CO-B1: confounding, b=2, d=2, p=0; wait states draw one of a hundred images at every observation.
+
+    The paper leaves ids and numbers of images open. This package chose: a hundred images for wait states, one for
+    decision states and one for end states.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    observations = Observations(decision_ids=(2, 2), wait_ids=(3, 102), end_ids=(103, 103))
+    return Task(CTGraph(2, 2, 0.0), goal, observations, PaperImages(104, image_seed))
+
+
+def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-POSR-B1: partially observable with stochastic rewards, b=2, d=2, p=0.5; the images of CT-SU-B1.
+
+    Rewards are drawn from N(c, 0.1), with c = 1 at the goal and 0 at the other end states. The paper leaves the standard
+    deviation open: 0.1 is a choice of this package.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return replace(ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed), reward_std=0.1)
