@@ -23,6 +23,7 @@ from ctgraph_rl.philox import (
     normal,
     randint,
     randint_wide,
+    splitmix64,
 )
 from ctgraph_rl.rewards import Arrival, RewardFn
 from ctgraph_rl.rotation import turn
@@ -234,12 +235,22 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
         params: the rows' tasks.
         uses: what the rows have use for.
     """
+    rows, angle = views(state, words, params.x, uses)
+    return vary(params.bank.index_select(0, rows), angle, state, params, uses)
+
+
+def views(state: RowState, words: Words, x: ObservationParams, uses: Uses) -> tuple[Tensor, Tensor | None]:
+    """The bank rows that rows show, and the degrees by which they are still to be turned; int64, arguments as above."""
+    rows = bank_rows(state, words[2], x, uses)
+    if not uses.views:
+        return rows, None
+    view = randint(words[3], x.num_views * x.num_angles)
+    return rows + view // x.num_angles, view % x.num_angles
+
+
+def vary(images: Tensor, angle: Tensor | None, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """Images from the bank with what is not in the bank: noise, late rotation, reward cue; uint8 [N, *shape]."""
     x = params.x
-    rows, angle = bank_rows(state, words[2], x, uses), None
-    if uses.views:
-        view = randint(words[3], x.num_views * x.num_angles)
-        rows, angle = rows + view // x.num_angles, view % x.num_angles
-    images = params.bank.index_select(0, rows)
     if uses.pixel_noise:
         images = add_noise(images, params.seed, params.row, state.tick, x.read_noise)
     if x.taps is not None and angle is not None:
@@ -251,11 +262,14 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
 
 
 def add_noise(images: Tensor, seed: Tensor, row: Tensor, tick: Tensor, read_noise: Tensor) -> Tensor:
-    """Add to each pixel an independent integer drawn uniformly from 0..read_noise, saturating at 255.
+    """Add to each pixel an independent integer drawn from 0..read_noise, saturating at 255.
+
+    A pixel has 16 bits of the SplitMix64 sequence that starts at the observation's own 64-bit draw, so each value's
+    probability is off by less than 2**-16.
 
     Args:
         images: uint8 [N, 1, r, r].
-        seed: int64 scalar.
+        seed: int64 [1] or [N].
         row: numbers of the rows.
         tick: how many observations each row has had.
         read_noise: largest addition per row, 0..255.
@@ -263,11 +277,22 @@ def add_noise(images: Tensor, seed: Tensor, row: Tensor, tick: Tensor, read_nois
     Returns:
         uint8 [N, 1, r, r].
     """
-    pixels = images[0].numel()
-    blocks = torch.arange((pixels + 3) // 4, device=images.device)
-    words = draw(seed.unsqueeze(-1), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_NOISE, blocks)
-    noise = randint(torch.stack(words, -1).flatten(1)[:, :pixels], read_noise.unsqueeze(-1) + 1)
-    return (images + noise.view(images.shape)).clamp_max(255).to(torch.uint8)
+    words = draw(seed, row, tick, STREAM_NOISE)
+    parts = images.flatten(1), (words[0] << 32) | words[1], (read_noise + 1).to(torch.int32)
+    if len(images) <= _NOISE_ROWS or torch.compiler.is_compiling():
+        return _noisy(*parts).view_as(images)
+    split = zip(*(part.split(_NOISE_ROWS) for part in parts), strict=True)
+    return torch.cat([_noisy(*chunk) for chunk in split]).view_as(images)
+
+
+_NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
+
+
+def _noisy(images: Tensor, start: Tensor, high: Tensor) -> Tensor:
+    """uint8 [N, pixels] with noise below ``high``, int32, from a 64-bit start per row."""
+    pixels = images.shape[-1]
+    bits = splitmix64(start, (pixels + 3) // 4).view(torch.int16)[..., :pixels].to(torch.int32) & 0xFFFF
+    return ((bits * high.unsqueeze(-1) >> 16) + images).clamp_max(255).to(torch.uint8)
 
 
 def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:
@@ -377,6 +402,15 @@ def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowSt
     if uses.goal_change:
         state = _count_episode(state, mask, params)
     return state
+
+
+def restart(
+    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Tensor]:
+    """`reset` when it leaves no row finished: the states, and the observations alone."""
+    state = begin(state, mask, params, uses)
+    words = words_of(state.tick, params, uses) if words is None else words
+    return state, observe(state, words, params, uses)
 
 
 def step_or_reset(

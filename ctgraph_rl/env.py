@@ -191,6 +191,29 @@ class CTGraphEnv(EnvBase):
         data = self._data(shown, torch.zeros_like(shown.done))
         return data.set("reward", self.rows.reward.unsqueeze(-1).clone())
 
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """The standard method without its question whether any row is done and without its merge of two TensorDicts.
+
+        The data are equal to those of the standard method, which TorchRL takes when the environment is wrapped.
+        """
+        tensordict = self.step(tensordict.to(self.device) if tensordict.device != self.device else tensordict)
+        tensordict_ = self._step_mdp(tensordict)
+        if self._post_step_mdp_hooks is not None:
+            tensordict, tensordict_ = self._post_step_mdp_hooks(tensordict, tensordict_)
+        done = tensordict.get(("next", "done"))
+        observation = self.rows.restart(done.squeeze(-1))
+        running = torch.zeros_like(done)
+        tensordict_.set("observation", observation)
+        tensordict_.set("is_init", done.clone())
+        tensordict_.set("step_count", self.rows.step_count.unsqueeze(-1).clone())
+        tensordict_.set("episode_reward", self.rows.episode_reward.unsqueeze(-1).clone())
+        tensordict_.set("outcome", running.to(torch.uint8))
+        tensordict_.set("leaf", torch.full_like(tensordict.get(("next", "leaf")), dynamics.NO_LEAF))
+        tensordict_.set("done", running)
+        tensordict_.set("terminated", running.clone())
+        tensordict_.set("truncated", running.clone())
+        return tensordict, tensordict_
+
     def _data(self, shown: Shown, is_init: Tensor) -> TensorDict:
         """Observation, book-keeping and done flags; nothing shares memory with the state."""
         done = shown.done.unsqueeze(-1)

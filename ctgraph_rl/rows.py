@@ -187,6 +187,13 @@ class Rows(nn.Module):
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
         return self._keep(*dynamics.step(self.state, action, self._params, self._uses, self._words(self.tick + 1)))
 
+    def restart(self, mask: Tensor) -> Tensor:
+        """`reset` of all finished rows, the mask: what all rows observe."""
+        words = self._words(self.tick + mask)
+        state, observation = dynamics.restart(self.state, mask, self._params, self._uses, words)
+        self._buffers.update(zip(RowState._fields, state, strict=True))
+        return observation
+
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         words = self._words(self.tick + 1)
