@@ -1,13 +1,13 @@
 import random
-from itertools import product
+from itertools import islice, product
 
 import pytest
 import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
-from ctgraph_rl.dynamics import State, TreeParams, add_noise, stays, transition
+from ctgraph_rl.dynamics import _NOISE_ROWS, State, TreeParams, add_noise, stays, transition
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint
+from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint, splitmix64
 
 SHAPES = list(product((2, 3), (1, 2, 3)))
 
@@ -225,12 +225,51 @@ def test_draws_can_be_vmapped_over_rows():
     assert torch.equal(mapped, torch.stack(draw(seed, rows, tick, STREAM_STEP), -1))
 
 
-def test_noise_uses_a_draw_of_its_own_for_every_pixel():
-    images = torch.zeros(2, 1, 8, 8, dtype=torch.uint8)
-    words = draw(torch.tensor(9), torch.tensor([[4], [5]]), torch.tensor([[6], [7]]), STREAM_NOISE, torch.arange(16))
-    expected = [(torch.stack(words, -1)[row].flatten() * (noise + 1)) >> 32 for row, noise in enumerate((10, 255))]
+def splitmix64_in_python(seed):
+    """The published generator, number by number."""
+    while True:
+        seed = (seed + 0x9E3779B97F4A7C15) % 2**64
+        z = (seed ^ (seed >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+        z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+        yield z ^ (z >> 31)
+
+
+def test_splitmix64_meets_the_published_known_answers():
+    known = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821]
+
+    assert [number % 2**64 for number in splitmix64(torch.tensor(1234567), 5).tolist()] == known
+
+
+def test_splitmix64_equals_plain_python_for_any_start():
+    starts = [0, 1, -1, 2**63 - 1, -(2**63), 123456789]
+
+    found = splitmix64(torch.tensor(starts), 40)
+
+    for start, numbers in zip(starts, found.tolist(), strict=True):
+        assert [number % 2**64 for number in numbers] == list(islice(splitmix64_in_python(start % 2**64), 40))
+
+
+def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence():
+    images = torch.zeros(2, 1, 9, 9, dtype=torch.uint8)
+    words = draw(torch.tensor(9), torch.tensor([4, 5]), torch.tensor([6, 7]), STREAM_NOISE)
+    expected = []
+    for row, noise in enumerate((10, 255)):
+        numbers = islice(splitmix64_in_python(int(words[0][row]) << 32 | int(words[1][row])), 21)
+        bits = [number >> shift & 0xFFFF for number in numbers for shift in (0, 16, 32, 48)]
+        expected.append([value * (noise + 1) >> 16 for value in bits[:81]])
 
     noisy = add_noise(images, torch.tensor(9), torch.tensor([4, 5]), torch.tensor([6, 7]), torch.tensor([10, 255]))
 
-    assert noisy.dtype == torch.uint8
-    assert torch.equal(noisy.flatten(1).long(), torch.stack(expected))
+    assert noisy.flatten(1).tolist() == expected
+
+
+def test_noise_of_many_rows_is_that_of_each_part_of_them():
+    n = 2 * _NOISE_ROWS + 3
+    images = torch.zeros(n, 1, 4, 4, dtype=torch.uint8)
+    arguments = (torch.arange(n), torch.arange(n) * 7, torch.arange(n) % 256)
+
+    noisy = add_noise(images, torch.tensor([3]), *arguments)
+
+    for part in (slice(0, 5), slice(_NOISE_ROWS - 2, _NOISE_ROWS + 2), slice(n - 4, n)):
+        alone = add_noise(images[part], torch.tensor([3]), *(argument[part] for argument in arguments))
+        assert torch.equal(noisy[part], alone)
