@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from ctgraph_rl.rewards import Gradient as Gradient
     from ctgraph_rl.rewards import Needle as Needle
     from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
+    from ctgraph_rl.fast import Steps as Steps
+    from ctgraph_rl.fast import rollout as rollout
+    from ctgraph_rl.rows import Rows as Rows
     from ctgraph_rl.task import Task as Task
 
 __version__ = "0.1.0"
@@ -53,13 +56,16 @@ _HOMES = {
     "Observations": "observations",
     "OneHot": "images",
     "PaperImages": "images",
+    "Rows": "rows",
     "RunLog": "log",
     "StateType": "graph",
+    "Steps": "fast",
     "Task": "task",
     "count_repeats": "images",
     "distances": "images",
     "evaluate": "lifelong",
     "learn_curriculum": "lifelong",
+    "rollout": "fast",
 }
 
 __all__ = [*_HOMES, "metrics"]

@@ -23,10 +23,9 @@ from ctgraph_rl.philox import (
     normal,
     randint,
     randint_wide,
-    splitmix64,
 )
+from ctgraph_rl.reading import add_cue, add_noise, cue_level, turn
 from ctgraph_rl.rewards import Arrival, RewardFn
-from ctgraph_rl.rotation import turn
 
 _HOME, _WAIT, _DECISION, _END, _FAIL = map(int, StateType)  # plain integers: torch.compile knows no IntEnum
 
@@ -174,7 +173,7 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
     in_tree = kind.bool() & (kind < _END)  # at a wait or decision state
     fails = in_tree & ((at_wait ^ waits) | (action > tree.branching_factor))
     before_end = at_wait & (node >= tree.first_leaf)
-    next_kind = (at_wait.view(torch.uint8) + before_end.view(torch.uint8) + 1).masked_fill(fails, _FAIL)
+    next_kind = (at_wait.to(torch.uint8) + before_end.to(torch.uint8) + 1).masked_fill(fails, _FAIL)
     if stays is not None:
         next_kind = next_kind.masked_fill(at_wait & waits & stays, _WAIT)
     decides = in_tree & ~(at_wait | fails)
@@ -235,25 +234,38 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
         params: the rows' tasks.
         uses: what the rows have use for.
     """
-    rows, angle = views(state, words, params.x, uses)
-    return vary(params.bank.index_select(0, rows), angle, state, params, uses)
-
-
-def views(state: RowState, words: Words, x: ObservationParams, uses: Uses) -> tuple[Tensor, Tensor | None]:
-    """The bank rows that rows show, and the degrees by which they are still to be turned; int64, arguments as above."""
-    rows = bank_rows(state, words[2], x, uses)
-    if not uses.views:
-        return rows, None
-    view = randint(words[3], x.num_views * x.num_angles)
-    return rows + view // x.num_angles, view % x.num_angles
-
-
-def vary(images: Tensor, angle: Tensor | None, state: RowState, params: RowParams, uses: Uses) -> Tensor:
-    """Images from the bank with what is not in the bank: noise, late rotation, reward cue; uint8 [N, *shape]."""
-    x = params.x
+    seen = look(state, words, params, uses)
+    images = params.bank.index_select(0, seen.rows)
     if uses.pixel_noise:
-        images = add_noise(images, params.seed, params.row, state.tick, x.read_noise)
-    if x.taps is not None and angle is not None:
+        images = add_noise(images, seen.noise, params.x.read_noise)
+    return finish(images, seen.angle, state, params, uses)
+
+
+class Seen(NamedTuple):
+    """What there is to see, before it is read from the bank; int64."""
+
+    rows: Tensor  # of the bank
+    angle: Tensor  # degrees by which the images are still to be turned
+    noise: Tensor  # start of the noise
+
+
+def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
+    """The view in the bank that each row sees and the draws of what is not in the bank; arguments as above."""
+    x, rows = params.x, bank_rows(state, words[2], params.x, uses)
+    angle = noise = torch.zeros_like(rows)
+    if uses.views:
+        view = randint(words[3], x.num_views * x.num_angles)
+        rows, angle = rows + view // x.num_angles, view % x.num_angles
+    if uses.pixel_noise:
+        upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
+        noise = (upper << 32) | lower
+    return Seen(rows, angle, noise)
+
+
+def finish(images: Tensor, angle: Tensor, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """Images with late rotation and reward cue; uint8 [N, *shape]."""
+    x = params.x
+    if x.taps is not None:
         images = turn(images, angle, x.taps)
     if uses.reward_cue:
         level = cue_level((state.reward - params.g.step_reward).double() / params.g.goal_reward, x.white, x.cue_wraps)
@@ -261,81 +273,12 @@ def vary(images: Tensor, angle: Tensor | None, state: RowState, params: RowParam
     return images
 
 
-def add_noise(images: Tensor, seed: Tensor, row: Tensor, tick: Tensor, read_noise: Tensor) -> Tensor:
-    """Add to each pixel an independent integer drawn from 0..read_noise, saturating at 255.
-
-    A pixel has 16 bits of the SplitMix64 sequence that starts at the observation's own 64-bit draw, so each value's
-    probability is off by less than 2**-16.
-
-    Args:
-        images: uint8 [N, 1, r, r].
-        seed: int64 [1] or [N].
-        row: numbers of the rows.
-        tick: how many observations each row has had.
-        read_noise: largest addition per row, 0..255.
-
-    Returns:
-        uint8 [N, 1, r, r].
-    """
-    words = draw(seed, row, tick, STREAM_NOISE)
-    parts = images.flatten(1), (words[0] << 32) | words[1], (read_noise + 1).to(torch.int32)
-    if len(images) <= _NOISE_ROWS or torch.compiler.is_compiling():
-        return _noisy(*parts).view_as(images)
-    split = zip(*(part.split(_NOISE_ROWS) for part in parts), strict=True)
-    return torch.cat([_noisy(*chunk) for chunk in split]).view_as(images)
-
-
-_NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
-
-
-def _noisy(images: Tensor, start: Tensor, high: Tensor) -> Tensor:
-    """uint8 [N, pixels] with noise below ``high``, int32, from a 64-bit start per row."""
-    pixels = images.shape[-1]
-    bits = splitmix64(start, (pixels + 3) // 4).view(torch.int16)[..., :pixels].to(torch.int32) & 0xFFFF
-    return ((bits * high.unsqueeze(-1) >> 16) + images).clamp_max(255).to(torch.uint8)
-
-
-def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:
-    """The brightness of a reward: white for the goal's, 0 for none, in between cut off; uint8.
-
-    Args:
-        share: float64, the reward as a share of the goal's.
-        white: float64.
-        wraps: bool, the rows where a level out of range is taken modulo 256; in the others it saturates.
-    """
-    level = (share * white).trunc()
-    saturated = torch.minimum(level.clamp_min(0), white.trunc())
-    return torch.where(wraps, level.remainder(256), saturated).to(torch.uint8)
-
-
-def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Tensor:
-    """Show a brightness as a square in the middle half of images, or as an element of vectors.
-
-    Args:
-        images: uint8 [N, 1, r, r] or [N, K].
-        level: uint8.
-        shows: bool, the rows that show it.
-        element: int64, which element of a vector shows it.
-
-    Returns:
-        uint8 of the shape of ``images``.
-    """
-    size, ones = images.shape[-1], (1,) * (images.ndim - 1)
-    place = torch.arange(size, device=images.device)
-    if images.ndim == 2:
-        inside = place == element.unsqueeze(-1)
-    else:
-        middle = (place >= size // 4) & (place < size - size // 4)
-        inside = middle & middle.unsqueeze(-1)
-    return torch.where(shows.view(-1, *ones) & inside, level.view(-1, *ones), images)
-
-
 Words = tuple[Tensor, ...]
-"""The four small draws of a tick: two for waiting, one for the id, one for the view."""
+"""The four small draws of a tick: two for a wait that begins there, one for the id and one for the view shown there."""
 
 
 def step(
-    state: RowState, action: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+    state: RowState, action: Tensor, params: RowParams, uses: Uses, words: tuple[Words, Words] | None = None
 ) -> tuple[RowState, Shown]:
     """One step of every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
 
@@ -344,18 +287,18 @@ def step(
         action: int64, see `transition`.
         params: the rows' tasks.
         uses: what the rows have use for.
-        words: the draws of the next tick, if they are at hand.
+        words: the draws of the present and of the next tick, if they are at hand.
 
     Returns:
         The next states, with the step's reward, and what they show.
     """
-    words = words_of(state.tick + 1, params, uses) if words is None else words
-    state = advance(state, action, words, params, uses)
-    return state, _show(state, words, params, uses)
+    now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
+    state = advance(state, action, now, params, uses)
+    return state, _show(state, then, params, uses)
 
 
 def advance(state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses) -> RowState:
-    """The step without what it shows: the next states, with the step's reward."""
+    """The step without what it shows, with the draws of the present tick: the next states, with the step's reward."""
     before = State(state.state_type, state.node)
     after = transition(before, action, stays(words, params.tree) if uses.waits else None, params.tree)
     tick = state.tick + 1
@@ -391,13 +334,15 @@ def reset(
 
 def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowState:
     """The reset without what it shows."""
+    starts = mask.long()
+    goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
     state = state._replace(
-        state_type=state.state_type.masked_fill(mask, _HOME),
-        node=state.node.masked_fill(mask, 0),
-        tick=state.tick + mask,
-        step_count=state.step_count.masked_fill(mask, 0),
-        episode_reward=state.episode_reward.masked_fill(mask, 0),
-        reward=state.reward.masked_fill(mask, 0),
+        state_type=state.state_type * goes_on.to(torch.uint8),  # the home state is 0; faster than filling by a mask
+        node=state.node * goes_on,
+        tick=state.tick + starts,
+        step_count=state.step_count * goes_on,
+        episode_reward=torch.where(mask, nothing, state.episode_reward),
+        reward=torch.where(mask, nothing, state.reward),
     )
     if uses.goal_change:
         state = _count_episode(state, mask, params)
@@ -414,13 +359,18 @@ def restart(
 
 
 def step_or_reset(
-    state: RowState, action: Tensor, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+    state: RowState,
+    action: Tensor,
+    mask: Tensor,
+    params: RowParams,
+    uses: Uses,
+    words: tuple[Words, Words] | None = None,
 ) -> tuple[RowState, Shown]:
     """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
-    words = words_of(state.tick + 1, params, uses) if words is None else words
-    stepped = advance(state, action, words, params, uses)
+    now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
+    stepped = advance(state, action, now, params, uses)
     state = begin(stepped._replace(tick=stepped.tick - mask.long()), mask, params, uses)
-    return state, _show(state, words, params, uses)
+    return state, _show(state, then, params, uses)
 
 
 def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = None) -> Shown:
@@ -480,8 +430,13 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
 def _show(state: RowState, words: Words, params: RowParams, uses: Uses) -> Shown:
     """Observation, outcome, leaf and done of states."""
     done = is_done(state, params.tree)
+    return Shown(observe(state, words, params, uses), *outcome(state, done, params), done)
+
+
+def outcome(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor]:
+    """The ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
     arrived = done & (state.state_type != _FAIL)
     leaf = state.node - params.tree.first_leaf
     hits = arrived & (leaf == state.goal_leaf)
-    outcome = done.view(torch.uint8) + arrived.view(torch.uint8) + hits.view(torch.uint8)
-    return Shown(observe(state, words, params, uses), outcome, leaf.masked_fill(~arrived, NO_LEAF), done)
+    result = done.to(torch.uint8) + arrived.to(torch.uint8) + hits.to(torch.uint8)
+    return result, leaf.masked_fill(~arrived, NO_LEAF)

@@ -175,7 +175,7 @@ class CTGraphEnv(EnvBase):
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
         state = RowState(*(given[field] for field in RowState._fields))
         nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
-        running = (state.state_type >= 0) & ~dynamics.is_done(state, self.rows._params.tree)
+        running = (state.state_type >= 0) & ~dynamics.is_done(state, self.rows.params.tree)
         inside = (state.node >= 0) & (state.node < nodes) & (state.goal_leaf >= 0) & (state.goal_leaf < leaves)
         wrong = (~(running & inside)).nonzero().flatten()[:5].tolist()
         require((not wrong, f"rows {wrong} of the given state are finished or no states of their trees"))

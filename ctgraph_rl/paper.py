@@ -29,8 +29,8 @@ def ct_graph(
         depth: d >= 1.
         wait_prob: p in [0, 1).
         goal: d decisions in 1..b; None: always the first branch.
-        fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective, the
-            images 0 to 4 for home, fail, decision, wait and end states.
+        fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective,
+            the images 0 to 4 for home, fail, decision, wait and end states.
         one_hot: vectors instead of images.
         image_seed: seed of the image set.
     """
@@ -102,8 +102,8 @@ def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
 def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
     """CT-POSR-B1: partially observable with stochastic rewards, b=2, d=2, p=0.5; the images of CT-SU-B1.
 
-    Rewards are drawn from N(c, 0.1), with c = 1 at the goal and 0 at the other end states. The paper leaves the standard
-    deviation open: 0.1 is a choice of this package.
+    End states pay a draw from N(c, 0.1), with c = 1 at the goal and 0 at the others. The paper leaves ids and the
+    standard deviation open: they are choices of this package.
 
     Args:
         goal: two decisions in 1..2.

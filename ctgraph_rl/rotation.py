@@ -54,19 +54,3 @@ def rotations(images: Tensor, read_rotation: int) -> Tensor:
         for angle in range(read_rotation + 1):
             out[:, angle, 0] = rotate(part, angle)
     return views.flatten(0, 1)
-
-
-def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotate each image by its own angle, as `rotate` does.
-
-    Args:
-        images: uint8 [N, 1, r, r].
-        angle: int64, whole degrees in [0, A).
-        taps: `taps_of` A angles, int64 [A, r * r, 4] each.
-
-    Returns:
-        uint8 [N, 1, r, r].
-    """
-    index, weight = (table[angle] for table in taps)
-    sources = images.flatten(1).to(torch.int64).gather(1, index.flatten(1)).view(index.shape)
-    return (((sources * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view(images.shape)

@@ -89,6 +89,7 @@ class Rows(nn.Module):
         for field in RowState._fields:
             self.register_buffer(field, zeros.to(_STATE_DTYPES.get(field, torch.int64), copy=True))
         self._stock: _Stock | None = None
+        self._now: Words | None = None
         self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
         self.set_tasks(tasks)
 
@@ -105,7 +106,7 @@ class Rows(nn.Module):
 
     @state.setter
     def state(self, state: RowState) -> None:
-        self._stock = None
+        self._stock = self._now = None
         self._buffers.update(zip(RowState._fields, state, strict=True))
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
@@ -132,9 +133,9 @@ class Rows(nn.Module):
         def rows(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
 
-        self._params, self._uses = self._make_params(different, rows)
+        self.params, self.uses = self._make_params(different, rows)
         self._task_goals = rows([task.goal_leaf for task in different])
-        self._stock = None
+        self._stock = self._now = None
         self._begin()
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
@@ -156,7 +157,7 @@ class Rows(nn.Module):
             goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
-        outside = (goals < 0) | (goals >= self._params.g.num_leaves)
+        outside = (goals < 0) | (goals >= self.params.g.num_leaves)
         require((not outside.any(), f"goals must be end states of the rows' trees, got {goals[outside][:5].tolist()}"))
         self.goal_leaf = goals.to(self.device, copy=True)
 
@@ -174,76 +175,83 @@ class Rows(nn.Module):
         """
         self.seed, self.row = seed, row
         self.tick = torch.zeros_like(self.row)
-        self._stock = None
-        self._params = self._row_params(self._params.tree, self._params.x, self._params.g)
+        self._stock = self._now = None
+        self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
         self._begin()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
-        return self._keep(*dynamics.reset(self.state, mask, self._params, self._uses, self._words(self.tick + mask)))
+        words = self._draw(self.tick + mask)
+        return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words))
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        return self._keep(*dynamics.step(self.state, action, self._params, self._uses, self._words(self.tick + 1)))
+        return self._keep(*dynamics.step(self.state, action, self.params, self.uses, self._draw_next()))
 
     def restart(self, mask: Tensor) -> Tensor:
         """`reset` of all finished rows, the mask: what all rows observe."""
-        words = self._words(self.tick + mask)
-        state, observation = dynamics.restart(self.state, mask, self._params, self._uses, words)
+        words = self._draw(self.tick + mask)
+        state, observation = dynamics.restart(self.state, mask, self.params, self.uses, words)
         self._buffers.update(zip(RowState._fields, state, strict=True))
         return observation
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
-        words = self._words(self.tick + 1)
-        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self._params, self._uses, words))
+        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, self._draw_next()))
 
     def _keep(self, state: RowState, shown: Shown) -> Shown:
         self._buffers.update(zip(RowState._fields, state, strict=True))
         return shown
 
-    def _words(self, tick: Tensor) -> Words | None:
-        """The draws of ticks, at most one ahead of the present; from a stock that is drawn for many ticks at once."""
-        if self._stock_ticks < 2 or not self._uses.draws:
-            return None
+    def _draw_next(self) -> tuple[Words, Words]:
+        """The draws of the present and of the next tick."""
+        now = self._draw(self.tick) if self._now is None else self._now
+        return now, self._draw(self.tick + 1)
+
+    def _draw(self, tick: Tensor) -> Words:
+        """The draws of ticks, at most one ahead of the present, kept as those of the present to be."""
+        if self._stock_ticks < 2 or not self.uses.draws:
+            self._now = dynamics.words_of(tick, self.params, self.uses)
+            return self._now
         if self._stock is None or self._stock.left == 0:
-            self._stock = _Stock(self._params, self._uses, self.tick, self._stock_ticks)
-        return self._stock.at(tick)
+            self._stock = _Stock(self.params, self.uses, self.tick, self._stock_ticks)
+        self._now = self._stock.at(tick)
+        return self._now
 
     def show(self) -> Shown:
         """What all rows show now."""
-        return dynamics.show(self.state, self._params, self._uses)
+        return dynamics.show(self.state, self.params, self.uses)
 
     @property
     def observation_id(self) -> Tensor:
         """The ids that the rows show now, int64 [N]."""
-        return dynamics.observation_id(self.state, self._params, self._uses)
+        return dynamics.observation_id(self.state, self.params, self.uses)
 
     @property
     def is_done(self) -> Tensor:
         """bool [N]: rows whose episode is over."""
-        return dynamics.is_done(self.state, self._params.tree)
+        return dynamics.is_done(self.state, self.params.tree)
 
     @property
     def branching_factor(self) -> Tensor:
         """b of each row, int64 [N]."""
-        return self._params.tree.branching_factor
+        return self.params.tree.branching_factor
 
     @property
     def first_leaf(self) -> Tensor:
         """Heap index of each row's first end state, int64 [N]."""
-        return self._params.tree.first_leaf
+        return self.params.tree.first_leaf
 
     @property
     def num_end_states(self) -> Tensor:
         """b^d of each row, int64 [N]."""
-        return self._params.g.num_leaves
+        return self.params.g.num_leaves
 
     @property
     def max_depth(self) -> int:
         """The largest depth of the rows."""
-        return self._uses.max_depth
+        return self.uses.max_depth
 
     def check_actions(self, action: Tensor | None) -> None:
         """Refuse actions of a wrong shape, dtype or range, and steps of finished rows.
@@ -279,7 +287,7 @@ class Rows(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
         """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
-        old = self._params
+        old = self.params
 
         def moved(part: Any) -> Any:
             return None if part is None else fn(part) if isinstance(part, Tensor) else tuple(map(moved, part))
@@ -287,7 +295,7 @@ class Rows(nn.Module):
         legacy = old.x.legacy and LegacyIndex(*moved(old.x.legacy))
         x = ObservationParams(*moved(old.x))._replace(legacy=legacy)
         self._task_goals = fn(self._task_goals)
-        self._params = self._row_params(TreeParams(*moved(old.tree)), x, RewardParams(*moved(old.g)))
+        self.params = self._row_params(TreeParams(*moved(old.tree)), x, RewardParams(*moved(old.g)))
         return self
 
     def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:

@@ -43,10 +43,10 @@ def test_the_core_compiles_into_one_graph_with_the_same_bits(backend):
     state = env.rows.state
 
     for action in scripts(12, 6, 4):
-        expected = dynamics.step(state, action, env.rows._params, env.rows._uses)
-        found = step(state, action, env.rows._params, env.rows._uses)
+        expected = dynamics.step(state, action, env.rows.params, env.rows.uses)
+        found = step(state, action, env.rows.params, env.rows.uses)
         assert all(torch.equal(x, y) for x, y in zip(flat(found), flat(expected), strict=True))
-        state, _ = dynamics.reset(expected[0], expected[1].done, env.rows._params, env.rows._uses)
+        state, _ = dynamics.reset(expected[0], expected[1].done, env.rows.params, env.rows.uses)
 
 
 def test_the_core_maps_over_a_further_dimension_with_vmap():
@@ -54,9 +54,9 @@ def test_the_core_maps_over_a_further_dimension_with_vmap():
     env.reset()
     actions = scripts(5, 6, 4)
 
-    state, shown = torch.vmap(lambda a: dynamics.step(env.rows.state, a, env.rows._params, env.rows._uses))(actions)
+    state, shown = torch.vmap(lambda a: dynamics.step(env.rows.state, a, env.rows.params, env.rows.uses))(actions)
 
-    alone = [flat(dynamics.step(env.rows.state, action, env.rows._params, env.rows._uses)) for action in actions]
+    alone = [flat(dynamics.step(env.rows.state, action, env.rows.params, env.rows.uses)) for action in actions]
     assert all(torch.equal(x, torch.stack(y)) for x, y in zip([*state, *shown], zip(*alone, strict=True), strict=True))
 
 
@@ -65,7 +65,7 @@ def test_a_step_of_the_core_changes_nothing_in_place():
     env.reset()
     before = [value.clone() for value in env.rows.state]
 
-    dynamics.step(env.rows.state, torch.zeros(6, dtype=torch.int64), env.rows._params, env.rows._uses)
+    dynamics.step(env.rows.state, torch.zeros(6, dtype=torch.int64), env.rows.params, env.rows.uses)
 
     assert all(torch.equal(x, y) for x, y in zip(env.rows.state, before, strict=True))
 
@@ -73,11 +73,11 @@ def test_a_step_of_the_core_changes_nothing_in_place():
 def test_what_has_no_use_changes_nothing_when_it_is_computed_all_the_same():
     env = CTGraphEnv([surjective()] * 4)
     env.reset()
-    everything = dynamics.Uses(reward_fns=env.rows._uses.reward_fns)
+    everything = dynamics.Uses(reward_fns=env.rows.uses.reward_fns)
 
     for action in scripts(12, 4):
-        lean = dynamics.step(env.rows.state, action, env.rows._params, env.rows._uses)
-        full = dynamics.step(env.rows.state, action, env.rows._params, everything)
+        lean = dynamics.step(env.rows.state, action, env.rows.params, env.rows.uses)
+        full = dynamics.step(env.rows.state, action, env.rows.params, everything)
         assert all(torch.equal(x, y) for x, y in zip(flat(lean), flat(full), strict=True))
         act(env, action)
         env.reset(TensorDict({"_reset": lean[1].done.unsqueeze(-1)}, [4]))

@@ -1,5 +1,5 @@
 from fractions import Fraction
-from itertools import permutations
+from itertools import permutations, product
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from oracles import DECISION, END, FAIL, HOME, WAIT
 
 from ctgraph_rl import CTGraph
 from ctgraph_rl.dynamics import State, TreeParams, transition
-from curricula.paper import ct_su_b1
+from ctgraph_rl.paper import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_posr_b1, ct_su_b1
 
 TABLE = [
     (2, 1, "0"),
@@ -44,6 +44,16 @@ PRINTED_RIGHT = [
     ("P_R of b=2 d=16 p=.5", 3.04e-20, CTGraph(2, 16, 0.5).reward_prob_random),
     ("E[rho] of CT-POSR-B1", 9, CTGraph(2, 2, 0.5).expected_episode_length),
     ("E[rho] of p=.99", 303, CTGraph(3, 2, 0.99).expected_episode_length),
+]
+
+
+# configuration, P_R, E[rho], number of images
+CONFIGURATIONS = [
+    (ct_fo_b1, Fraction(1, 243), 6, 16),
+    (ct_fo_b2, Fraction(1, 16875), 12, 32),
+    (ct_su_b1, Fraction(1, 243), 6, 5),
+    (ct_co_b1, Fraction(1, 243), 6, 104),
+    (ct_posr_b1, Fraction(3, 3375), 9, 5),
 ]
 
 
@@ -138,6 +148,53 @@ def test_the_implemented_transition_has_exactly_the_p_r_of_every_end_state(b, d,
     arrivals = implemented_arrivals(b, d, stay)
 
     assert arrivals == dict.fromkeys(range(first_leaf, first_leaf + b**d), expected)
+
+
+@pytest.mark.parametrize(("configuration", "p_r", "e_rho", "num_images"), CONFIGURATIONS)
+def test_a_configuration_has_the_closed_forms_of_the_paper(configuration, p_r, e_rho, num_images):
+    graph, task = configuration().graph, configuration(image_seed=3)
+
+    assert graph.reward_prob_random == pytest.approx(float(p_r), rel=1e-12, abs=0)
+    assert graph.expected_episode_length == pytest.approx(e_rho, rel=1e-12)
+    assert (task.images.num_images, task.image_seed) == (num_images, 3)
+    assert task.observations.last_id == num_images - 1
+    assert task.optimal_value(1.0) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("configuration", "_p_r", "_e_rho", "_num_images"), CONFIGURATIONS)
+def test_a_configuration_takes_any_goal(configuration, _p_r, _e_rho, _num_images):
+    depth = configuration().graph.depth
+
+    goals = {configuration(goal).goal_leaf for goal in product((1, 2), repeat=depth)}
+
+    assert goals == set(range(2**depth))
+
+
+def test_the_ids_of_fully_observable_configurations_are_the_published_ones():
+    small, large = ct_fo_b1().observations, ct_fo_b2().observations
+
+    assert (small.wait_ids, small.decision_ids, small.end_ids) == ((2, 8), (9, 11), (12, 15))
+    assert (large.wait_ids, large.decision_ids, large.end_ids) == ((2, 16), (17, 23), (24, 31))
+
+
+def test_wait_states_of_the_confounding_configuration_share_a_hundred_images():
+    x = ct_co_b1().observations
+
+    assert (x.wait_ids, x.decision_ids, x.end_ids) == ((3, 102), (2, 2), (103, 103))
+    assert x.draws_ids
+
+
+def test_rewards_of_the_stochastic_configuration_are_normal():
+    task = ct_posr_b1()
+
+    assert (task.reward_std, task.reward_noise, task.observations) == (0.1, "additive", ct_su_b1().observations)
+
+
+def test_a_task_of_any_size_has_an_image_for_each_state_or_kind_of_state():
+    full, shared = ct_graph(3, 2, 0.5), ct_graph(3, 2, 0.5, goal=(3, 1), fully_observable=False, one_hot=True)
+
+    assert full.images.num_images == full.graph.num_states
+    assert (full.goal, shared.goal, shared.images.shape) == ((1, 1), (3, 1), (5,))
 
 
 def implemented_arrivals(b: int, d: int, stay: Fraction) -> dict[int, Fraction]:

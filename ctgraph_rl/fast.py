@@ -1,0 +1,150 @@
+"""The fast path: steps of many rows into buffers that are allocated once, without TensorDict or Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl import dynamics, reading
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.dynamics import RowParams, RowState, Seen, Uses, Words
+from ctgraph_rl.rows import Rows
+
+Policy = Callable[[Tensor, Tensor], Tensor]
+"""What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
+
+
+class Steps(NamedTuple):
+    """T steps of N rows. Finished rows start anew at once, so every entry is a step that was taken.
+
+    What was seen at the end of an episode is not kept: it is terminal, so nothing is to be learned from it.
+    """
+
+    observation: Tensor  # uint8 [T + 1, N, *shape]; number t is seen before action t, number T comes after the last one
+    is_init: Tensor  # bool [T + 1, N]: the observation is the first of an episode
+    action: Tensor  # int64 [T, N]
+    reward: Tensor  # float32 [T, N]
+    done: Tensor  # bool [T, N]: the step ended an episode
+    outcome: Tensor  # uint8 [T, N]: 0 running, 1 fail, 2 another end state, 3 the goal
+
+    @classmethod
+    def empty(cls, rows: Rows, num_steps: int) -> Steps:
+        """Buffers for ``num_steps`` steps, to be filled again and again by `rollout`."""
+        require(*at_least_one(num_steps=num_steps))
+        t, n, device = num_steps, rows.num_rows, rows.device
+        return cls(
+            torch.empty(t + 1, n, *rows.image_shape, dtype=torch.uint8, device=device),
+            torch.empty(t + 1, n, dtype=torch.bool, device=device),
+            torch.empty(t, n, dtype=torch.int64, device=device),
+            torch.empty(t, n, device=device),
+            torch.empty(t, n, dtype=torch.bool, device=device),
+            torch.empty(t, n, dtype=torch.uint8, device=device),
+        )
+
+
+@torch.no_grad()
+def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = False) -> Steps:
+    """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
+
+    The steps are those that `CTGraphEnv` and the Gymnasium environments take with the same seeds and actions, bit for
+    bit.
+
+    Args:
+        rows: the batch. It is left where the last step led.
+        policy: what acts, or the actions, int64 [T, N].
+        steps: the buffers, from `Steps.empty`; filled in place.
+        compiled: run the step and the noise through ``torch.compile``: the same bits, several times faster where
+            waiting, ids, views or noise are drawn, after seconds of compiling for each batch size and kind of task.
+
+    Returns:
+        ``steps``.
+
+    Raises:
+        ValueError: for buffers of another shape, and actions of a wrong shape, dtype or range; the rows stay where they
+            were.
+    """
+    _check_buffers(rows, steps)
+    if isinstance(policy, Tensor):
+        _check_actions(rows, policy, steps.action.shape)
+    params, uses = rows.params, rows.uses
+    advance, noisy = _compiled(uses.draws or uses.pixel_noise) if compiled else (step_and_reset, reading.add_noise)
+    state = dynamics.begin(rows.state, rows.is_done, params, uses)
+    words = dynamics.words_of(state.tick, params, uses)
+    steps.observation[0] = dynamics.observe(state, words, params, uses)
+    torch.eq(state.step_count, 0, out=steps.is_init[0])
+    plain = not (uses.pixel_noise or uses.reward_cue or params.x.taps)
+    for t in range(len(steps.action)):
+        if isinstance(policy, Tensor):
+            action = policy[t]
+        else:
+            action = policy(steps.observation[t], steps.is_init[t])
+            _check_actions(rows, action, steps.action.shape[1:])
+        state, words, reward, done, outcome, seen = advance(state, action, words, params, uses)
+        steps.action[t], steps.reward[t], steps.done[t], steps.outcome[t] = action, reward, done, outcome
+        steps.is_init[t + 1] = done
+        if plain:
+            torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
+            continue
+        images = params.bank.index_select(0, seen.rows)
+        if uses.pixel_noise:
+            images = noisy(images, seen.noise, params.x.read_noise)
+        steps.observation[t + 1] = dynamics.finish(images, seen.angle, state, params, uses)
+    rows.state = state
+    return steps
+
+
+def step_and_reset(
+    state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses
+) -> tuple[RowState, Words, Tensor, Tensor, Tensor, Seen]:
+    """One step of every row, and the reset of those that it finishes; a pure function.
+
+    Args:
+        state: the rows' states, none of them finished.
+        action: int64 [N].
+        words: the draws of the present tick.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+
+    Returns:
+        The states after the resets and the draws of their tick; the step's reward, done and outcome; and what is seen
+        after the resets.
+    """
+    state = dynamics.advance(state, action, words, params, uses)
+    done, reward = dynamics.is_done(state, params.tree), state.reward
+    outcome = dynamics.outcome(state, done, params)[0]
+    state = dynamics.begin(state, done, params, uses)
+    words = dynamics.words_of(state.tick, params, uses)
+    return state, words, reward, done, outcome, dynamics.look(state, words, params, uses)
+
+
+@cache
+def _compiled(draws: bool) -> tuple[Callable, Callable]:
+    """The step and the noise as compiled functions.
+
+    Inductor's own vectors are slower than those that the C++ compiler finds in plain loops, and in the noise they are
+    wrong (see `reading.noisy`). Philox needs them: its products leave the range of int64, which C++ leaves undefined.
+    """
+    plain_loops: dict[str, Any] = {"cpp.simdlen": 1}
+    advance = torch.compile(step_and_reset, fullgraph=True, dynamic=False, options=None if draws else plain_loops)
+    return advance, torch.compile(reading.noisy, fullgraph=True, dynamic=False, options=plain_loops)
+
+
+def _check_buffers(rows: Rows, steps: Steps) -> None:
+    t, n = steps.action.shape
+    wanted = (t + 1, n, *rows.image_shape)
+    found = tuple(steps.observation.shape)
+    require((found == wanted and n == rows.num_rows, f"buffers must be those of Steps.empty(rows, {t}), got {found}"))
+
+
+def _check_actions(rows: Rows, action: Tensor, shape: torch.Size) -> None:
+    """Refuse what is no action. The range is checked on the CPU only: elsewhere the host would have to wait."""
+    spec = f"actions must be int64 of shape {list(shape)} with values in 0..{rows.max_branching}"
+    got = f"{action.dtype} {list(action.shape)}"
+    require((action.dtype == torch.int64 and action.shape == shape, f"{spec}, got {got}"))
+    if action.device.type == "cpu":
+        low, high = (int(value) for value in action.aminmax())
+        require((low >= 0 and high <= rows.max_branching, f"{spec}, got {low}..{high}"))

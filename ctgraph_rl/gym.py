@@ -1,0 +1,463 @@
+"""CT-graphs as Gymnasium environments: one alone, and a batch with all three autoreset modes.
+
+Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-B1-v0`` and so on;
+``gymnasium.make("ctgraph_rl.gym:ctgraph/CT-SU-B1-v0")`` imports and makes in one.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import lru_cache
+from inspect import signature
+from os import PathLike
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import logger, spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ctgraph_rl import paper
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.dynamics import RowState, Shown
+from ctgraph_rl.graph import CTGraph, StateType
+from ctgraph_rl.render import render
+from ctgraph_rl.rows import Rows, seed_rule
+from ctgraph_rl.task import Task
+
+CONFIGURATIONS: dict[str, Callable[..., Task]] = {
+    "CT-FO-B1": paper.ct_fo_b1,
+    "CT-FO-B2": paper.ct_fo_b2,
+    "CT-SU-B1": paper.ct_su_b1,
+    "CT-CO-B1": paper.ct_co_b1,
+    "CT-POSR-B1": paper.ct_posr_b1,
+}
+"""The configurations of the paper by name."""
+
+Json = str | PathLike[str] | Mapping[str, Any]
+Frame = NDArray[np.uint8] | str
+Array = NDArray[Any]
+
+_RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
+_GREYS = " ░▒▓█"
+
+
+def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
+    """A task from what ``gymnasium.make`` is given.
+
+    Args:
+        task: a task, or the name of one of the paper's configurations.
+        config: a configuration file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
+        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` that shall be different. Without
+            task and config also the arguments of `paper.ct_graph`.
+
+    Raises:
+        ValueError: for unknown names, and values out of range.
+    """
+    require((task is None or config is None, "give a task or a config, not both"))
+    if config is not None:
+        return _changed(Task.from_json(config, changes.pop("goal", None)), changes)
+    if task is None:
+        shape = {name: changes.pop(name) for name in signature(paper.ct_graph).parameters if name in changes}
+        return _changed(paper.ct_graph(**shape), changes)
+    if isinstance(task, str):
+        require((task in CONFIGURATIONS, f"task must be one of {', '.join(CONFIGURATIONS)}, got {task!r}"))
+        task = CONFIGURATIONS[task]()
+    require((isinstance(task, Task), f"task must be a Task or the name of a configuration, got {task!r}"))
+    return _changed(task, changes)
+
+
+def _changed(task: Task, changes: dict[str, Any]) -> Task:
+    """A task with other values of its fields, those of its graph and its observations among them."""
+    if "image_seed" in changes:
+        require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
+        changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]
+    for name in ("graph", "observations"):
+        part = getattr(task, name)
+        own = {field.name: changes.pop(field.name) for field in fields(part) if field.name in changes}
+        if own:
+            changes[name] = replace(part, **own)
+    unknown = changes.keys() - {field.name for field in fields(Task)}
+    require((not unknown, f"no field of a task, its graph or its observations: {', '.join(sorted(unknown))}"))
+    return replace(task, **changes)
+
+
+class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
+    """One CT-graph.
+
+    Observations are uint8 [1, r, r], or [K] when one-hot; action 0 waits and 1..b decides. Episodes end by themselves:
+    ``truncated`` is always False. ``info`` holds
+
+    - ``task``: the number of the task in ``task_pool``,
+    - ``outcome``: 0 running, 1 fail, 2 another end state, 3 the goal,
+    - ``leaf``: the number of the end state arrived at, else -1.
+
+    Args:
+        task: see `make_task`, as for ``config`` and ``changes``.
+        config: see `make_task`.
+        task_pool: the tasks that `set_task` may be given. Default: the task alone.
+        render_mode: ``rgb_array``, ``ansi`` or None.
+        changes: see `make_task`.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+
+    metadata = _RENDERING
+
+    def __init__(
+        self,
+        task: Task | str | None = None,
+        *,
+        config: Json | None = None,
+        task_pool: Iterable[Task] | None = None,
+        render_mode: str | None = None,
+        **changes: Any,
+    ) -> None:
+        task = make_task(task, config, **changes)
+        self.task_pool = _pool([task], task_pool)
+        self.rows = Rows([task], task_pool=self.task_pool)
+        self.render_mode = _known_mode(render_mode)
+        self.observation_space, self.action_space = _spaces(self.rows)
+        self._number = self._next_number = self.task_pool.index(task)
+        self._num_actions = self.rows.max_branching + 1
+        self._is_seeded, self._is_over = False, True
+
+    def set_task(self, task: Task) -> None:
+        """Change to another task of the pool at the next reset."""
+        (self._next_number,) = _numbers([task], self.task_pool)
+
+    @torch.inference_mode()
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: start the random stream of (seed, row 0), in [0, 2**63); None: go on with the present one.
+            options: without use.
+        """
+        require(_seed_rule(seed))
+        super().reset(seed=seed)
+        if self._next_number != self._number:
+            self._number = self._next_number
+            self.rows.set_tasks([self.task_pool[self._number]])
+        if seed is not None or not self._is_seeded:
+            self._is_seeded = True
+            first = int(self.np_random.integers(2**63 - 1)) if seed is None else seed
+            self.rows.set_streams(torch.tensor([first]), torch.tensor([0]))
+        self._is_over = False
+        shown = self.rows.reset()
+        return shown.observation.numpy()[0], self._info(shown)
+
+    @torch.inference_mode()
+    def step(self, action: int) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        """One step with an action in 0..b.
+
+        Raises:
+            ValueError: for another action, and after the end of an episode.
+        """
+        number = _as_int(action)
+        if self._is_over or not 0 <= number < self._num_actions:
+            require(
+                (0 <= number < self._num_actions, f"action must be in 0..{self._num_actions - 1}, got {action!r}"),
+                (not self._is_over, "no episode is running: reset first"),
+            )
+        shown = self.rows.step(_as_tensor(number))
+        self._is_over = bool(shown.done.item())
+        return shown.observation.numpy()[0], self.rows.reward.item(), self._is_over, False, self._info(shown)
+
+    def _info(self, shown: Shown) -> dict[str, Any]:
+        return {"task": self._number, "outcome": shown.outcome.item(), "leaf": shown.leaf.item()}
+
+    def render(self) -> Frame | None:
+        """The present state as a picture, uint8 [192, 384, 3], or as text."""
+        frames = _frames(self)
+        return frames[0] if frames else None
+
+
+class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
+    """A batch of CT-graphs, equal step for step to `gymnasium.vector.SyncVectorEnv` of as many `CTGraphGymEnv`.
+
+    Row i has the random stream of its own seed, ``seed + i`` or ``seed[i]``. What is returned is not changed later.
+
+    Args:
+        num_envs: number of rows.
+        task: see `make_task`, as for ``config`` and ``changes``; or a list of one task per row.
+        config: see `make_task`.
+        task_pool: the tasks that `set_tasks` may be given. Default: the rows' tasks.
+        render_mode: ``rgb_array``, ``ansi`` or None.
+        autoreset_mode: when a row whose episode is over starts the next one: ``NextStep``, in the next step, which
+            ignores its action; ``SameStep``, at once, with what was last in ``final_obs`` and ``final_info``;
+            ``Disabled``, with ``reset(options={"reset_mask": mask})``.
+        changes: see `make_task`.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+
+    metadata = _RENDERING
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: Task | str | Iterable[Task | str] | None = None,
+        *,
+        config: Json | None = None,
+        task_pool: Iterable[Task] | None = None,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **changes: Any,
+    ) -> None:
+        require((is_int(num_envs, 1), f"num_envs must be an integer >= 1, got {num_envs!r}"))
+        rows = as_tuple(task)
+        given = rows if isinstance(rows, tuple) else (task,)
+        require((len(given) in (1, num_envs), f"task must be one, or one per row of {num_envs}, got {len(given)}"))
+        made = [make_task(one, config, **changes) for one in given]
+        tasks = made if len(made) == num_envs else made * num_envs
+        self.num_envs = num_envs
+        self.task_pool = _pool(tasks, task_pool)
+        self.rows = Rows(tasks, task_pool=self.task_pool)
+        self.render_mode = _known_mode(render_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = _spaces(self.rows)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._numbers = self._next_numbers = np.array(_numbers(tasks, self.task_pool))
+        self._seeds = np.zeros(num_envs, np.int64)
+        self._is_seeded = False
+        self._is_over = np.ones(num_envs, np.bool_)
+
+    def set_tasks(self, tasks: Iterable[Task]) -> None:
+        """Give every row a task of the pool; a row changes to it at its next reset."""
+        numbers = np.array(_numbers(tasks, self.task_pool))
+        require((len(numbers) == self.num_envs, f"set_tasks needs {self.num_envs} tasks, got {len(numbers)}"))
+        self._next_numbers = numbers
+
+    @torch.inference_mode()
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Start an episode in all rows, or in those of a mask.
+
+        Args:
+            seed: start the random streams of (seed + i, row 0), or of a list's seeds; None: go on with the present.
+            options: ``{"reset_mask": bool [N]}`` says which rows; the others stay as they are.
+
+        Raises:
+            ValueError: for wrong seeds and masks, and a mask in the very first reset.
+        """
+        mask = self._mask(options)
+        self._start_streams(mask, seed)
+        self._change_tasks(mask)
+        self._is_over = self._is_over & ~mask
+        shown = self.rows.reset(torch.from_numpy(mask))
+        return shown.observation.numpy(), self._infos(shown, mask)
+
+    @torch.inference_mode()
+    def step(self, actions: NDArray[np.int64]) -> tuple[NDArray[np.uint8], Array, Array, Array, dict[str, Any]]:
+        """One step of all rows with actions, integers [N] in 0..b.
+
+        Raises:
+            ValueError: for other actions, before the first reset, and for rows that are done without autoreset.
+        """
+        action, over = self._checked(actions), self._is_over
+        if over.any():
+            self._change_tasks(over)
+            shown = self.rows.step_or_reset(action, torch.from_numpy(over))
+        else:
+            shown = self.rows.step(action)
+        rewards, done = self.rows.reward.numpy().astype(np.float64), shown.done.numpy()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
+            shown, infos = self._restart(done, shown)
+        else:
+            self._is_over, infos = done, self._infos(shown)
+        return shown.observation.numpy(), rewards, done.copy(), np.zeros_like(done), infos
+
+    def _restart(self, done: NDArray[np.bool_], final: Shown) -> tuple[Shown, dict[str, Any]]:
+        """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
+        last = np.full(self.num_envs, None, dtype=object)
+        for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
+            last[i] = observation
+        infos: dict[str, Any] = {"final_obs": last, "_final_obs": done.copy()}
+        infos |= {"final_info": self._infos(final, done), "_final_info": done.copy()}
+        self._change_tasks(done)
+        shown = self.rows.reset(final.done)
+        return shown, infos | self._infos(shown)
+
+    def _infos(self, shown: Shown, mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+        """What a `CTGraphGymEnv` says in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
+        values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
+        infos: dict[str, Any] = {}
+        for key, value in values.items():
+            infos[key] = value.astype(np.int64) if mask is None else np.where(mask, value, 0).astype(np.int64)
+            infos[f"_{key}"] = np.ones(self.num_envs, np.bool_) if mask is None else mask.copy()
+        return infos
+
+    def _checked(self, actions: NDArray[np.int64]) -> Tensor:
+        """A copy of actions as the rows want them."""
+        action, last = np.asarray(actions), self.rows.max_branching
+        fits = action.shape == (self.num_envs,) and action.dtype.kind in "iu"
+        if not fits or action.min() < 0 or action.max() > last:
+            got = action[(action < 0) | (action > last)][:5].tolist() if fits else f"{action.dtype} {action.shape}"
+            raise ValueError(f"actions must be integers of shape ({self.num_envs},) in 0..{last}, got {got}")
+        autoresets = self.autoreset_mode == AutoresetMode.NEXT_STEP and self._is_seeded
+        if not autoresets and self._is_over.any():
+            rows = self._is_over.nonzero()[0][:5].tolist()
+            raise ValueError(f"no episode is running in the rows {rows}: reset them first")
+        return torch.from_numpy(action.astype(np.int64))
+
+    def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+        """The rows that a reset is for."""
+        if options is None or "reset_mask" not in options:
+            return np.ones(self.num_envs, np.bool_)
+        mask = options["reset_mask"]
+        fits = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
+        require(
+            (
+                fits and bool(mask.any()),
+                f"reset_mask must be a bool array of shape [{self.num_envs}] with a row to reset, got {mask!r}",
+            ),
+            (self._is_seeded, "the first reset must be of all rows"),
+        )
+        return mask.copy()
+
+    def _start_streams(self, mask: NDArray[np.bool_], seed: int | Sequence[int | None] | None) -> None:
+        """Start random streams in the rows of a mask that are given a seed, and in all at first."""
+        seeds = self._seeds_of(seed)
+        given = np.array([one is not None for one in seeds])
+        start = mask & given if self._is_seeded else mask
+        if start.any():
+            drawn = self.np_random.integers(2**63 - 1, size=self.num_envs) if not given[start].all() else self._seeds
+            chosen = np.array([draw if one is None else one for one, draw in zip(seeds, drawn, strict=True)])
+            self._seeds, self._is_seeded = np.where(start, chosen, self._seeds), True
+            row = torch.zeros(self.num_envs, dtype=torch.int64)
+            self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
+
+    def _seeds_of(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
+        """A seed or None for every row, from what `reset` is given."""
+        seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
+        if isinstance(seed, int) and is_int(seed, 0):
+            super().reset(seed=seed)
+            seeds = tuple(range(seed, seed + self.num_envs))
+        fits = isinstance(seeds, tuple) and len(seeds) == self.num_envs
+        require((fits, f"seed must be an integer or one or None per row, {self.num_envs} in all, got {seed!r}"))
+        require(*map(_seed_rule, seeds))
+        return seeds
+
+    def _change_tasks(self, mask: NDArray[np.bool_]) -> None:
+        """Give the rows of a mask their next tasks."""
+        if self._next_numbers is self._numbers:
+            return
+        numbers = np.where(mask, self._next_numbers, self._numbers)
+        self._only(mask, lambda: self.rows.set_tasks([self.task_pool[number] for number in numbers]))
+        all_changed = (numbers == self._next_numbers).all()
+        self._numbers, self._next_numbers = numbers, numbers if all_changed else self._next_numbers
+
+    def _only(self, mask: NDArray[np.bool_], change: Callable[[], None]) -> None:
+        """A change that ends all episodes, in the rows of a mask only."""
+        before, rows = self.rows.state, torch.from_numpy(mask)
+        change()
+        after = zip(self.rows.state, before, strict=True)
+        self.rows.state = RowState(*(torch.where(rows, new, old) for new, old in after))
+
+    def render(self) -> tuple[Frame, ...] | None:
+        """The present state of every row as a picture, uint8 [192, 384, 3], or as text."""
+        return _frames(self)
+
+
+def _pool(tasks: Iterable[Task], task_pool: Iterable[Task] | None) -> tuple[Task, ...]:
+    """The different tasks of a pool, by default of the rows."""
+    return tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
+
+
+def _numbers(tasks: Iterable[Task], pool: tuple[Task, ...]) -> list[int]:
+    """The places of tasks in a pool."""
+    tasks, places = require_all(Task, "tasks", tasks), {task: number for number, task in enumerate(pool)}
+    unknown = [task for task in tasks if task not in places]
+    require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
+    return [places[task] for task in tasks]
+
+
+def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+    """The spaces of one row."""
+    white = 255 if len(rows.image_shape) == 3 else rows.white
+    return spaces.Box(0, white, rows.image_shape, np.uint8), spaces.Discrete(rows.max_branching + 1)
+
+
+def _seed_rule(seed: object) -> tuple[bool, str]:
+    return (True, "") if seed is None else seed_rule(seed)
+
+
+def _as_int(action: object) -> int:
+    """An integer, -1 for anything else."""
+    try:
+        return operator.index(action)  # type: ignore[arg-type]
+    except TypeError:
+        return -1
+
+
+@lru_cache(maxsize=256)
+def _as_tensor(action: int) -> Tensor:
+    return torch.tensor([action])
+
+
+def _known_mode(render_mode: str | None) -> str | None:
+    modes = _RENDERING["render_modes"]
+    require((render_mode in (None, *modes), f"render_mode must be None or one of {modes}, got {render_mode!r}"))
+    return render_mode
+
+
+def _frames(env: CTGraphGymEnv | CTGraphVectorEnv) -> tuple[Frame, ...] | None:
+    """A picture or a text of every row."""
+    if env.render_mode is None:
+        logger.warn("render() needs a render_mode, as in gymnasium.make(id, render_mode='rgb_array')")
+        return None
+    rows, observation = env.rows, env.rows.show().observation
+    if env.render_mode == "rgb_array":
+        return tuple(render(rows.tasks, rows.state_type, rows.node, rows.goal_leaf, observation).numpy())
+    states = (rows.state_type, rows.node, rows.goal_leaf, rows.step_count)
+    values = zip(*(state.tolist() for state in states), strict=True)
+    return tuple(
+        f"{_words(task, *value)}\n{_blocks(image, rows.white)}"
+        for task, value, image in zip(rows.tasks, values, observation.numpy(), strict=True)
+    )
+
+
+def _words(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
+    """Where a row is: ``wait state after 1 2, step 4, goal 1 1``."""
+    graph = task.graph
+    goal, way = (_decisions(graph, place) for place in (graph.num_decision_states + goal_leaf, node))
+    place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
+    return f"{place}, step {step_count}, goal {goal}"
+
+
+def _decisions(graph: CTGraph, node: int) -> str:
+    """The decisions from the root to a node."""
+    b, way = graph.branching_factor, []
+    while node > 0:
+        way.append((node - 1) % b + 1)
+        node = (node - 1) // b
+    return " ".join(map(str, reversed(way)))
+
+
+def _blocks(observation: NDArray[np.uint8], white: int) -> str:
+    """An image as lines of blocks of grey, two for each pixel; a vector as one line."""
+    levels = (observation.reshape(-1, observation.shape[-1]).astype(int) * 4 // white).clip(0, 4)
+    return "\n".join("".join(_GREYS[level] * 2 for level in line) for line in levels)
+
+
+for _name in ("CTGraph", *CONFIGURATIONS):
+    gymnasium.register(
+        f"ctgraph/{_name}-v0",
+        entry_point="ctgraph_rl.gym:CTGraphGymEnv",
+        vector_entry_point="ctgraph_rl.gym:CTGraphVectorEnv",
+        kwargs={"task": _name} if _name in CONFIGURATIONS else {},
+    )

@@ -1,0 +1,98 @@
+"""CT-graphs for Stable-Baselines3 in one batch, many times as fast as its ``make_vec_env`` with Gymnasium's ids."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.gym import CTGraphVectorEnv
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+except ImportError as error:
+    raise ImportError("ctgraph_rl.sb3 needs Stable-Baselines3: pip install stable-baselines3") from error
+
+
+class SB3VecEnv(VecEnv):
+    """A `CTGraphVectorEnv` for Stable-Baselines3, equal step for step to its ``DummyVecEnv`` of `CTGraphGymEnv`.
+
+    ``VecMonitor(SB3VecEnv(256, "CT-SU-B1"))`` records returns and lengths of episodes.
+
+    Args:
+        num_envs: number of rows.
+        task: see `CTGraphVectorEnv`, as for all others but the autoreset mode.
+        kwargs: see `CTGraphVectorEnv`.
+    """
+
+    def __init__(self, num_envs: int, task: Any = None, **kwargs: Any) -> None:
+        self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
+        super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
+        self.metadata = self.envs.metadata
+
+    def reset(self) -> NDArray[np.uint8]:
+        """Start an episode in all rows, with the seeds that ``seed`` was given before."""
+        observation, infos = self.envs.reset(seed=self._seeds)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = _by_row(infos)
+        return observation
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Take actions for the next `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One step; rows that are done start an episode at once and say in ``terminal_observation`` what was last."""
+        observation, rewards, done, _, batch = self.envs.step(self._actions)
+        infos = _by_row(batch, **{"TimeLimit.truncated": False})
+        ended = done.nonzero()[0].tolist()
+        if ended:
+            begun, final = _by_row(batch), _by_row(batch["final_info"])
+            for i in ended:
+                self.reset_infos[i] = begun[i]
+                infos[i] |= final[i] | {"terminal_observation": batch["final_obs"][i]}
+        return observation, rewards.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Nothing is held open."""
+        self.envs.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """A picture of every row, with ``render_mode="rgb_array"``."""
+        frames = self.envs.render() if self.render_mode == "rgb_array" else None
+        return cast("Sequence[NDArray[np.uint8] | None]", frames or [None] * self.num_envs)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the batch, once for every row."""
+        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of the batch; ``indices`` must be None."""
+        require(_batch_rule(indices))
+        setattr(self.envs, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the batch once, such as ``set_tasks`` with a list of tasks; ``indices`` must be None."""
+        require(_batch_rule(indices))
+        result = getattr(self.envs, method_name)(*args, **kwargs)
+        return list(result) if isinstance(result, tuple) else [result] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
+        """Rows are never wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def _batch_rule(indices: VecEnvIndices) -> tuple[bool, str]:
+    return indices is None, f"the rows are one batch: indices must be None, got {indices!r}"
+
+
+def _by_row(infos: dict[str, Any], **more: Any) -> list[dict[str, Any]]:
+    """Gymnasium's batch of infos as a dictionary for every row."""
+    rows = zip(*(infos[key].tolist() for key in ("task", "outcome", "leaf")), strict=True)
+    return [{"task": task, "outcome": outcome, "leaf": leaf, **more} for task, outcome, leaf in rows]
