@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.curriculum import Curriculum as Curriculum
     from ctgraph_rl.curriculum import Evaluation as Evaluation
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
+    from ctgraph_rl.fast import Steps as Steps
+    from ctgraph_rl.fast import rollout as rollout
     from ctgraph_rl.graph import CTGraph as CTGraph
     from ctgraph_rl.graph import StateType as StateType
     from ctgraph_rl.images import GroupedImages as GroupedImages
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.rewards import Gradient as Gradient
     from ctgraph_rl.rewards import Needle as Needle
     from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
-    from ctgraph_rl.fast import Steps as Steps
-    from ctgraph_rl.fast import rollout as rollout
     from ctgraph_rl.rows import Rows as Rows
     from ctgraph_rl.task import Task as Task
 

@@ -155,7 +155,7 @@ NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
 
 
-def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams) -> State:
+def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams, absorbing: bool = True) -> State:
     """One step of the tree, sections 2.1 and 2.2 of the paper.
 
     Args:
@@ -163,6 +163,7 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
         action: int64, 0 waits and 1..b decides; above a row's b it fails as a wrong action does.
         stays: bool, the row's draw with probability p; None if no row ever stays.
         tree: the rows' trees.
+        absorbing: whether rows may be at an end or fail state already; False saves their exception.
 
     Returns:
         The next state. ``node`` of a fail state is where it failed. An episode with an extra end step is over in a home
@@ -178,6 +179,8 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
         next_kind = next_kind.masked_fill(at_wait & waits & stays, _WAIT)
     decides = in_tree & ~(at_wait | fails)
     next_node = torch.where(decides, node * tree.branching_factor + action, node)
+    if not absorbing and tree.extra_end_step is None:
+        return State(next_kind, next_node)
     over = kind >= _END
     if tree.extra_end_step is not None:
         ended = (kind == _HOME) & (node > 0)
@@ -274,7 +277,8 @@ def finish(images: Tensor, angle: Tensor, state: RowState, params: RowParams, us
 
 
 Words = tuple[Tensor, ...]
-"""The four small draws of a tick: two for a wait that begins there, one for the id and one for the view shown there."""
+"""The small draws of a tick: two for a wait that begins there, one for the id and one for the view that are shown
+there, and, where rewards have noise, one for the reward of the step that begins there."""
 
 
 def step(
@@ -297,16 +301,18 @@ def step(
     return state, _show(state, then, params, uses)
 
 
-def advance(state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses) -> RowState:
+def advance(
+    state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses, absorbing: bool = True
+) -> RowState:
     """The step without what it shows, with the draws of the present tick: the next states, with the step's reward."""
-    before = State(state.state_type, state.node)
-    after = transition(before, action, stays(words, params.tree) if uses.waits else None, params.tree)
-    tick = state.tick + 1
-    reward = _reward(before, after, state.goal_leaf, tick, params, uses)
+    stay = stays(words, params.tree) if uses.waits else None
+    after = transition(State(state.state_type, state.node), action, stay, params.tree, absorbing)
+    entered = after.state_type != state.state_type if absorbing else None
+    reward = _reward(after, entered, state.goal_leaf, words, params, uses)
     return state._replace(
         state_type=after.state_type,
         node=after.node,
-        tick=tick,
+        tick=state.tick + 1,
         step_count=state.step_count + 1,
         episode_reward=state.episode_reward + reward,
         reward=reward,
@@ -332,8 +338,14 @@ def reset(
     return state, show(state, params, uses, words)
 
 
-def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowState:
-    """The reset without what it shows."""
+def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -> RowState:
+    """The reset without what it shows, in the rows of a mask or in all."""
+    if mask is None:
+        zeros = RowState(*map(torch.zeros_like, state))
+        state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
+        return (
+            _count_episode(state, torch.ones_like(state.node, dtype=torch.bool), params) if uses.goal_change else state
+        )
     starts = mask.long()
     goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
     state = state._replace(
@@ -350,7 +362,7 @@ def begin(state: RowState, mask: Tensor, params: RowParams, uses: Uses) -> RowSt
 
 
 def restart(
-    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+    state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
 ) -> tuple[RowState, Tensor]:
     """`reset` when it leaves no row finished: the states, and the observations alone."""
     state = begin(state, mask, params, uses)
@@ -369,7 +381,7 @@ def step_or_reset(
     """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
     now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
     stepped = advance(state, action, now, params, uses)
-    state = begin(stepped._replace(tick=stepped.tick - mask.long()), mask, params, uses)
+    state = begin(stepped._replace(tick=state.tick + ~mask), mask, params, uses)
     return state, _show(state, then, params, uses)
 
 
@@ -380,9 +392,8 @@ def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = N
 
 def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
     """The small draws of a tick, int64 of its shape; zeros without use."""
-    if not uses.draws:
-        return (torch.zeros_like(tick),) * 4
-    return draw(params.seed, params.row, tick, STREAM_STEP)
+    words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
+    return (*words, draw(params.seed, params.row, tick, STREAM_REWARD)[0]) if uses.reward_noise else words
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
@@ -398,20 +409,23 @@ def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState
     return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
 
 
-def _reward(before: State, after: State, goal_leaf: Tensor, tick: Tensor, params: RowParams, uses: Uses) -> Tensor:
+def _reward(
+    after: State, entered: Tensor | None, goal_leaf: Tensor, words: Words, params: RowParams, uses: Uses
+) -> Tensor:
     """float32: the step's own reward, and what is paid on entering an end or a fail state.
 
     Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
-    g, entered = params.g, after.state_type != before.state_type
+    g = params.g
     paid = _share(after, goal_leaf, params, uses) * g.goal_reward
     if uses.reward_noise:
-        word = draw(params.seed, params.row, tick, STREAM_REWARD)[0]
-        noise = (normal(word, params.normal_table) * g.reward_std).float()
+        noise = (normal(words[4], params.normal_table) * g.reward_std).float()
         paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
-    reward = torch.where(entered & (after.state_type == _END), paid, 0.0)
+    at_end = after.state_type == _END
+    reward = torch.where(at_end if entered is None else at_end & entered, paid, 0.0)
     if uses.fail_reward:
-        reward = torch.where(entered & (after.state_type == _FAIL), g.fail_reward, reward)
+        failed = after.state_type == _FAIL
+        reward = torch.where(failed if entered is None else failed & entered, g.fail_reward, reward)
     if uses.step_reward:
         reward = reward.double() + g.step_reward
     return reward.float()

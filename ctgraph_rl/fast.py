@@ -113,7 +113,7 @@ def step_and_reset(
         The states after the resets and the draws of their tick; the step's reward, done and outcome; and what is seen
         after the resets.
     """
-    state = dynamics.advance(state, action, words, params, uses)
+    state = dynamics.advance(state, action, words, params, uses, absorbing=False)
     done, reward = dynamics.is_done(state, params.tree), state.reward
     outcome = dynamics.outcome(state, done, params)[0]
     state = dynamics.begin(state, done, params, uses)

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ctgraph_rl import paper
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
-from ctgraph_rl.dynamics import RowState, Shown
+from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
 from ctgraph_rl.graph import CTGraph, StateType
 from ctgraph_rl.render import render
 from ctgraph_rl.rows import Rows, seed_rule
@@ -153,8 +153,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             first = int(self.np_random.integers(2**63 - 1)) if seed is None else seed
             self.rows.set_streams(torch.tensor([first]), torch.tensor([0]))
         self._is_over = False
-        shown = self.rows.reset()
-        return shown.observation.numpy()[0], self._info(shown)
+        return self.rows.restart().numpy()[0], {"task": self._number, "outcome": OUTCOME_RUNNING, "leaf": NO_LEAF}
 
     @torch.inference_mode()
     def step(self, action: int) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
@@ -169,12 +168,12 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
                 (0 <= number < self._num_actions, f"action must be in 0..{self._num_actions - 1}, got {action!r}"),
                 (not self._is_over, "no episode is running: reset first"),
             )
-        shown = self.rows.step(_as_tensor(number))
-        self._is_over = bool(shown.done.item())
-        return shown.observation.numpy()[0], self.rows.reward.item(), self._is_over, False, self._info(shown)
-
-    def _info(self, shown: Shown) -> dict[str, Any]:
-        return {"task": self._number, "outcome": shown.outcome.item(), "leaf": shown.leaf.item()}
+        observation, done = self.rows.act(_as_tensor(number))
+        self._is_over, outcome, leaf = bool(done.item()), OUTCOME_RUNNING, NO_LEAF
+        if self._is_over:
+            outcome, leaf = (int(value.item()) for value in self.rows.result(done))
+        info = {"task": self._number, "outcome": outcome, "leaf": leaf}
+        return observation.numpy()[0], self.rows.reward.item(), self._is_over, False, info
 
     def render(self) -> Frame | None:
         """The present state as a picture, uint8 [192, 384, 3], or as text."""
@@ -273,7 +272,8 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
             self._change_tasks(over)
             shown = self.rows.step_or_reset(action, torch.from_numpy(over))
         else:
-            shown = self.rows.step(action)
+            observation, ends = self.rows.act(action)
+            shown = Shown(observation, *self.rows.result(ends), ends)
         rewards, done = self.rows.reward.numpy().astype(np.float64), shown.done.numpy()
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             shown, infos = self._restart(done, shown)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -24,10 +22,9 @@ from ctgraph_rl.dynamics import (
     Uses,
     Words,
 )
-from ctgraph_rl.graph import MAX_STATES, StateType
-from ctgraph_rl.images import ImageSet, white_level
-from ctgraph_rl.rewards import RewardFn
-from ctgraph_rl.rotation import taps_of
+from ctgraph_rl.graph import StateType
+from ctgraph_rl.images import white_level
+from ctgraph_rl.params import make_params, shared_bank
 from ctgraph_rl.task import Task
 
 
@@ -79,11 +76,12 @@ class Rows(nn.Module):
         super().__init__()
         self._pool = frozenset(pool)
         self.max_branching = max(task.graph.branching_factor for task in pool)
-        self.image_shape, self._bank_start, bank = _shared_bank(pool, self.num_rows)
+        bank = shared_bank(pool, self.num_rows)
+        self._bank, self.image_shape = bank._replace(images=bank.images[:0]), bank.shape
         self.white = max(int(white_level(task.images)) for task in pool)
         self.register_buffer("seed", torch.tensor([seed], device=device))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
-        self.register_buffer("bank", bank.to(device), persistent=False)
+        self.register_buffer("bank", bank.images.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field in RowState._fields:
@@ -133,7 +131,8 @@ class Rows(nn.Module):
         def rows(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
 
-        self.params, self.uses = self._make_params(different, rows)
+        tree, x, g, self.uses = make_params(different, rows, self._bank)
+        self.params = self._row_params(tree, x, g)
         self._task_goals = rows([task.goal_leaf for task in different])
         self._stock = self._now = None
         self._begin()
@@ -189,16 +188,31 @@ class Rows(nn.Module):
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
         return self._keep(*dynamics.step(self.state, action, self.params, self.uses, self._draw_next()))
 
-    def restart(self, mask: Tensor) -> Tensor:
-        """`reset` of all finished rows, the mask: what all rows observe."""
-        words = self._draw(self.tick + mask)
-        state, observation = dynamics.restart(self.state, mask, self.params, self.uses, words)
+    def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
+
+        `result` tells more.
+        """
+        now, then = self._draw_next()
+        state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
         self._buffers.update(zip(RowState._fields, state, strict=True))
-        return observation
+        return dynamics.observe(state, then, self.params, self.uses), dynamics.is_done(state, self.params.tree)
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
-        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, self._draw_next()))
+        words = self._draw_next()
+        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words))
+
+    def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
+        """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
+        return dynamics.outcome(self.state, done, self.params)
+
+    def restart(self, mask: Tensor | None = None) -> Tensor:
+        """`reset` of all rows, or of all finished ones, the mask: what all rows observe."""
+        words = self._draw(self.tick + (1 if mask is None else mask))
+        state, observation = dynamics.restart(self.state, mask, self.params, self.uses, words)
+        self._buffers.update(zip(RowState._fields, state, strict=True))
+        return observation
 
     def _keep(self, state: RowState, shown: Shown) -> Shown:
         self._buffers.update(zip(RowState._fields, state, strict=True))
@@ -211,7 +225,7 @@ class Rows(nn.Module):
 
     def _draw(self, tick: Tensor) -> Words:
         """The draws of ticks, at most one ahead of the present, kept as those of the present to be."""
-        if self._stock_ticks < 2 or not self.uses.draws:
+        if self._stock_ticks < 2 or not (self.uses.draws or self.uses.reward_noise):
             self._now = dynamics.words_of(tick, self.params, self.uses)
             return self._now
         if self._stock is None or self._stock.left == 0:
@@ -301,61 +315,6 @@ class Rows(nn.Module):
     def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
         return RowParams(self.seed, self.row, tree, x, g, self.bank, self.normal_table)
 
-    def _make_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> tuple[RowParams, Uses]:
-        """The rows' parameters from their different tasks, and what they have use for."""
-        reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
-        params = self._row_params(
-            _tree_params(tasks, rows),
-            self._observation_params(tasks, rows),
-            _reward_params(tasks, rows, reward_fns),
-        )
-        observations = [task.observations for task in tasks]
-        uses = Uses(
-            waits=any(task.graph.wait_prob > 0 for task in tasks),
-            unique_ids=any(x.is_unique(kind) and not x.legacy_index for x in observations for kind in StateType),
-            drawn_ids=any(x.draws_ids for x in observations),
-            views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
-            pixel_noise=any(x.read_noise for x in observations),
-            reward_noise=any(task.reward_std for task in tasks),
-            fail_reward=any(task.fail_reward for task in tasks),
-            step_reward=any(task.step_reward for task in tasks),
-            reward_cue=any(x.reward_cue for x in observations),
-            goal_change=any(task.goal_change for task in tasks),
-            max_depth=max(task.graph.depth for task in tasks),
-            reward_fns=reward_fns,
-        )
-        return params, uses
-
-    def _observation_params(self, tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> ObservationParams:
-        observations = [task.observations for task in tasks]
-        by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
-        views, starts = [_num_views(task) for task in tasks], [self._bank_start[_bank_key(task)] for task in tasks]
-
-        def first_view(i: int, kind: StateType) -> int:
-            skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
-            return starts[i] + (observations[i].ids(kind)[0] - skipped) * views[i]
-
-        def num_ids(x: Any, kind: StateType) -> int:
-            return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
-
-        angles = max(map(_num_angles, tasks))
-        taps = [taps_of(self.image_shape[-1], angle) for angle in range(angles)] if angles > 1 else []
-        return ObservationParams(
-            first_view=rows([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
-            views_per_node=rows([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
-            num_ids=rows([[num_ids(x, kind) for kind in StateType] for x in observations]),
-            bank_start=rows(starts),
-            num_views=rows(views),
-            num_angles=rows([_num_angles(task) for task in tasks]),
-            read_noise=rows([x.read_noise for x in observations]),
-            reward_cue=rows([x.reward_cue for x in observations], torch.bool),
-            cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
-            cue_element=rows([task.images.num_images for task in tasks]),
-            white=rows([white_level(task.images) for task in tasks], torch.float64),
-            legacy=_legacy_index(tasks, rows) if any(x.legacy_index for x in observations) else None,
-            taps=tuple(torch.stack(part).to(self.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
-        )
-
 
 class _Stock:
     """The small draws of all rows for many ticks, drawn in one call: many small calls would cost more."""
@@ -384,111 +343,3 @@ _STATE_DTYPES = {"state_type": torch.uint8, "episode_reward": torch.float32, "re
 def seed_rule(seed: object) -> tuple[bool, str]:
     """The rule for seeds of environments."""
     return is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"
-
-
-def _tree_params(tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> TreeParams:
-    graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
-    return TreeParams(
-        branching_factor=rows([graph.branching_factor for graph in graphs]),
-        first_leaf=rows([graph.num_decision_states for graph in graphs]),
-        stay_below=rows([int(graph.wait_prob * 2**63) for graph in graphs]),
-        extra_end_step=rows(extra, torch.bool) if any(extra) else None,
-    )
-
-
-def _legacy_index(tasks: tuple[Task, ...], rows: Callable[..., Tensor]) -> LegacyIndex:
-    """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
-
-    def level(task: Task, k: int) -> tuple[int, int]:
-        if k > task.graph.depth:
-            return MAX_STATES, 0
-        number = task.graph.branching_factor**k - 1
-        first = number // (task.graph.branching_factor - 1)
-        return first, number - first
-
-    def num_ids(task: Task, kind: StateType) -> int:
-        first, last = task.observations.ids(kind)
-        return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
-
-    levels = range(max(task.graph.depth for task in tasks) + 1)
-    tables = [[level(task, k) for k in levels] for task in tasks]
-    return LegacyIndex(
-        level_first=rows([[first for first, _ in table] for table in tables]),
-        level_shift=rows([[shift for _, shift in table] for table in tables]),
-        num_ids=rows([[num_ids(task, kind) for kind in StateType] for task in tasks]),
-    )
-
-
-def _reward_params(
-    tasks: tuple[Task, ...], rows: Callable[..., Tensor], reward_fns: tuple[RewardFn, ...]
-) -> RewardParams:
-    changes = [task.goal_change or (0, 0) for task in tasks]
-    return RewardParams(
-        depth=rows([task.graph.depth for task in tasks]),
-        num_leaves=rows([task.graph.num_end_states for task in tasks]),
-        reward_fn=rows([reward_fns.index(task.reward_fn) for task in tasks]),
-        goal_reward=rows([task.goal_reward for task in tasks], torch.float32),
-        fail_reward=rows([task.fail_reward for task in tasks], torch.float32),
-        step_reward=rows([task.step_reward for task in tasks], torch.float32),
-        reward_std=rows([task.reward_std for task in tasks], torch.float32),
-        multiplicative=rows([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
-        change_first=rows([first for first, _ in changes]),
-        change_last=rows([last for _, last in changes]),
-        legacy_change=rows([task.legacy_goal_change for task in tasks], torch.bool),
-    )
-
-
-def _turns_late(task: Task) -> bool:
-    """Whether rotations come after noise, so that they cannot be in the bank; without noise the order is the same."""
-    return task.observations.noise_before_rotation and task.observations.read_noise > 0
-
-
-def _num_angles(task: Task) -> int:
-    return task.observations.read_rotation + 1 if _turns_late(task) else 1
-
-
-def _num_views(task: Task) -> int:
-    """Bank rows that one id of a task has."""
-    return task.images.num_variants * (_bank_key(task)[1] + 1)
-
-
-def _bank_key(task: Task) -> tuple[ImageSet, int]:
-    """The images of a task and the rotation that is in the bank."""
-    return task.images, 0 if _turns_late(task) else task.observations.read_rotation
-
-
-def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
-    """Refuse image sets and observations that cannot be held, before anything is allocated; POSIX systems only."""
-    if not hasattr(os, "sysconf"):
-        return
-    sets = dict.fromkeys(map(_bank_key, pool))
-    images_held = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
-    needed = bytes_each * (images_held + 2 * num_rows)  # a step holds two observations of every row
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    message = f"images and observations need {needed:,} bytes, this machine has {memory:,}; use fewer images or rows"
-    require((needed < memory, message))
-
-
-def _shared_bank(
-    pool: tuple[Task, ...], num_rows: int
-) -> tuple[tuple[int, ...], dict[tuple[ImageSet, int], int], Tensor]:
-    """One bank with each different image set of the pool once.
-
-    Returns:
-        The shape of an observation, the first row of each image set and rotation, and uint8 [rows, *shape].
-    """
-    shapes = list(dict.fromkeys(task.images.shape for task in pool))
-    one_hot = all(len(shape) == 1 for shape in shapes)
-    require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
-    shape = max(shapes)
-    _require_memory(pool, math.prod(shape), num_rows)
-    banks, starts, rows = [], {}, 0
-    for key in dict.fromkeys(map(_bank_key, pool)):
-        images, rotation = key
-        bank = images.bank(rotation)
-        if one_hot:
-            bank = torch.nn.functional.pad(bank, (0, shape[0] - bank.shape[1]))
-        banks.append(bank)
-        starts[key] = rows
-        rows += len(bank)
-    return shape, starts, banks[0] if len(banks) == 1 else torch.cat(banks)  # one may be large

@@ -221,10 +221,10 @@ def test_gradient_rewards_of_rows_with_other_trees_are_their_own():
     assert paid.flatten().tolist() == [0.0, 0.0]
 
 
-def test_the_noise_is_the_normal_number_of_the_steps_word_added_or_times_the_reward():
+def test_the_noise_is_the_normal_number_of_the_word_where_the_step_begins_added_or_times_the_reward():
     additive = replace(surjective(), reward_std=0.5, goal_reward=3.0)
     env = CTGraphEnv([additive, replace(additive, reward_noise="multiplicative")], seed=3, first_row=5)
-    ticks = torch.tensor([7, 7])  # the first observation and six steps
+    ticks = torch.tensor([6, 6])  # the first observation and five steps: where the last step begins
     z = normal(draw(torch.tensor(3), torch.tensor([5, 6]), ticks, STREAM_REWARD)[0], normal_table())
 
     paid = play(env, optimal)["reward"].squeeze(-1).double()

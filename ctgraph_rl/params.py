@@ -1,0 +1,189 @@
+"""From tasks to tensors: the parameters of rows, and the bank of images that they share."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.dynamics import LegacyIndex, ObservationParams, RewardParams, TreeParams, Uses
+from ctgraph_rl.graph import MAX_STATES, StateType
+from ctgraph_rl.images import ImageSet, white_level
+from ctgraph_rl.rewards import RewardFn
+from ctgraph_rl.rotation import taps_of
+from ctgraph_rl.task import Task
+
+Expand = Callable[..., Tensor]
+"""Makes a tensor with one entry per row from a list with one entry per different task, and a dtype (int64)."""
+
+
+def make_params(
+    tasks: tuple[Task, ...], rows: Expand, bank: Bank
+) -> tuple[TreeParams, ObservationParams, RewardParams, Uses]:
+    """The rows' parameters from their different tasks, and what they have use for."""
+    reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
+    observations = [task.observations for task in tasks]
+    uses = Uses(
+        waits=any(task.graph.wait_prob > 0 for task in tasks),
+        unique_ids=any(x.is_unique(kind) and not x.legacy_index for x in observations for kind in StateType),
+        drawn_ids=any(x.draws_ids for x in observations),
+        views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
+        pixel_noise=any(x.read_noise for x in observations),
+        reward_noise=any(task.reward_std for task in tasks),
+        fail_reward=any(task.fail_reward for task in tasks),
+        step_reward=any(task.step_reward for task in tasks),
+        reward_cue=any(x.reward_cue for x in observations),
+        goal_change=any(task.goal_change for task in tasks),
+        max_depth=max(task.graph.depth for task in tasks),
+        reward_fns=reward_fns,
+    )
+    reward_params = _reward_params(tasks, rows, reward_fns)
+    return _tree_params(tasks, rows), _observation_params(tasks, rows, bank), reward_params, uses
+
+
+def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
+    graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
+    return TreeParams(
+        branching_factor=rows([graph.branching_factor for graph in graphs]),
+        first_leaf=rows([graph.num_decision_states for graph in graphs]),
+        stay_below=rows([int(graph.wait_prob * 2**63) for graph in graphs]),
+        extra_end_step=rows(extra, torch.bool) if any(extra) else None,
+    )
+
+
+def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> ObservationParams:
+    observations = [task.observations for task in tasks]
+    by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
+    views, starts = [_num_views(task) for task in tasks], [bank.start[_bank_key(task)] for task in tasks]
+
+    def first_view(i: int, kind: StateType) -> int:
+        skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
+        return starts[i] + (observations[i].ids(kind)[0] - skipped) * views[i]
+
+    def num_ids(x: Any, kind: StateType) -> int:
+        return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
+
+    bank_start, angles = rows(starts), max(map(_num_angles, tasks))
+    taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
+    return ObservationParams(
+        first_view=rows([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
+        views_per_node=rows([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
+        num_ids=rows([[num_ids(x, kind) for kind in StateType] for x in observations]),
+        bank_start=bank_start,
+        num_views=rows(views),
+        num_angles=rows([_num_angles(task) for task in tasks]),
+        read_noise=rows([x.read_noise for x in observations]),
+        reward_cue=rows([x.reward_cue for x in observations], torch.bool),
+        cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
+        cue_element=rows([task.images.num_images for task in tasks]),
+        white=rows([white_level(task.images) for task in tasks], torch.float64),
+        legacy=_legacy_index(tasks, rows) if any(x.legacy_index for x in observations) else None,
+        taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
+    )
+
+
+def _legacy_index(tasks: tuple[Task, ...], rows: Expand) -> LegacyIndex:
+    """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
+
+    def level(task: Task, k: int) -> tuple[int, int]:
+        if k > task.graph.depth:
+            return MAX_STATES, 0
+        number = task.graph.branching_factor**k - 1
+        first = number // (task.graph.branching_factor - 1)
+        return first, number - first
+
+    def num_ids(task: Task, kind: StateType) -> int:
+        first, last = task.observations.ids(kind)
+        return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
+
+    levels = range(max(task.graph.depth for task in tasks) + 1)
+    tables = [[level(task, k) for k in levels] for task in tasks]
+    return LegacyIndex(
+        level_first=rows([[first for first, _ in table] for table in tables]),
+        level_shift=rows([[shift for _, shift in table] for table in tables]),
+        num_ids=rows([[num_ids(task, kind) for kind in StateType] for task in tasks]),
+    )
+
+
+def _reward_params(tasks: tuple[Task, ...], rows: Expand, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
+    changes = [task.goal_change or (0, 0) for task in tasks]
+    return RewardParams(
+        depth=rows([task.graph.depth for task in tasks]),
+        num_leaves=rows([task.graph.num_end_states for task in tasks]),
+        reward_fn=rows([reward_fns.index(task.reward_fn) for task in tasks]),
+        goal_reward=rows([task.goal_reward for task in tasks], torch.float32),
+        fail_reward=rows([task.fail_reward for task in tasks], torch.float32),
+        step_reward=rows([task.step_reward for task in tasks], torch.float32),
+        reward_std=rows([task.reward_std for task in tasks], torch.float32),
+        multiplicative=rows([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
+        change_first=rows([first for first, _ in changes]),
+        change_last=rows([last for _, last in changes]),
+        legacy_change=rows([task.legacy_goal_change for task in tasks], torch.bool),
+    )
+
+
+def _turns_late(task: Task) -> bool:
+    """Whether rotations come after noise, so that they cannot be in the bank; without noise the order is the same."""
+    return task.observations.noise_before_rotation and task.observations.read_noise > 0
+
+
+def _num_angles(task: Task) -> int:
+    return task.observations.read_rotation + 1 if _turns_late(task) else 1
+
+
+def _num_views(task: Task) -> int:
+    """Bank rows that one id of a task has."""
+    return task.images.num_variants * (_bank_key(task)[1] + 1)
+
+
+def _bank_key(task: Task) -> tuple[ImageSet, int]:
+    """The images of a task and the rotation that is in the bank."""
+    return task.images, 0 if _turns_late(task) else task.observations.read_rotation
+
+
+def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
+    """Refuse image sets and observations that cannot be held, before anything is allocated; POSIX systems only."""
+    if not hasattr(os, "sysconf"):
+        return
+    sets = dict.fromkeys(map(_bank_key, pool))
+    images_held = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    needed = bytes_each * (images_held + 2 * num_rows)  # a step holds two observations of every row
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    message = f"images and observations need {needed:,} bytes, this machine has {memory:,}; use fewer images or rows"
+    require((needed < memory, message))
+
+
+class Bank(NamedTuple):
+    """All images that a pool of tasks can show, each different set of them once."""
+
+    images: Tensor  # uint8 [rows, *shape]
+    shape: tuple[int, ...]  # of an observation
+    start: dict[tuple[ImageSet, int], int]  # the first row of each image set and rotation
+
+
+def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
+    """The bank of a pool.
+
+    Raises:
+        ValueError: for observations of different shapes, and for more than the machine can hold.
+    """
+    shapes = list(dict.fromkeys(task.images.shape for task in pool))
+    one_hot = all(len(shape) == 1 for shape in shapes)
+    require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
+    shape = max(shapes)
+    _require_memory(pool, math.prod(shape), num_rows)
+    banks, starts, rows = [], {}, 0
+    for key in dict.fromkeys(map(_bank_key, pool)):
+        images, rotation = key
+        bank = images.bank(rotation)
+        if one_hot:
+            bank = torch.nn.functional.pad(bank, (0, shape[0] - bank.shape[1]))
+        banks.append(bank)
+        starts[key] = rows
+        rows += len(bank)
+    return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts)  # one may be large
