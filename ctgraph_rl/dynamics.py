@@ -137,6 +137,7 @@ class RowState(NamedTuple):
     goal_leaf: Tensor
     episodes_left: Tensor  # episodes with this goal, the present one included; 0 before the first
     reward: Tensor  # float32: the last step's reward
+    paid: Tensor  # float32: the part of it that an end or fail state paid
 
 
 class Shown(NamedTuple):
@@ -271,7 +272,7 @@ def finish(images: Tensor, angle: Tensor, state: RowState, params: RowParams, us
     if x.taps is not None:
         images = turn(images, angle, x.taps)
     if uses.reward_cue:
-        level = cue_level((state.reward - params.g.step_reward).double() / params.g.goal_reward, x.white, x.cue_wraps)
+        level = cue_level(state.paid.double() / params.g.goal_reward, x.white, x.cue_wraps)
         images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
     return images
 
@@ -308,7 +309,9 @@ def advance(
     stay = stays(words, params.tree) if uses.waits else None
     after = transition(State(state.state_type, state.node), action, stay, params.tree, absorbing)
     entered = after.state_type != state.state_type if absorbing else None
-    reward = _reward(after, entered, state.goal_leaf, words, params, uses)
+    paid = reward = _paid(after, entered, state.goal_leaf, words, params, uses)
+    if uses.step_reward:
+        reward = (paid.double() + params.g.step_reward).float()
     return state._replace(
         state_type=after.state_type,
         node=after.node,
@@ -316,6 +319,7 @@ def advance(
         step_count=state.step_count + 1,
         episode_reward=state.episode_reward + reward,
         reward=reward,
+        paid=paid,
     )
 
 
@@ -348,13 +352,15 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
         )
     starts = mask.long()
     goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
+    reward = torch.where(mask, nothing, state.reward)
     state = state._replace(
         state_type=state.state_type * goes_on.to(torch.uint8),  # the home state is 0; faster than filling by a mask
         node=state.node * goes_on,
         tick=state.tick + starts,
         step_count=state.step_count * goes_on,
         episode_reward=torch.where(mask, nothing, state.episode_reward),
-        reward=torch.where(mask, nothing, state.reward),
+        reward=reward,
+        paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
     )
     if uses.goal_change:
         state = _count_episode(state, mask, params)
@@ -409,10 +415,10 @@ def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState
     return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
 
 
-def _reward(
+def _paid(
     after: State, entered: Tensor | None, goal_leaf: Tensor, words: Words, params: RowParams, uses: Uses
 ) -> Tensor:
-    """float32: the step's own reward, and what is paid on entering an end or a fail state.
+    """float32: what is paid on entering an end or a fail state.
 
     Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
     """
@@ -426,8 +432,6 @@ def _reward(
     if uses.fail_reward:
         failed = after.state_type == _FAIL
         reward = torch.where(failed if entered is None else failed & entered, g.fail_reward, reward)
-    if uses.step_reward:
-        reward = reward.double() + g.step_reward
     return reward.float()
 
 

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from ctgraph_rl import dynamics
 from ctgraph_rl.checks import require, require_all
 from ctgraph_rl.dynamics import RowState, Shown
+from ctgraph_rl.graph import StateType
 from ctgraph_rl.render import render
 from ctgraph_rl.rows import Rows, seed_rule
 from ctgraph_rl.task import Task
@@ -175,8 +176,12 @@ class CTGraphEnv(EnvBase):
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
         state = RowState(*(given[field] for field in RowState._fields))
         nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
-        running = (state.state_type >= 0) & ~dynamics.is_done(state, self.rows.params.tree)
+        kind, is_leaf = state.state_type, state.node >= self.first_leaf
+        running = (kind >= 0) & ~dynamics.is_done(state, self.rows.params.tree)
+        misplaced = ((kind == StateType.DECISION) & is_leaf) | ((kind == StateType.END) & ~is_leaf)
+        misplaced = misplaced | ((kind == StateType.HOME) & (state.node != 0))
         inside = (state.node >= 0) & (state.node < nodes) & (state.goal_leaf >= 0) & (state.goal_leaf < leaves)
+        inside = inside & ~misplaced
         wrong = (~(running & inside)).nonzero().flatten()[:5].tolist()
         require((not wrong, f"rows {wrong} of the given state are finished or no states of their trees"))
         if mask is None:

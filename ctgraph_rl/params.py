@@ -80,7 +80,7 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> Ob
         read_noise=rows([x.read_noise for x in observations]),
         reward_cue=rows([x.reward_cue for x in observations], torch.bool),
         cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
-        cue_element=rows([task.images.num_images for task in tasks]),
+        cue_element=rows([task.images.shape[-1] - 1 for task in tasks]),
         white=rows([white_level(task.images) for task in tasks], torch.float64),
         legacy=_legacy_index(tasks, rows) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]

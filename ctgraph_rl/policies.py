@@ -93,5 +93,6 @@ class SearchPolicy(OptimalPolicy):
             self.target = self._random_below(self.env.num_end_states)
         over = tensordict.get("is_init").squeeze(-1) & self.tried & (self.target != self.env.goal_leaf)
         self.target = torch.where(over, (self.target + 1) % self.env.num_end_states, self.target)
-        self.tried = (self.env.state_type == StateType.WAIT) & (self.env.node == self.env.first_leaf + self.target)
+        arrives = (self.env.state_type == StateType.WAIT) & (self.env.node == self.env.first_leaf + self.target)
+        self.tried = arrives | (self.tried & (self.env.state_type == StateType.END))  # which may take one more action
         return super().action(tensordict)

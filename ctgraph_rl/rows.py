@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +26,8 @@ from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import white_level
 from ctgraph_rl.params import make_params, shared_bank
 from ctgraph_rl.task import Task
+
+T = TypeVar("T")
 
 
 class Rows(nn.Module):
@@ -57,6 +59,7 @@ class Rows(nn.Module):
     goal_leaf: Tensor
     episodes_left: Tensor
     reward: Tensor
+    paid: Tensor
 
     def __init__(
         self,
@@ -182,11 +185,12 @@ class Rows(nn.Module):
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         words = self._draw(self.tick + mask)
-        return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words))
+        return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        return self._keep(*dynamics.step(self.state, action, self.params, self.uses, self._draw_next()))
+        words = self._draw_next()
+        return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
@@ -195,13 +199,13 @@ class Rows(nn.Module):
         """
         now, then = self._draw_next()
         state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
-        self._buffers.update(zip(RowState._fields, state, strict=True))
-        return dynamics.observe(state, then, self.params, self.uses), dynamics.is_done(state, self.params.tree)
+        observation = dynamics.observe(state, then, self.params, self.uses)
+        return self._keep(state, (observation, dynamics.is_done(state, self.params.tree)), then)
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         words = self._draw_next()
-        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words))
+        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
 
     def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
         """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
@@ -210,13 +214,13 @@ class Rows(nn.Module):
     def restart(self, mask: Tensor | None = None) -> Tensor:
         """`reset` of all rows, or of all finished ones, the mask: what all rows observe."""
         words = self._draw(self.tick + (1 if mask is None else mask))
-        state, observation = dynamics.restart(self.state, mask, self.params, self.uses, words)
-        self._buffers.update(zip(RowState._fields, state, strict=True))
-        return observation
+        return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
 
-    def _keep(self, state: RowState, shown: Shown) -> Shown:
+    def _keep(self, state: RowState, result: T, words: Words) -> T:
+        """Go over to a state and the draws of its ticks; the result is passed on."""
         self._buffers.update(zip(RowState._fields, state, strict=True))
-        return shown
+        self._now = words
+        return result
 
     def _draw_next(self) -> tuple[Words, Words]:
         """The draws of the present and of the next tick."""
@@ -224,14 +228,12 @@ class Rows(nn.Module):
         return now, self._draw(self.tick + 1)
 
     def _draw(self, tick: Tensor) -> Words:
-        """The draws of ticks, at most one ahead of the present, kept as those of the present to be."""
+        """The draws of ticks, at most one ahead of the present."""
         if self._stock_ticks < 2 or not (self.uses.draws or self.uses.reward_noise):
-            self._now = dynamics.words_of(tick, self.params, self.uses)
-            return self._now
+            return dynamics.words_of(tick, self.params, self.uses)
         if self._stock is None or self._stock.left == 0:
             self._stock = _Stock(self.params, self.uses, self.tick, self._stock_ticks)
-        self._now = self._stock.at(tick)
-        return self._now
+        return self._stock.at(tick)
 
     def show(self) -> Shown:
         """What all rows show now."""
@@ -297,10 +299,12 @@ class Rows(nn.Module):
         """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
         self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
         super()._load_from_state_dict(*args, **kwargs)
+        self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
         """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
+        self._stock = self._now = None
         old = self.params
 
         def moved(part: Any) -> Any:
@@ -337,7 +341,12 @@ class _Stock:
 MAX_STOCK = 2**14
 MAX_STOCK_TICKS = 256
 
-_STATE_DTYPES = {"state_type": torch.uint8, "episode_reward": torch.float32, "reward": torch.float32}
+_STATE_DTYPES = {
+    "state_type": torch.uint8,
+    "episode_reward": torch.float32,
+    "reward": torch.float32,
+    "paid": torch.float32,
+}
 
 
 def seed_rule(seed: object) -> tuple[bool, str]:

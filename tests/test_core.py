@@ -168,6 +168,7 @@ def test_a_reset_clears_all_of_the_episode_in_its_rows_and_leaves_the_others():
         "goal_leaf": [0, 0],
         "episodes_left": [1, 2],
         "reward": [0.0, 0.5],
+        "paid": [0.0, 0.0],
     }
 
 
