@@ -24,7 +24,7 @@ from ctgraph_rl.philox import (
     randint,
     randint_wide,
 )
-from ctgraph_rl.reading import add_cue, add_noise, cue_level, turn
+from ctgraph_rl.reading import add_cue, add_noise, add_saturating, cue_level, turn
 from ctgraph_rl.rewards import Arrival, RewardFn
 
 _HOME, _WAIT, _DECISION, _END, _FAIL = map(int, StateType)  # plain integers: torch.compile knows no IntEnum
@@ -72,6 +72,7 @@ class ObservationParams(NamedTuple):
     cue_wraps: Tensor  # bool
     cue_element: Tensor  # which element of a vector shows it
     white: Tensor  # float64: brightness of the cue for the goal's reward
+    noise_start: Tensor  # first row of the noise bank with the row's noise
     legacy: LegacyIndex | None = None
     taps: tuple[Tensor, Tensor] | None = None  # of `num_angles` rotations, see `rotation.taps_of`
 
@@ -101,6 +102,7 @@ class RowParams(NamedTuple):
     x: ObservationParams
     g: RewardParams
     bank: Tensor  # uint8 [B, *shape]
+    noise_bank: Tensor  # uint8 [B', *shape]; empty for noise of its own for every observation
     normal_table: Tensor
 
 
@@ -112,6 +114,7 @@ class Uses(NamedTuple):
     drawn_ids: bool = True
     views: bool = True
     pixel_noise: bool = True
+    noise_bank: int = 0  # how many noises an observation's is chosen from
     reward_noise: bool = True
     fail_reward: bool = True
     step_reward: bool = True
@@ -240,7 +243,9 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
     """
     seen = look(state, words, params, uses)
     images = params.bank.index_select(0, seen.rows)
-    if uses.pixel_noise:
+    if uses.noise_bank:
+        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
+    elif uses.pixel_noise:
         images = add_noise(images, seen.noise, params.x.read_noise)
     return finish(images, seen.angle, state, params, uses)
 
@@ -250,7 +255,7 @@ class Seen(NamedTuple):
 
     rows: Tensor  # of the bank
     angle: Tensor  # degrees by which the images are still to be turned
-    noise: Tensor  # start of the noise
+    noise: Tensor  # start of the noise, or its row in the noise bank
 
 
 def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
@@ -262,7 +267,7 @@ def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
         rows, angle = rows + view // x.num_angles, view % x.num_angles
     if uses.pixel_noise:
         upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
-        noise = (upper << 32) | lower
+        noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
     return Seen(rows, angle, noise)
 
 

@@ -49,7 +49,8 @@ class CTGraphEnv(EnvBase):
         task_pool: the tasks that `set_tasks` may be given; specs and images are fixed by it. Default: ``tasks``.
         device: where the tensors live.
         check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows, with a
-            ``ValueError``. False trusts them for speed.
+            ``ValueError``. False trusts them for speed; on a GPU the check waits for the device at every step.
+        noise_bank: 0, or from how many noises drawn in advance an observation takes its own: see `Rows`.
 
     Raises:
         ValueError: for no tasks, values out of range, and observations of different shapes.
@@ -67,12 +68,13 @@ class CTGraphEnv(EnvBase):
         task_pool: Iterable[Task] | None = None,
         device: torch.device | str = "cpu",
         check_actions: bool = True,
+        noise_bank: int = 0,
     ) -> None:
         require((isinstance(check_actions, bool), f"check_actions must be true or false, got {check_actions!r}"))
         tasks = require_all(Task, "tasks", tasks)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions = check_actions
-        self.rows = Rows(tasks, seed, first_row, task_pool, self.device)
+        self.rows = Rows(tasks, seed, first_row, task_pool, self.device, noise_bank)
         self._make_specs()
 
     def _make_specs(self) -> None:

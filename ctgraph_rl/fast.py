@@ -12,6 +12,7 @@ from torch import Tensor
 from ctgraph_rl import dynamics, reading
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.dynamics import RowParams, RowState, Seen, Uses, Words
+from ctgraph_rl.reading import add_saturating
 from ctgraph_rl.rows import Rows
 
 Policy = Callable[[Tensor, Tensor], Tensor]
@@ -90,7 +91,9 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
             torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
             continue
         images = params.bank.index_select(0, seen.rows)
-        if uses.pixel_noise:
+        if uses.noise_bank:
+            images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
+        elif uses.pixel_noise:
             images = noisy(images, seen.noise, params.x.read_noise)
         steps.observation[t + 1] = dynamics.finish(images, seen.angle, state, params, uses)
     rows.state = state

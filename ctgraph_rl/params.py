@@ -23,7 +23,7 @@ Expand = Callable[..., Tensor]
 
 
 def make_params(
-    tasks: tuple[Task, ...], rows: Expand, bank: Bank
+    tasks: tuple[Task, ...], rows: Expand, bank: Bank, noise_bank: int
 ) -> tuple[TreeParams, ObservationParams, RewardParams, Uses]:
     """The rows' parameters from their different tasks, and what they have use for."""
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
@@ -34,6 +34,7 @@ def make_params(
         drawn_ids=any(x.draws_ids for x in observations),
         views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
         pixel_noise=any(x.read_noise for x in observations),
+        noise_bank=noise_bank if any(x.read_noise for x in observations) else 0,
         reward_noise=any(task.reward_std for task in tasks),
         fail_reward=any(task.fail_reward for task in tasks),
         step_reward=any(task.step_reward for task in tasks),
@@ -43,7 +44,10 @@ def make_params(
         reward_fns=reward_fns,
     )
     reward_params = _reward_params(tasks, rows, reward_fns)
-    return _tree_params(tasks, rows), _observation_params(tasks, rows, bank), reward_params, uses
+    x = _observation_params(tasks, rows, bank)._replace(
+        noise_start=rows([bank.noise_levels.index(task.observations.read_noise) * noise_bank for task in tasks])
+    )
+    return _tree_params(tasks, rows), x, reward_params, uses
 
 
 def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
@@ -82,6 +86,7 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> Ob
         cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
         cue_element=rows([task.images.shape[-1] - 1 for task in tasks]),
         white=rows([white_level(task.images) for task in tasks], torch.float64),
+        noise_start=bank_start,
         legacy=_legacy_index(tasks, rows) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
     )
@@ -164,6 +169,7 @@ class Bank(NamedTuple):
     images: Tensor  # uint8 [rows, *shape]
     shape: tuple[int, ...]  # of an observation
     start: dict[tuple[ImageSet, int], int]  # the first row of each image set and rotation
+    noise_levels: tuple[int, ...]  # the different values of ``read_noise``
 
 
 def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
@@ -177,6 +183,7 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
     shape = max(shapes)
     _require_memory(pool, math.prod(shape), num_rows)
+    levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(_bank_key, pool)):
         images, rotation = key
@@ -186,4 +193,4 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
         banks.append(bank)
         starts[key] = rows
         rows += len(bank)
-    return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts)  # one may be large
+    return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts, levels)  # one may be large

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ctgraph_rl.philox import splitmix64
+from ctgraph_rl.philox import STREAM_NOISE, draw, splitmix64
 
 
 def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
@@ -48,6 +48,19 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 # its own it stays whole; `fast` compiles it alone, in a way that is right.
 _opaque = torch.library.custom_op("ctgraph_rl::add_noise", _by_parts, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
+
+
+def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Tensor:
+    """Noise drawn in advance: for each largest addition so many noises, uint8 [levels * size, *shape]."""
+    numbers = torch.arange(len(levels) * size)
+    upper, lower, *_ = draw(torch.tensor(0), numbers, torch.tensor(0), STREAM_NOISE)
+    black = torch.zeros(len(numbers), *shape, dtype=torch.uint8)
+    return add_noise(black, (upper << 32) | lower, torch.tensor(levels).repeat_interleave(size))
+
+
+def add_saturating(images: Tensor, noise: Tensor) -> Tensor:
+    """The sum of two uint8 tensors of the same shape, at most 255."""
+    return images + torch.minimum(noise, 255 - images)
 
 
 def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl import dynamics, philox
+from ctgraph_rl import dynamics, philox, reading
 from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.dynamics import (
     LegacyIndex,
@@ -42,6 +42,9 @@ class Rows(nn.Module):
         first_row: number of the first row, for a batch that is split.
         task_pool: the tasks that `set_tasks` may be given; the images are fixed by it. Default: ``tasks``.
         device: where the tensors live.
+        noise_bank: 0 draws the noise of every pixel of every observation. A number M >= 1 takes each observation's
+            noise from M that were drawn in advance, which is faster; two observations then have the same noise with
+            probability 1 / M, where the first way hardly ever repeats noise.
 
     Raises:
         ValueError: for no tasks, values out of range, and observations of different shapes.
@@ -50,6 +53,7 @@ class Rows(nn.Module):
     seed: Tensor
     row: Tensor
     bank: Tensor
+    noises: Tensor
     normal_table: Tensor
     state_type: Tensor
     node: Tensor
@@ -68,6 +72,7 @@ class Rows(nn.Module):
         first_row: int = 0,
         task_pool: Iterable[Task] | None = None,
         device: torch.device | str | None = "cpu",
+        noise_bank: int = 0,
     ) -> None:
         tasks = require_all(Task, "tasks", tasks)
         pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
@@ -75,6 +80,7 @@ class Rows(nn.Module):
         require(
             seed_rule(seed),
             (is_int(first_row, 0, 2**32 - self.num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
+            (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
         )
         super().__init__()
         self._pool = frozenset(pool)
@@ -85,6 +91,10 @@ class Rows(nn.Module):
         self.register_buffer("seed", torch.tensor([seed], device=device))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self.register_buffer("bank", bank.images.to(device), persistent=False)
+        has_noise = noise_bank > 0 and max(bank.noise_levels) > 0
+        noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else bank.images[:0]
+        self._noise_bank = noise_bank
+        self.register_buffer("noises", noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field in RowState._fields:
@@ -134,7 +144,7 @@ class Rows(nn.Module):
         def rows(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
 
-        tree, x, g, self.uses = make_params(different, rows, self._bank)
+        tree, x, g, self.uses = make_params(different, rows, self._bank, self._noise_bank)
         self.params = self._row_params(tree, x, g)
         self._task_goals = rows([task.goal_leaf for task in different])
         self._stock = self._now = None
@@ -317,7 +327,7 @@ class Rows(nn.Module):
         return self
 
     def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
-        return RowParams(self.seed, self.row, tree, x, g, self.bank, self.normal_table)
+        return RowParams(self.seed, self.row, tree, x, g, self.bank, self.noises, self.normal_table)
 
 
 class _Stock:

@@ -1,0 +1,295 @@
+"""How fast the environment runs: ``python -m ctgraph_rl.benchmark``.
+
+Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
+table has the medians of the rounds. An observation is one row for one step. The yardsticks are memset and memcpy of as
+many bytes as the observations have, and a native TorchRL environment that does nothing but count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.fast import Steps, rollout
+from ctgraph_rl.paper import ct_co_b1, ct_su_b1
+from ctgraph_rl.rows import Rows
+from ctgraph_rl.task import Task
+
+MEMCPY, TRIVIAL = "memcpy", "trivial environment: "
+MAX_BUFFER = 2**26
+"""Bytes of observations in the buffers: beyond the caches."""
+
+
+NOISE_BANK = 4096
+
+
+def configurations() -> dict[str, Task]:
+    """The tasks that are measured: SU is CT-SU-B1, CO is CT-CO-B1 with p = 0.5 and up to ten degrees of rotation."""
+    confounding = ct_co_b1()
+    confounding = replace(
+        confounding,
+        graph=replace(confounding.graph, wait_prob=0.5),
+        observations=replace(confounding.observations, read_rotation=10),
+    )
+    tasks = {"SU": ct_su_b1(), "CO": confounding}
+    noisy = {f"{name}, noise 10": _with_noise(task) for name, task in tasks.items()}
+    return tasks | noisy
+
+
+def _with_noise(task: Task) -> Task:
+    return replace(task, observations=replace(task.observations, read_noise=10))
+
+
+@dataclass
+class Contender:
+    """One way to step."""
+
+    name: str
+    configuration: str
+    num_rows: int
+    run: Callable[[], int]  # runs for a while and says how many observations there were
+    speeds: list[float]
+
+    def measure(self, seconds: float) -> None:
+        """Observations a second over at least so many seconds."""
+        count, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            count += self.run()
+        self.speeds.append(count / (time.perf_counter() - start))
+
+
+class Counter(EnvBase):
+    """The trivial environment: it counts to four and starts anew."""
+
+    batch_locked = True
+
+    def __init__(self, num_rows: int) -> None:
+        super().__init__(batch_size=torch.Size([num_rows]))
+        self.observation_spec = Composite(observation=Unbounded((num_rows, 1), dtype=torch.int64), shape=(num_rows,))
+        self.action_spec = Categorical(3, shape=(num_rows,))
+        self.reward_spec = Unbounded((num_rows, 1))
+        self.count = torch.zeros(num_rows, 1, dtype=torch.int64)
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        self.count = torch.zeros_like(self.count) if mask is None else self.count.masked_fill(mask, 0)
+        return TensorDict({"observation": self.count}, self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.count = self.count + 1
+        return TensorDict(
+            {"observation": self.count, "reward": self.count.float(), "done": self.count >= 4}, self.batch_size
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def _num_steps(num_rows: int, size: int = 144) -> int:
+    """Steps in a buffer of observations."""
+    return max(4, min(512, MAX_BUFFER // (num_rows * size)))
+
+
+def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+    steps = _num_steps(num_rows)
+    target = torch.empty(steps, num_rows, 1, 12, 12, dtype=torch.uint8)
+    source = torch.randint(0, 255, target.shape, dtype=torch.uint8)
+
+    def run(write: Callable[[Tensor, int], object]) -> int:
+        for t in range(steps):
+            write(target[t], t)
+        return steps * num_rows
+
+    yield "memset", partial(run, lambda row, t: row.zero_())
+    yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
+
+
+def _fast(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+    rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
+    steps = Steps.empty(rows, _num_steps(num_rows))
+    actions = torch.randint(0, 3, steps.action.shape)
+
+    def run(rows: Rows, compiled: bool) -> int:
+        rollout(rows, actions, steps, compiled)
+        return steps.action.numel()
+
+    def core() -> int:
+        for action in actions[:16]:
+            rows.restart(rows.act(action)[1])
+        return min(16, len(actions)) * num_rows
+
+    yield "core, observations of the step and of the reset", core
+    for compiled, suffix in ((False, ""), (True, ", compiled")):
+        yield f"fast rollout{suffix}", partial(run, rows, compiled)
+        if task.observations.read_noise:
+            yield f"fast rollout, noise bank{suffix}", partial(run, banked, compiled)
+
+
+def _torchrl(make: Callable[[], EnvBase], prefix: str = "") -> Iterator[tuple[str, Callable[[], int]]]:
+    env, collected = make(), make()
+    n = env.batch_size[0]
+    steps = max(4, min(64, 2**25 // (n * 300)))
+    policy = _Random(n)
+    collector = Collector(
+        collected,
+        policy,
+        frames_per_batch=n * steps,
+        total_frames=-1,
+        trust_policy=True,
+        use_buffers=False,
+        track_traj_ids=False,
+        auto_register_policy_transforms=True,
+    )
+    batches = iter(collector)
+
+    def run() -> int:
+        env.rollout(steps, policy, break_when_any_done=False)
+        return steps * n
+
+    yield f"{prefix}TorchRL rollout", torch.no_grad()(run)
+    yield f"{prefix}TorchRL Collector", lambda: next(batches).numel()
+
+
+class _Random(TensorDictModuleBase):
+    """Uniform actions of three."""
+
+    in_keys: tuple[str, ...] = ("observation",)
+    out_keys: tuple[str, ...] = ("action",)
+
+    def __init__(self, num_rows: int) -> None:
+        super().__init__()
+        self.num_rows = num_rows
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", torch.randint(0, 3, (self.num_rows,)))
+
+
+def _gymnasium(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+    from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
+
+    envs = CTGraphVectorEnv(num_rows, task)
+    envs.reset(seed=0)
+    actions = torch.randint(0, 3, (16, num_rows)).numpy()
+
+    def run_batch() -> int:
+        for action in actions:
+            envs.step(action)
+        return actions.size
+
+    yield "Gymnasium VectorEnv", run_batch
+    if num_rows == 1:
+        yield "Gymnasium Env", _single(CTGraphGymEnv(task))
+
+
+def _single(env) -> Callable[[], int]:  # type: ignore[no-untyped-def]
+    """Steps of any Gymnasium environment with random actions."""
+    actions = torch.randint(0, 3, (256,)).tolist()
+    env.reset(seed=0)
+
+    def run() -> int:
+        for action in actions:
+            if env.step(action)[2]:
+                env.reset()
+        return len(actions)
+
+    return run
+
+
+def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
+    """The authors' environment, where the user has installed it; its own default configuration."""
+    if find_spec("gym_CTgraph") is None:
+        return
+    import gym_CTgraph  # type: ignore[import-not-found]  # noqa: F401
+    import gymnasium
+
+    yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
+
+
+def contenders(num_rows: list[int], names: list[str]) -> list[Contender]:
+    """Everything that is measured, in the order of the table."""
+    found: list[Contender] = []
+
+    def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
+        found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
+
+    tasks = configurations()
+    for n in num_rows:
+        add("", n, _memory(n))
+        add("", n, _torchrl(partial(Counter, n), TRIVIAL))
+        for name in names:
+            task = tasks[name]
+            add(name, n, _fast(task, n))
+            add(name, n, _torchrl(partial(CTGraphEnv, [task] * n, check_actions=False)))
+            add(name, n, _gymnasium(task, n))
+    add("", 1, _authors())
+    return found
+
+
+def table(measured: list[Contender]) -> str:
+    """Medians in Markdown, with their spread over the rounds and their ratios to the yardsticks of the same rows."""
+    lines = ["| rows | task | way | M obs/s | spread | / memcpy | / trivial |", "|---|---|---|---|---|---|---|"]
+    median = {(one.num_rows, one.configuration, one.name): statistics.median(one.speeds) for one in measured}
+    for one in measured:
+        speed = statistics.median(one.speeds)
+        spread = (max(one.speeds) - min(one.speeds)) / speed / 2
+        yardstick = median.get((one.num_rows, "", MEMCPY))
+        trivial = median.get((one.num_rows, "", TRIVIAL + one.name))
+        cells = [
+            f"{one.num_rows:,}",
+            one.configuration,
+            one.name,
+            f"{speed / 1e6:.3g}",
+            f"±{100 * spread:.0f} %",
+            f"{speed / yardstick:.2g}" if yardstick else "",
+            f"{speed / trivial:.2f}" if trivial else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def machine() -> str:
+    """What was measured on."""
+    threads, capability = torch.get_num_threads(), torch.backends.cpu.get_cpu_capability()
+    return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
+    names = list(configurations())
+    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.benchmark", description=__doc__)
+    parser.add_argument("--rows", type=int, nargs="+", default=[1, 64, 1024, 16384], help="batch sizes")
+    parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
+    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
+    parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
+    parser.add_argument("--threads", type=int, default=None, help="threads of torch")
+    options = parser.parse_args(arguments)
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    measured = contenders(options.rows, options.tasks)
+    console = Console(stderr=True)
+    for one in track(measured, "compiling and filling caches", console=console):
+        one.run()
+    for one in track(measured * options.rounds, "measuring", console=console):
+        one.measure(options.seconds)
+    print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(measured)}")
+
+
+if __name__ == "__main__":
+    main()
