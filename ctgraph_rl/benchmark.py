@@ -121,7 +121,7 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
     yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
 
 
-def _fast(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+def _fast(task: Task, num_rows: int, with_compiled: bool) -> Iterator[tuple[str, Callable[[], int]]]:
     rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
     steps = Steps.empty(rows, _num_steps(num_rows))
     actions = torch.randint(0, 3, steps.action.shape)
@@ -136,7 +136,7 @@ def _fast(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
         return min(16, len(actions)) * num_rows
 
     yield "core, observations of the step and of the reset", core
-    for compiled, suffix in ((False, ""), (True, ", compiled")):
+    for compiled, suffix in ((False, ""), (True, ", compiled"))[: 1 + with_compiled]:
         yield f"fast rollout{suffix}", partial(run, rows, compiled)
         if task.observations.read_noise:
             yield f"fast rollout, noise bank{suffix}", partial(run, banked, compiled)
@@ -222,7 +222,7 @@ def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
     yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
 
 
-def contenders(num_rows: list[int], names: list[str]) -> list[Contender]:
+def contenders(num_rows: list[int], names: list[str], with_compiled: bool) -> list[Contender]:
     """Everything that is measured, in the order of the table."""
     found: list[Contender] = []
 
@@ -235,7 +235,7 @@ def contenders(num_rows: list[int], names: list[str]) -> list[Contender]:
         add("", n, _torchrl(partial(Counter, n), TRIVIAL))
         for name in names:
             task = tasks[name]
-            add(name, n, _fast(task, n))
+            add(name, n, _fast(task, n, with_compiled))
             add(name, n, _torchrl(partial(CTGraphEnv, [task] * n, check_actions=False)))
             add(name, n, _gymnasium(task, n))
     add("", 1, _authors())
@@ -278,11 +278,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
+    parser.add_argument("--skip-compiled", action="store_true", help="leave out what torch.compile compiles")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
     options = parser.parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
-    measured = contenders(options.rows, options.tasks)
+    measured = contenders(options.rows, options.tasks, not options.skip_compiled)
     console = Console(stderr=True)
     for one in track(measured, "compiling and filling caches", console=console):
         one.run()
