@@ -284,7 +284,7 @@ def finish(images: Tensor, angle: Tensor, state: RowState, params: RowParams, us
 
 Words = tuple[Tensor, ...]
 """The small draws of a tick: two for a wait that begins there, one for the id and one for the view that are shown
-there, and, where rewards have noise, one for the reward of the step that begins there."""
+there, and, where rewards have noise, a normal number for the reward of the step that begins there."""
 
 
 def step(
@@ -402,9 +402,11 @@ def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = N
 
 
 def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
-    """The small draws of a tick, int64 of its shape; zeros without use."""
+    """The small draws of a tick, of its shape; zeros without use."""
     words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
-    return (*words, draw(params.seed, params.row, tick, STREAM_REWARD)[0]) if uses.reward_noise else words
+    if not uses.reward_noise:
+        return words
+    return *words, normal(draw(params.seed, params.row, tick, STREAM_REWARD)[0], params.normal_table)
 
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
@@ -430,7 +432,7 @@ def _paid(
     g = params.g
     paid = _share(after, goal_leaf, params, uses) * g.goal_reward
     if uses.reward_noise:
-        noise = (normal(words[4], params.normal_table) * g.reward_std).float()
+        noise = (words[4] * g.reward_std).float()
         paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
     at_end = after.state_type == _END
     reward = torch.where(at_end if entered is None else at_end & entered, paid, 0.0)
