@@ -38,12 +38,56 @@ class State(NamedTuple):
 
 
 class TreeParams(NamedTuple):
-    """What the transition needs to know of each row's task; int64."""
+    """What the transition needs to know of each row's task; int64 if not said. `tree_params` makes it."""
 
     branching_factor: Tensor
     first_leaf: Tensor  # heap index of the first end state, the number of decision states
     stay_below: Tensor  # wait_prob * 2**63
-    extra_end_step: Tensor | None = None  # bool: an end state takes one more action; None for no row
+    extra_end_step: Tensor | None  # bool: an end state takes one more action; None for no row
+    first_move: Tensor  # place of the row's action 0 at home in the tables
+    next_kind: Tensor  # uint8 table: the state type that a move leads to
+    decides: Tensor  # bool table: the move is a decision
+    width: int  # of the tables: actions -1 to the largest b + 1; what is beyond counts as one of these
+
+
+def tree_params(
+    branching_factor: Tensor, first_leaf: Tensor, stay_below: Tensor, extra_end_step: Tensor | None = None
+) -> TreeParams:
+    """The parameters of trees, with tables of the moves of each different one."""
+    extra = torch.zeros_like(branching_factor) if extra_end_step is None else extra_end_step.long()
+    different, which = torch.unique(2 * branching_factor + extra, return_inverse=True)
+    last_action = int(branching_factor.max()) + 1
+    tables = [_moves(number // 2, bool(number % 2), last_action) for number in different.tolist()]
+    next_kind = torch.tensor(tables, dtype=torch.uint8, device=which.device)
+    decides = torch.zeros_like(next_kind, dtype=torch.bool)
+    decides[..., _DECISION, :] = next_kind[..., _DECISION, :] == _WAIT
+    first_move = which * next_kind[0].numel() + 1
+    flat = next_kind.flatten(), decides.flatten()
+    return TreeParams(branching_factor, first_leaf, stay_below, extra_end_step, first_move, *flat, last_action + 2)
+
+
+def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list:
+    """Where an action leads, sections 2.1 and 2.2 of the paper: [stays, before an end state, state type, action]."""
+
+    def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
+        waits, decides = action == WAIT_ACTION, WAIT_ACTION < action <= branching_factor
+        if kind == _HOME:
+            return _WAIT
+        if kind == _WAIT and waits:
+            return _WAIT if stays else _END if before_end else _DECISION
+        if kind == _DECISION and decides:
+            return _WAIT
+        if kind == _END:
+            return _HOME if extra_end_step else _END
+        return _FAIL
+
+    return [
+        [
+            [[next_kind(stays, before_end, kind, action) for action in range(-1, last_action + 1)] for kind in range(5)]
+            for before_end in (False, True)
+        ]
+        for stays in (False, True)
+    ]
 
 
 class LegacyIndex(NamedTuple):
@@ -159,38 +203,34 @@ NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
 
 
-def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams, absorbing: bool = True) -> State:
-    """One step of the tree, sections 2.1 and 2.2 of the paper.
+def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams) -> State:
+    """One step of the tree: tables say which kind of state follows, arithmetic says which node.
 
     Args:
         state: current state; an end or fail state is absorbing.
-        action: int64, 0 waits and 1..b decides; above a row's b it fails as a wrong action does.
+        action: int64, 0 waits and 1..b decides; any other fails as a wrong action does.
         stays: bool, the row's draw with probability p; None if no row ever stays.
         tree: the rows' trees.
-        absorbing: whether rows may be at an end or fail state already; False saves their exception.
 
     Returns:
         The next state. ``node`` of a fail state is where it failed. An episode with an extra end step is over in a home
         state whose node is an end state's.
     """
     kind, node = state
-    at_wait, waits = kind == _WAIT, action == WAIT_ACTION
-    in_tree = kind.bool() & (kind < _END)  # at a wait or decision state
-    fails = in_tree & ((at_wait ^ waits) | (action > tree.branching_factor))
-    before_end = at_wait & (node >= tree.first_leaf)
-    next_kind = (at_wait.to(torch.uint8) + before_end.to(torch.uint8) + 1).masked_fill(fails, _FAIL)
+    block = len(StateType) * tree.width
+    move = torch.add(tree.first_move + action.clamp(-1, tree.width - 2), kind, alpha=tree.width)
+    move = torch.add(move, node >= tree.first_leaf, alpha=block)
     if stays is not None:
-        next_kind = next_kind.masked_fill(at_wait & waits & stays, _WAIT)
-    decides = in_tree & ~(at_wait | fails)
-    next_node = torch.where(decides, node * tree.branching_factor + action, node)
-    if not absorbing and tree.extra_end_step is None:
-        return State(next_kind, next_node)
-    over = kind >= _END
+        move = torch.add(move, stays, alpha=2 * block)
+    next_kind, decides = _look_up(tree.next_kind, move), _look_up(tree.decides, move)
     if tree.extra_end_step is not None:
-        ended = (kind == _HOME) & (node > 0)
-        next_kind = next_kind.masked_fill(ended | ((kind == _END) & tree.extra_end_step), _HOME)
-        over = over & ~((kind == _END) & tree.extra_end_step)
-    return State(torch.where(over, kind, next_kind), next_node)
+        next_kind = next_kind.masked_fill((kind == _HOME) & (node > 0), _HOME)
+    return State(next_kind, torch.where(decides, node * tree.branching_factor + action, node))
+
+
+def _look_up(table: Tensor, index: Tensor) -> Tensor:
+    """``table[index]``, much faster."""
+    return table.index_select(0, index) if index.ndim == 1 else table[index]
 
 
 def is_done(state: State | RowState, tree: TreeParams) -> Tensor:
@@ -312,7 +352,7 @@ def advance(
 ) -> RowState:
     """The step without what it shows, with the draws of the present tick: the next states, with the step's reward."""
     stay = stays(words, params.tree) if uses.waits else None
-    after = transition(State(state.state_type, state.node), action, stay, params.tree, absorbing)
+    after = transition(State(state.state_type, state.node), action, stay, params.tree)
     entered = after.state_type != state.state_type if absorbing else None
     paid = reward = _paid(after, entered, state.goal_leaf, words, params, uses)
     if uses.step_reward:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.dynamics import LegacyIndex, ObservationParams, RewardParams, TreeParams, Uses
+from ctgraph_rl.dynamics import LegacyIndex, ObservationParams, RewardParams, TreeParams, Uses, tree_params
 from ctgraph_rl.graph import MAX_STATES, StateType
 from ctgraph_rl.images import ImageSet, white_level
 from ctgraph_rl.rewards import RewardFn
@@ -52,7 +52,7 @@ def make_params(
 
 def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
     graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
-    return TreeParams(
+    return tree_params(
         branching_factor=rows([graph.branching_factor for graph in graphs]),
         first_leaf=rows([graph.num_decision_states for graph in graphs]),
         stay_below=rows([int(graph.wait_prob * 2**63) for graph in graphs]),

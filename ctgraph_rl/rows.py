@@ -318,7 +318,9 @@ class Rows(nn.Module):
         old = self.params
 
         def moved(part: Any) -> Any:
-            return None if part is None else fn(part) if isinstance(part, Tensor) else tuple(map(moved, part))
+            if isinstance(part, tuple):
+                return tuple(map(moved, part))
+            return fn(part) if isinstance(part, Tensor) else part
 
         legacy = old.x.legacy and LegacyIndex(*moved(old.x.legacy))
         x = ObservationParams(*moved(old.x))._replace(legacy=legacy)

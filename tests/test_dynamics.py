@@ -5,7 +5,8 @@ import pytest
 import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
-from ctgraph_rl.dynamics import State, TreeParams, stays, transition
+from ctgraph_rl.dynamics import State, stays, transition
+from ctgraph_rl.dynamics import tree_params as make_tree
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint, splitmix64
 from ctgraph_rl.reading import _NOISE_ROWS, add_noise
@@ -36,7 +37,7 @@ def philox_in_python(counter, key):
 
 
 def tree_params(b, d, num_rows, stay_below=0):
-    return TreeParams(*(torch.full((num_rows,), value) for value in (b, (b**d - 1) // (b - 1), stay_below)))
+    return make_tree(*(torch.full((num_rows,), value) for value in (b, (b**d - 1) // (b - 1), stay_below)))
 
 
 def states_and_actions(b, d):
@@ -188,7 +189,7 @@ def test_the_table_of_transitions_at_the_root_of_a_binary_tree(kind, action, exp
 
 
 def test_rows_of_one_batch_may_have_trees_of_their_own():
-    tree = TreeParams(torch.tensor([2, 3, 3]), torch.tensor([3, 1, 4]), torch.zeros(3, dtype=torch.int64))
+    tree = make_tree(torch.tensor([2, 3, 3]), torch.tensor([3, 1, 4]), torch.zeros(3, dtype=torch.int64))
     state = State(torch.full((3,), int(DECISION)), torch.tensor([1, 0, 0]))
 
     after = transition(state, torch.tensor([3, 3, 3]), torch.zeros(3, dtype=torch.bool), tree)
@@ -212,8 +213,9 @@ def test_the_transition_can_be_vmapped():
     states, actions, stay = zip(*states_and_actions(b, d), strict=True)
     tree = tree_params(b, d, len(states))._replace(extra_end_step=torch.arange(len(states)) % 2 == 0)
     arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree)
+    in_dims = type(tree)(*(None if field in ("next_kind", "decides", "width") else 0 for field in tree._fields))
 
-    mapped = torch.vmap(transition)(*arguments)
+    mapped = torch.vmap(transition, in_dims=(0, 0, 0, in_dims))(*arguments)
 
     assert all(torch.equal(*pair) for pair in zip(mapped, transition(*arguments), strict=True))
 

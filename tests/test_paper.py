@@ -6,7 +6,8 @@ import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT
 
 from ctgraph_rl import CTGraph
-from ctgraph_rl.dynamics import State, TreeParams, transition
+from ctgraph_rl.dynamics import State, transition
+from ctgraph_rl.dynamics import tree_params as make_tree
 from ctgraph_rl.paper import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_posr_b1, ct_su_b1
 
 TABLE = [
@@ -199,7 +200,7 @@ def test_a_task_of_any_size_has_an_image_for_each_state_or_kind_of_state():
 
 def implemented_arrivals(b: int, d: int, stay: Fraction) -> dict[int, Fraction]:
     """P of each end node under the uniformly random policy, pushed forward through `transition`."""
-    tree = TreeParams(*(torch.tensor([value]) for value in (b, (b**d - 1) // (b - 1), 0)))
+    tree = make_tree(*(torch.tensor([value]) for value in (b, (b**d - 1) // (b - 1), 0)))
     mass, arrived = {(int(HOME), 0): Fraction(1)}, {}
     while mass:
         state, prob = mass.popitem()

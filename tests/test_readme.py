@@ -9,13 +9,15 @@ README = Path(__file__).resolve().parents[1] / "README.md"
 
 
 def test_the_python_in_readme_runs_and_prints_what_it_says(capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
-    exec(compile(code, str(README), "exec"), {})
+    for code in blocks:
+        exec(compile(code, str(README), "exec"), {})
 
-    closed_forms, goals = capsys.readouterr().out.splitlines()
+    closed_forms, goals, mean_return = capsys.readouterr().out.splitlines()
     assert closed_forms == f"32 {1 / 16875} 12.0"
     assert goals.endswith("goals reached at random in 51200 frames")
+    assert mean_return == "mean return 1.0"
 
 
 @pytest.mark.parametrize("name", ["run-command", "test-command"])

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl import CTGraph, Needle, Observations, OneHot, StateType, Task
-from ctgraph_rl.dynamics import State, TreeParams, transition
+from ctgraph_rl.dynamics import State, transition
+from ctgraph_rl.dynamics import tree_params as make_tree
 from ctgraph_rl.rewards import Arrival
 from ctgraph_rl.values import MAX_ENUMERATED_STATES
 from curricula.paper import ct_su_b1
@@ -181,10 +182,10 @@ def extract(graph: CTGraph) -> tuple[Tensor, Tensor, Tensor]:
     kind = torch.arange(5).repeat_interleave(counts)
     node = torch.arange(len(kind)) - first[kind] + decisions * (kind == StateType.END)
     shape = (len(kind), b + 1, 2)
-    tree = TreeParams(torch.tensor(b), torch.tensor(decisions), torch.tensor(0))
+    tree = make_tree(torch.tensor(b), torch.tensor(decisions), torch.tensor(0))
     state = State(kind[:, None, None].expand(shape), node[:, None, None].expand(shape))
     action, stays = torch.arange(b + 1)[None, :, None].expand(shape), torch.tensor([False, True]).expand(shape)
-    after = transition(state, action, stays, tree)
+    after = State(*(part.long() for part in transition(state, action, stays, tree)))
     offset = after.node - decisions * (after.state_type == StateType.END)
     offset = torch.where(after.state_type == StateType.FAIL, 0, offset)
     return kind, node, first[after.state_type] + offset
