@@ -70,9 +70,9 @@ def splitmix64(start: Tensor, count: int) -> Tensor:
         int64 [..., count], all 64 bits random.
     """
     z = start.unsqueeze(-1) + _GOLDEN * torch.arange(1, count + 1, device=start.device)
-    z = (z ^ ((z >> 30) & 0x3FFFFFFFF)) * _MIX[0]
-    z = (z ^ ((z >> 27) & 0x1FFFFFFFFF)) * _MIX[1]
-    return z ^ ((z >> 31) & 0x1FFFFFFFF)
+    z.bitwise_xor_((z >> 30).bitwise_and_(0x3FFFFFFFF)).mul_(_MIX[0])
+    z.bitwise_xor_((z >> 27).bitwise_and_(0x1FFFFFFFFF)).mul_(_MIX[1])
+    return z.bitwise_xor_((z >> 31).bitwise_and_(0x1FFFFFFFF))
 
 
 def randint(word: Tensor, high: Tensor | int) -> Tensor:

@@ -40,8 +40,9 @@ def _by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`add_noise` in one piece."""
     pixels, high = images[0].numel(), (read_noise + 1).to(torch.int32).unsqueeze(-1)
-    bits = splitmix64(start, (pixels + 3) // 4).view(torch.int16)[:, :pixels].to(torch.int32) & 0xFFFF
-    return ((bits * high >> 16) + images.flatten(1)).clamp_max(255).to(torch.uint8).view_as(images)
+    bits = splitmix64(start, (pixels + 3) // 4).view(torch.uint16)[:, :pixels].to(torch.int32)
+    noise = bits.mul_(high).bitwise_right_shift_(16).to(torch.uint8)
+    return add_saturating(images, noise.view_as(images))
 
 
 # Inductor of torch 2.13 writes beyond its buffers when it fuses the noise with what comes before it. As an operator of
