@@ -1,7 +1,6 @@
 """The functional core: pure tensor functions, without TorchRL, that every face of the environment wraps.
 
-A state is two integers per row, ``state_type`` and ``node``: the heap index of the position in the tree
-(the root is 0, branch a of node n is b * n + a). A wait state carries the node that it leads to.
+The tree's own dynamics are in `ctgraph_rl.tree`; here are observations, rewards, goals and episodes.
 
 Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is drawn by counter, see `philox`.
 """
@@ -13,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.graph import WAIT_ACTION, StateType
+from ctgraph_rl.graph import StateType
 from ctgraph_rl.philox import (
     STREAM_GOAL,
     STREAM_NOISE,
@@ -26,68 +25,9 @@ from ctgraph_rl.philox import (
 )
 from ctgraph_rl.reading import add_cue, add_noise, add_saturating, cue_level, turn
 from ctgraph_rl.rewards import Arrival, RewardFn
+from ctgraph_rl.tree import State, TreeParams, is_done, stays, transition
 
 _HOME, _WAIT, _DECISION, _END, _FAIL = map(int, StateType)  # plain integers: torch.compile knows no IntEnum
-
-
-class State(NamedTuple):
-    """Where each row is."""
-
-    state_type: Tensor  # uint8
-    node: Tensor  # int64
-
-
-class TreeParams(NamedTuple):
-    """What the transition needs to know of each row's task; int64 if not said. `tree_params` makes it."""
-
-    branching_factor: Tensor
-    first_leaf: Tensor  # heap index of the first end state, the number of decision states
-    stay_below: Tensor  # wait_prob * 2**63
-    extra_end_step: Tensor | None  # bool: an end state takes one more action; None for no row
-    first_move: Tensor  # place of the row's action 0 at home in the tables
-    next_kind: Tensor  # uint8 table: the state type that a move leads to
-    decides: Tensor  # bool table: the move is a decision
-    width: int  # of the tables: actions -1 to the largest b + 1; what is beyond counts as one of these
-
-
-def tree_params(
-    branching_factor: Tensor, first_leaf: Tensor, stay_below: Tensor, extra_end_step: Tensor | None = None
-) -> TreeParams:
-    """The parameters of trees, with tables of the moves of each different one."""
-    extra = torch.zeros_like(branching_factor) if extra_end_step is None else extra_end_step.long()
-    different, which = torch.unique(2 * branching_factor + extra, return_inverse=True)
-    last_action = int(branching_factor.max()) + 1
-    tables = [_moves(number // 2, bool(number % 2), last_action) for number in different.tolist()]
-    next_kind = torch.tensor(tables, dtype=torch.uint8, device=which.device)
-    decides = torch.zeros_like(next_kind, dtype=torch.bool)
-    decides[..., _DECISION, :] = next_kind[..., _DECISION, :] == _WAIT
-    first_move = which * next_kind[0].numel() + 1
-    flat = next_kind.flatten(), decides.flatten()
-    return TreeParams(branching_factor, first_leaf, stay_below, extra_end_step, first_move, *flat, last_action + 2)
-
-
-def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list:
-    """Where an action leads, sections 2.1 and 2.2 of the paper: [stays, before an end state, state type, action]."""
-
-    def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
-        waits, decides = action == WAIT_ACTION, WAIT_ACTION < action <= branching_factor
-        if kind == _HOME:
-            return _WAIT
-        if kind == _WAIT and waits:
-            return _WAIT if stays else _END if before_end else _DECISION
-        if kind == _DECISION and decides:
-            return _WAIT
-        if kind == _END:
-            return _HOME if extra_end_step else _END
-        return _FAIL
-
-    return [
-        [
-            [[next_kind(stays, before_end, kind, action) for action in range(-1, last_action + 1)] for kind in range(5)]
-            for before_end in (False, True)
-        ]
-        for stays in (False, True)
-    ]
 
 
 class LegacyIndex(NamedTuple):
@@ -95,19 +35,21 @@ class LegacyIndex(NamedTuple):
 
     level_first: Tensor  # [N, D + 1]: first node of a level, in rows of less depth 2**63 - 1 beyond it
     level_shift: Tensor  # [N, D + 1]: what is added to a node of the level
-    num_ids: Tensor  # [N, 5]: the number is taken modulo it; 1 where ids are not unique or not legacy
+    num_ids: Tensor  # [U * 5]: the number is taken modulo it; 1 where ids are not unique or not legacy
 
 
 class ObservationParams(NamedTuple):
     """What the observation process X and the reading of images need to know of each row's task; int64 if not said.
 
     An image is a row of the bank: the first view of the state's kind, plus the node's where ids are unique, plus a draw
-    of an id, plus a draw of a view, which is one of the id's instances in one of its rotations.
+    of an id, plus a draw of a view, which is one of the id's instances in one of its rotations. Tables [U * 5] have an
+    entry for each of U different tasks and each state type.
     """
 
-    first_view: Tensor  # [N, 5], by state type: bank row of the first id; where unique, of node 0
-    views_per_node: Tensor  # [N, 5]: bank rows from one node to the next, 0 where ids are not unique
-    num_ids: Tensor  # [N, 5]: how many ids are drawn from; 1 where they are unique
+    first_kind: Tensor | None  # where the row's task begins in the tables; None for U = 1
+    first_view: Tensor  # [U * 5]: bank row of the first id; where unique, of node 0
+    views_per_node: Tensor  # [U * 5]: bank rows from one node to the next, 0 where ids are not unique
+    num_ids: Tensor  # [U * 5]: how many ids are drawn from; 1 where they are unique
     bank_start: Tensor  # first bank row of the task's image set
     num_views: Tensor  # bank rows of one id
     num_angles: Tensor  # rotations that are not in the bank but come after the noise, at least 1
@@ -203,66 +145,18 @@ NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
 
 
-def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreeParams) -> State:
-    """One step of the tree: tables say which kind of state follows, arithmetic says which node.
-
-    Args:
-        state: current state; an end or fail state is absorbing.
-        action: int64, 0 waits and 1..b decides; any other fails as a wrong action does.
-        stays: bool, the row's draw with probability p; None if no row ever stays.
-        tree: the rows' trees.
-
-    Returns:
-        The next state. ``node`` of a fail state is where it failed. An episode with an extra end step is over in a home
-        state whose node is an end state's.
-    """
-    kind, node = state
-    block = len(StateType) * tree.width
-    move = torch.add(tree.first_move + action.clamp(-1, tree.width - 2), kind, alpha=tree.width)
-    move = torch.add(move, node >= tree.first_leaf, alpha=block)
-    if stays is not None:
-        move = torch.add(move, stays, alpha=2 * block)
-    next_kind, decides = _look_up(tree.next_kind, move), _look_up(tree.decides, move)
-    if tree.extra_end_step is not None:
-        next_kind = next_kind.masked_fill((kind == _HOME) & (node > 0), _HOME)
-    return State(next_kind, torch.where(decides, node * tree.branching_factor + action, node))
-
-
-def _look_up(table: Tensor, index: Tensor) -> Tensor:
-    """``table[index]``, much faster."""
-    return table.index_select(0, index) if index.ndim == 1 else table[index]
-
-
-def is_done(state: State | RowState, tree: TreeParams) -> Tensor:
-    """bool: the episode is over, so the row needs a reset."""
-    done = state.state_type >= _END
-    if tree.extra_end_step is None:
-        return done
-    waits_for_one_more = (state.state_type == _END) & tree.extra_end_step
-    return (done & ~waits_for_one_more) | ((state.state_type == _HOME) & (state.node > 0))
-
-
-def stays(words: tuple[Tensor, ...], tree: TreeParams) -> Tensor:
-    """The wait draw: True with probability p, exact to 2**-63. Uses words 0 and 1."""
-    return ((words[0] << 31) | (words[1] >> 1)) < tree.stay_below
-
-
 def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
     """X: the first view in the bank of the id that a state shows, by its node or drawn with a word."""
-    kind = state.state_type.long().unsqueeze(-1)
-
-    def of_kind(table: Tensor) -> Tensor:
-        return table.gather(-1, kind).squeeze(-1)
-
-    rows = of_kind(x.first_view)
+    kind = state.state_type.long() if x.first_kind is None else x.first_kind + state.state_type
+    rows = x.first_view.index_select(0, kind)
     if uses.unique_ids:
-        rows = rows + state.node * of_kind(x.views_per_node)
+        rows = rows + state.node * x.views_per_node.index_select(0, kind)
     if x.legacy is not None:
         level = (state.node.unsqueeze(-1) >= x.legacy.level_first).sum(-1, keepdim=True) - 1
         number = state.node + x.legacy.level_shift.gather(-1, level).squeeze(-1)
-        rows = rows + number % of_kind(x.legacy.num_ids) * x.num_views
+        rows = rows + number % x.legacy.num_ids.index_select(0, kind) * x.num_views
     if uses.drawn_ids:
-        rows = rows + randint(word, of_kind(x.num_ids)) * x.num_views
+        rows = rows + randint(word, x.num_ids.index_select(0, kind)) * x.num_views
     return rows
 
 
@@ -500,8 +394,13 @@ def _show(state: RowState, words: Words, params: RowParams, uses: Uses) -> Shown
 
 def outcome(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor]:
     """The ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
+    result, arrived, leaf = arrivals(state, done, params)
+    return result, leaf.masked_fill(~arrived, NO_LEAF)
+
+
+def arrivals(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor, Tensor]:
+    """The ``OUTCOME_*`` of rows, uint8, whether they arrived at an end state, and if so at which."""
     arrived = done & (state.state_type != _FAIL)
     leaf = state.node - params.tree.first_leaf
     hits = arrived & (leaf == state.goal_leaf)
-    result = done.to(torch.uint8) + arrived.to(torch.uint8) + hits.to(torch.uint8)
-    return result, leaf.masked_fill(~arrived, NO_LEAF)
+    return done.to(torch.uint8) + arrived.to(torch.uint8) + hits.to(torch.uint8), arrived, leaf

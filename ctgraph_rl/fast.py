@@ -118,7 +118,7 @@ def step_and_reset(
     """
     state = dynamics.advance(state, action, words, params, uses, absorbing=False)
     done, reward = dynamics.is_done(state, params.tree), state.reward
-    outcome = dynamics.outcome(state, done, params)[0]
+    outcome = dynamics.arrivals(state, done, params)[0]
     state = dynamics.begin(state, done, params, uses)
     words = dynamics.words_of(state.tick, params, uses)
     return state, words, reward, done, outcome, dynamics.look(state, words, params, uses)

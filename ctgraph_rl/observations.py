@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from itertools import combinations
 
 from ctgraph_rl.checks import as_tuple, is_int, require
-from ctgraph_rl.graph import MAX_STATES, CTGraph, StateType
+from ctgraph_rl.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
 """First and last id of a subset, both included."""
@@ -103,9 +103,7 @@ class Observations:
 
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
         """What must hold on a graph: unique ids need as many ids as there are states."""
-        rooms = [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
-        fits = not self.legacy_index or 2 * graph.num_end_states < MAX_STATES
-        return [*rooms, (fits, f"legacy_index needs 2 b^d < 2**63, got a graph of {graph.num_end_states} end states")]
+        return [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
 
     def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:
         name, (first, last) = f"{kind.name.lower()}_ids", self.ids(kind)

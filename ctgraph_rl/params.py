@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.dynamics import LegacyIndex, ObservationParams, RewardParams, TreeParams, Uses, tree_params
+from ctgraph_rl.dynamics import LegacyIndex, ObservationParams, RewardParams, Uses
 from ctgraph_rl.graph import MAX_STATES, StateType
 from ctgraph_rl.images import ImageSet, white_level
 from ctgraph_rl.rewards import RewardFn
 from ctgraph_rl.rotation import taps_of
 from ctgraph_rl.task import Task
+from ctgraph_rl.tree import TreeParams, tree_params
 
 Expand = Callable[..., Tensor]
 """Makes a tensor with one entry per row from a list with one entry per different task, and a dtype (int64)."""
@@ -72,12 +73,16 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> Ob
     def num_ids(x: Any, kind: StateType) -> int:
         return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
 
+    def table(values: list) -> Tensor:
+        return torch.tensor(values, device=bank_start.device).flatten()
+
     bank_start, angles = rows(starts), max(map(_num_angles, tasks))
     taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
     return ObservationParams(
-        first_view=rows([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
-        views_per_node=rows([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
-        num_ids=rows([[num_ids(x, kind) for kind in StateType] for x in observations]),
+        first_kind=rows([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
+        first_view=table([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
+        views_per_node=table([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
+        num_ids=table([[num_ids(x, kind) for kind in StateType] for x in observations]),
         bank_start=bank_start,
         num_views=rows(views),
         num_angles=rows([_num_angles(task) for task in tasks]),
@@ -87,12 +92,12 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> Ob
         cue_element=rows([task.images.shape[-1] - 1 for task in tasks]),
         white=rows([white_level(task.images) for task in tasks], torch.float64),
         noise_start=bank_start,
-        legacy=_legacy_index(tasks, rows) if any(x.legacy_index for x in observations) else None,
+        legacy=_legacy_index(tasks, rows, table) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
     )
 
 
-def _legacy_index(tasks: tuple[Task, ...], rows: Expand) -> LegacyIndex:
+def _legacy_index(tasks: tuple[Task, ...], rows: Expand, table: Callable[[list], Tensor]) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
     def level(task: Task, k: int) -> tuple[int, int]:
@@ -107,16 +112,17 @@ def _legacy_index(tasks: tuple[Task, ...], rows: Expand) -> LegacyIndex:
         return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
 
     levels = range(max(task.graph.depth for task in tasks) + 1)
-    tables = [[level(task, k) for k in levels] for task in tasks]
+    by_level = [[level(task, k) for k in levels] for task in tasks]
     return LegacyIndex(
-        level_first=rows([[first for first, _ in table] for table in tables]),
-        level_shift=rows([[shift for _, shift in table] for table in tables]),
-        num_ids=rows([[num_ids(task, kind) for kind in StateType] for task in tasks]),
+        level_first=rows([[first for first, _ in pairs] for pairs in by_level]),
+        level_shift=rows([[shift for _, shift in pairs] for pairs in by_level]),
+        num_ids=table([[num_ids(task, kind) for kind in StateType] for task in tasks]),
     )
 
 
 def _reward_params(tasks: tuple[Task, ...], rows: Expand, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
     changes = [task.goal_change or (0, 0) for task in tasks]
+    pairs = list(zip(tasks, changes, strict=True))
     return RewardParams(
         depth=rows([task.graph.depth for task in tasks]),
         num_leaves=rows([task.graph.num_end_states for task in tasks]),
@@ -128,7 +134,7 @@ def _reward_params(tasks: tuple[Task, ...], rows: Expand, reward_fns: tuple[Rewa
         multiplicative=rows([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
         change_first=rows([first for first, _ in changes]),
         change_last=rows([last for _, last in changes]),
-        legacy_change=rows([task.legacy_goal_change for task in tasks], torch.bool),
+        legacy_change=rows([task.legacy_goal_change and change[0] > 0 for task, change in pairs], torch.bool),
     )
 
 

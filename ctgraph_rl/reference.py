@@ -121,6 +121,12 @@ class ReferenceImages(_Generated):
         """uint8 [num_images, 12, 12], before noise and rotation on read."""
         return _reference_images(self)
 
+    def bank(self, read_rotation: int) -> Tensor:
+        """See `ImageSet`; rotated on read as the authors' implementation does it, pixel by pixel."""
+        upright = self.images.numpy().astype(np.float64)
+        views = [_rotate(upright, angle).astype(np.uint8) for angle in range(read_rotation + 1)]
+        return torch.from_numpy(np.stack(views, axis=1)).flatten(0, 1).unsqueeze(1)
+
 
 @dataclass(frozen=True)
 class ReferenceOneHot:

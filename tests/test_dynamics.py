@@ -5,11 +5,11 @@ import pytest
 import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
-from ctgraph_rl.dynamics import State, stays, transition
-from ctgraph_rl.dynamics import tree_params as make_tree
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint, splitmix64
 from ctgraph_rl.reading import _NOISE_ROWS, add_noise
+from ctgraph_rl.tree import State, stays, transition
+from ctgraph_rl.tree import tree_params as make_tree
 
 SHAPES = list(product((2, 3), (1, 2, 3)))
 
@@ -213,7 +213,9 @@ def test_the_transition_can_be_vmapped():
     states, actions, stay = zip(*states_and_actions(b, d), strict=True)
     tree = tree_params(b, d, len(states))._replace(extra_end_step=torch.arange(len(states)) % 2 == 0)
     arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree)
-    in_dims = type(tree)(*(None if field in ("next_kind", "decides", "width") else 0 for field in tree._fields))
+    in_dims = type(tree)(
+        *(None if field in ("next_kind", "decides", "width", "by_action") else 0 for field in tree._fields)
+    )
 
     mapped = torch.vmap(transition, in_dims=(0, 0, 0, in_dims))(*arguments)
 

@@ -24,6 +24,7 @@ from ctgraph_rl import (
     Task,
     count_repeats,
 )
+from ctgraph_rl.rotation import rotate
 
 DATA = Path(__file__).parent / "data"
 RECORDED = np.load(DATA / "reference_images.npz")
@@ -737,3 +738,24 @@ def test_a_recorded_trace_is_reproduced_exactly(trace):
             data = act(env, [step["action"]], data)
             found = data["reward"].item(), data["done"].item(), env.state_type.item(), env.observation_id.item()
             assert found == (float(np.float32(step["reward"])), step["done"], step["state"], step["id"]), number
+
+
+def test_images_are_rotated_on_read_as_they_were_made():
+    images = ReferenceImages(40, seed=3)
+    bank = images.bank(9).view(40, 10, 12, 12)
+
+    assert torch.equal(bank[:, 0], images.images)
+    for angle in (1, 5, 9):
+        ours = rotate(images.images, angle)
+        assert (bank[:, angle].int() - ours.int()).abs().max() <= 1  # truncated instead of rounded
+        assert not torch.equal(bank[:, angle], ours)
+
+
+def test_an_image_without_a_black_pixel_is_as_bright_as_its_darkest_level_outside():
+    image = ReferenceImages(60, seed=5)
+
+    turned = image.bank(5).view(60, 6, 12, 12)[27, 5]
+
+    assert image.images[27].min() > 0
+    assert turned.min() == image.images[27].min()
+    assert rotate(image.images[27:28], 5).min() < turned.min()

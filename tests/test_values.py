@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl import CTGraph, Needle, Observations, OneHot, StateType, Task
-from ctgraph_rl.dynamics import State, transition
-from ctgraph_rl.dynamics import tree_params as make_tree
 from ctgraph_rl.rewards import Arrival
+from ctgraph_rl.tree import State, transition
+from ctgraph_rl.tree import tree_params as make_tree
 from ctgraph_rl.values import MAX_ENUMERATED_STATES
 from curricula.paper import ct_su_b1
 
