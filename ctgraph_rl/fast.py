@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from typing import Any, NamedTuple
+from functools import cache, partial
+from types import FunctionType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -72,7 +73,9 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
     if isinstance(policy, Tensor):
         _check_actions(rows, policy, steps.action.shape)
     params, uses = rows.params, rows.uses
-    advance, noisy = _compiled(uses.draws or uses.pixel_noise) if compiled else (step_and_reset, reading.add_noise)
+    advance, noisy = (
+        _compiled(uses, rows.num_rows, str(rows.device)) if compiled else (step_and_reset, reading.add_noise)
+    )
     state = dynamics.begin(rows.state, rows.is_done, params, uses)
     words = dynamics.words_of(state.tick, params, uses)
     steps.observation[0] = dynamics.observe(state, words, params, uses)
@@ -125,15 +128,15 @@ def step_and_reset(
 
 
 @cache
-def _compiled(draws: bool) -> tuple[Callable, Callable]:
-    """The step and the noise as compiled functions.
+def _compiled(uses: Uses, num_rows: int, device: str) -> tuple[Callable, Callable]:
+    """The step and the noise as compiled functions, in plain loops, for one kind of batch.
 
-    Inductor's own vectors are slower than those that the C++ compiler finds in plain loops, and in the noise they are
-    wrong (see `reading.noisy`). Philox needs them: its products leave the range of int64, which C++ leaves undefined.
+    The C++ compiler's vectors are faster than inductor's own, with which the noise comes out wrong: see `reading`. Each
+    kind of batch compiles code objects of its own, as the number of compilations of one is limited.
     """
-    plain_loops: dict[str, Any] = {"cpp.simdlen": 1}
-    advance = torch.compile(step_and_reset, fullgraph=True, dynamic=False, options=None if draws else plain_loops)
-    return advance, torch.compile(reading.noisy, fullgraph=True, dynamic=False, options=plain_loops)
+    compiler = partial(torch.compile, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1})
+    parts = (step_and_reset, reading.noisy)
+    return tuple(compiler(FunctionType(part.__code__.replace(), part.__globals__)) for part in parts)  # type: ignore[return-value]
 
 
 def _check_buffers(rows: Rows, steps: Steps) -> None:

@@ -34,11 +34,24 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Te
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(_ROUNDS):
-        even, odd = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]  # the low 64 bits are exact
-        c0, c1 = ((odd >> 32) ^ c1 ^ k0) & _WORD, odd & _WORD
-        c2, c3 = ((even >> 32) ^ c3 ^ k1) & _WORD, even & _WORD
+        (even_high, even_low), (odd_high, odd_low) = _product(c0, _MULTIPLIERS[0]), _product(c2, _MULTIPLIERS[1])
+        c0, c1 = (odd_high ^ c1 ^ k0) & _WORD, odd_low
+        c2, c3 = (even_high ^ c3 ^ k1) & _WORD, even_low
         k0, k1 = (k0 + _KEY_STEPS[0]) & _WORD, (k1 + _KEY_STEPS[1]) & _WORD
     return c0, c1, c2, c3
+
+
+def _product(a: Tensor, b: Tensor | int) -> tuple[Tensor, Tensor]:
+    """The words of a 64-bit product of two words: the upper one in the low 32 bits of a number, and the lower one.
+
+    Compiled, no number may leave the range of int64: that is undefined in C++, where compilers make use of it.
+    """
+    if not torch.compiler.is_compiling():
+        product = a * b  # the low 64 bits are exact
+        return product >> 32, product & _WORD
+    rest = (a & 1) * b
+    half = (a >> 1) * b + (rest >> 1)
+    return half >> 31, ((half & 0x7FFFFFFF) << 1) | (rest & 1)
 
 
 def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> tuple[Tensor, ...]:
@@ -84,9 +97,9 @@ def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
     """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
     upper, lower = words
     high_upper, high_lower = high >> 32, high & _WORD
-    middle = upper * high_lower  # up to 64 bits: only its halves are used
-    carry = (((lower * high_lower) >> 32) & _WORD) + (middle & _WORD) + lower * high_upper
-    return upper * high_upper + ((middle >> 32) & _WORD) + (carry >> 32)
+    middle_high, middle_low = _product(upper, high_lower)
+    carry = (_product(lower, high_lower)[0] & _WORD) + middle_low + lower * high_upper
+    return upper * high_upper + (middle_high & _WORD) + (carry >> 32)
 
 
 _NORMAL_CELLS = 256

@@ -9,7 +9,7 @@ import torch
 from oracles import confounding, fully_observable, one_hot, record, scripts, surjective
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, rollout
+from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, philox, rollout
 
 FILE = {
     "general_seed": 3,
@@ -88,16 +88,32 @@ def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tasks", [FAMILIES[name] for name in ("surjective", "noise", "mixed")])
-def test_the_fast_path_compiled_gives_the_same_bits(tasks):
-    rows, twin = Rows(rows_of(tasks)), Rows(rows_of(tasks))
-    actions = actions_of(tasks)
+@pytest.mark.parametrize("num_rows", [1, 3, 8, 37])
+@pytest.mark.parametrize("tasks", [FAMILIES[name] for name in ("surjective", "confounding", "noise", "mixed")])
+def test_the_fast_path_compiled_gives_the_same_bits(tasks, num_rows):
+    rows, twin = (Rows((tasks * num_rows)[:num_rows]) for _ in range(2))
+    actions = scripts(NUM_STEPS, num_rows)
 
     eager = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
     compiled = rollout(twin, actions, Steps.empty(rows, NUM_STEPS), compiled=True)
 
     assert all(torch.equal(*pair) for pair in zip(eager, compiled, strict=True))
     assert all(torch.equal(*pair) for pair in zip(rows.state, twin.state, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_rows", [1, 5, 16])
+@pytest.mark.parametrize("options", [None, {"cpp.simdlen": 1}])
+def test_compiled_draws_are_the_same_words(num_rows, options):
+    compiled = torch.compile(philox.draw, fullgraph=True, dynamic=False, options=options)
+    wide = torch.compile(philox.randint_wide, fullgraph=True, dynamic=False, options=options)
+    seed, row = torch.tensor([2**62 + 12345]), torch.arange(num_rows) * 2**27 + 2**31
+    high = torch.arange(1, num_rows + 1) * 2**57 - 1
+
+    words, found = philox.draw(seed, row, row + 2**40, 3), compiled(seed, row, row + 2**40, 3)
+
+    assert all(torch.equal(*pair) for pair in zip(words, found, strict=True))
+    assert torch.equal(philox.randint_wide((words[0], words[1]), high), wide((words[0], words[1]), high))
 
 
 @pytest.mark.slow
