@@ -26,6 +26,7 @@ from torchrl.collectors import Collector
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.fast import Steps, rollout
 from ctgraph_rl.paper import ct_co_b1, ct_su_b1
@@ -281,6 +282,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--skip-compiled", action="store_true", help="leave out what torch.compile compiles")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
     options = parser.parse_args(arguments)
+    require(
+        *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
+        *positive(seconds=options.seconds),
+    )
     if options.threads:
         torch.set_num_threads(options.threads)
     measured = contenders(options.rows, options.tasks, not options.skip_compiled)

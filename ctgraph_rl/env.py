@@ -107,7 +107,7 @@ class CTGraphEnv(EnvBase):
         self.rows.set_tasks(tasks)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
-        """Give every row a goal: see `Rows.set_goals`."""
+        """Give every row a goal: see `Rows.set_goals`. The outcome is told by the goal at the end of an episode."""
         self.rows.set_goals(goals)
 
     @property
@@ -118,12 +118,12 @@ class CTGraphEnv(EnvBase):
     @property
     def node(self) -> Tensor:
         """The heap index of each row's position in the tree, int64 [N]."""
-        return self.rows.node
+        return self.rows.node.clone()
 
     @property
     def goal_leaf(self) -> Tensor:
         """The number of each row's end state with the goal, int64 [N]."""
-        return self.rows.goal_leaf
+        return self.rows.goal_leaf.clone()
 
     @property
     def observation_id(self) -> Tensor:
@@ -176,19 +176,22 @@ class CTGraphEnv(EnvBase):
         given = TensorDict() if tensordict is None else tensordict.get("state", TensorDict())
         complete = set(RowState._fields) <= set(given.keys())
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
-        state = RowState(*(given[field] for field in RowState._fields))
+        present = self.rows.state
+        state = RowState(*(given[field].to(like.dtype) for field, like in zip(RowState._fields, present, strict=True)))
         nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
         kind, is_leaf = state.state_type, state.node >= self.first_leaf
         running = (kind >= 0) & ~dynamics.is_done(state, self.rows.params.tree)
         misplaced = ((kind == StateType.DECISION) & is_leaf) | ((kind == StateType.END) & ~is_leaf)
         misplaced = misplaced | ((kind == StateType.HOME) & (state.node != 0))
         inside = (state.node >= 0) & (state.node < nodes) & (state.goal_leaf >= 0) & (state.goal_leaf < leaves)
-        inside = inside & ~misplaced
-        wrong = (~(running & inside)).nonzero().flatten()[:5].tolist()
+        counts = (state.tick >= 0) & (state.step_count >= 0) & (state.episodes_left >= 0)
+        sound = running & inside & ~misplaced & counts
+        sound = sound if mask is None else sound | ~mask
+        wrong = (~sound).nonzero().flatten()[:5].tolist()
         require((not wrong, f"rows {wrong} of the given state are finished or no states of their trees"))
         if mask is None:
             return RowState(*(value.clone() for value in state))
-        return RowState(*(torch.where(mask, new, old) for old, new in zip(self.rows.state, state, strict=True)))
+        return RowState(*(torch.where(mask, new, old) for old, new in zip(present, state, strict=True)))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict.get("action", None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from functools import cache, partial
 from types import FunctionType
@@ -34,10 +35,10 @@ class Steps(NamedTuple):
     outcome: Tensor  # uint8 [T, N]: 0 running, 1 fail, 2 another end state, 3 the goal
 
     @classmethod
-    def empty(cls, rows: Rows, num_steps: int) -> Steps:
-        """Buffers for ``num_steps`` steps, to be filled again and again by `rollout`."""
+    def empty(cls, rows: Rows, num_steps: int, device: torch.device | str | None = None) -> Steps:
+        """Buffers for ``num_steps`` steps, for `rollout` to fill again and again; by default on the rows' device."""
         require(*at_least_one(num_steps=num_steps))
-        t, n, device = num_steps, rows.num_rows, rows.device
+        t, n, device = num_steps, rows.num_rows, rows.device if device is None else device
         return cls(
             torch.empty(t + 1, n, *rows.image_shape, dtype=torch.uint8, device=device),
             torch.empty(t + 1, n, dtype=torch.bool, device=device),
@@ -70,6 +71,8 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
             were.
     """
     _check_buffers(rows, steps)
+    is_policy = isinstance(policy, Tensor) or callable(policy)
+    require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
     if isinstance(policy, Tensor):
         _check_actions(rows, policy, steps.action.shape)
     params, uses = rows.params, rows.uses
@@ -85,7 +88,12 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
         if isinstance(policy, Tensor):
             action = policy[t]
         else:
+            before = rows.state
             action = policy(steps.observation[t], steps.is_init[t])
+            same = rows.params is params and all(map(operator.is_, rows.state, before))
+            require(
+                (same, "a policy must leave the rows as they are during a rollout: change them between two rollouts")
+            )
             _check_actions(rows, action, steps.action.shape[1:])
         state, words, reward, done, outcome, seen = advance(state, action, words, params, uses)
         steps.action[t], steps.reward[t], steps.done[t], steps.outcome[t] = action, reward, done, outcome
@@ -140,15 +148,18 @@ def _compiled(uses: Uses, num_rows: int, device: str) -> tuple[Callable, Callabl
 
 
 def _check_buffers(rows: Rows, steps: Steps) -> None:
-    t, n = steps.action.shape
-    wanted = (t + 1, n, *rows.image_shape)
-    found = tuple(steps.observation.shape)
-    require((found == wanted and n == rows.num_rows, f"buffers must be those of Steps.empty(rows, {t}), got {found}"))
+    t = len(steps.action)
+    wanted = Steps.empty(rows, t, "meta")
+    for name, buffer, like in zip(Steps._fields, steps, wanted, strict=True):
+        fits = buffer.shape == like.shape and buffer.dtype == like.dtype and buffer.device == rows.device
+        got = f"{buffer.dtype} {list(buffer.shape)} on {buffer.device}"
+        require((fits, f"buffers must be those of Steps.empty(rows, {t}), got {name} {got}"))
 
 
 def _check_actions(rows: Rows, action: Tensor, shape: torch.Size) -> None:
     """Refuse what is no action. The range is checked on the CPU only: elsewhere the host would have to wait."""
     spec = f"actions must be int64 of shape {list(shape)} with values in 0..{rows.max_branching}"
+    require((isinstance(action, Tensor), f"{spec}, got {type(action).__name__}"))
     got = f"{action.dtype} {list(action.shape)}"
     require((action.dtype == torch.int64 and action.shape == shape, f"{spec}, got {got}"))
     if action.device.type == "cpu":

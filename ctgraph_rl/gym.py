@@ -7,11 +7,9 @@ Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
-from inspect import signature
-from os import PathLike
 from typing import Any
 
 import gymnasium
@@ -23,69 +21,19 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ctgraph_rl import paper
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
 from ctgraph_rl.graph import CTGraph, StateType
+from ctgraph_rl.paper import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.render import render
 from ctgraph_rl.rows import Rows, seed_rule
 from ctgraph_rl.task import Task
 
-CONFIGURATIONS: dict[str, Callable[..., Task]] = {
-    "CT-FO-B1": paper.ct_fo_b1,
-    "CT-FO-B2": paper.ct_fo_b2,
-    "CT-SU-B1": paper.ct_su_b1,
-    "CT-CO-B1": paper.ct_co_b1,
-    "CT-POSR-B1": paper.ct_posr_b1,
-}
-"""The configurations of the paper by name."""
-
-Json = str | PathLike[str] | Mapping[str, Any]
 Frame = NDArray[np.uint8] | str
 Array = NDArray[Any]
 
 _RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
 _GREYS = " ░▒▓█"
-
-
-def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
-    """A task from what ``gymnasium.make`` is given.
-
-    Args:
-        task: a task, or the name of one of the paper's configurations.
-        config: a configuration file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
-        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` that shall be different. Without
-            task and config also the arguments of `paper.ct_graph`.
-
-    Raises:
-        ValueError: for unknown names, and values out of range.
-    """
-    require((task is None or config is None, "give a task or a config, not both"))
-    if config is not None:
-        return _changed(Task.from_json(config, changes.pop("goal", None)), changes)
-    if task is None:
-        shape = {name: changes.pop(name) for name in signature(paper.ct_graph).parameters if name in changes}
-        return _changed(paper.ct_graph(**shape), changes)
-    if isinstance(task, str):
-        require((task in CONFIGURATIONS, f"task must be one of {', '.join(CONFIGURATIONS)}, got {task!r}"))
-        task = CONFIGURATIONS[task]()
-    require((isinstance(task, Task), f"task must be a Task or the name of a configuration, got {task!r}"))
-    return _changed(task, changes)
-
-
-def _changed(task: Task, changes: dict[str, Any]) -> Task:
-    """A task with other values of its fields, those of its graph and its observations among them."""
-    if "image_seed" in changes:
-        require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
-        changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]
-    for name in ("graph", "observations"):
-        part = getattr(task, name)
-        own = {field.name: changes.pop(field.name) for field in fields(part) if field.name in changes}
-        if own:
-            changes[name] = replace(part, **own)
-    unknown = changes.keys() - {field.name for field in fields(Task)}
-    require((not unknown, f"no field of a task, its graph or its observations: {', '.join(sorted(unknown))}"))
-    return replace(task, **changes)
 
 
 class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
@@ -120,9 +68,10 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        task = make_task(task, config, **changes)
-        self.task_pool = _pool([task], task_pool)
-        self.rows = Rows([task], task_pool=self.task_pool)
+        with _one_thread():
+            task = make_task(task, config, **changes)
+            self.task_pool = _pool([task], task_pool)
+            self.rows = Rows([task], task_pool=self.task_pool)
         self.render_mode = _known_mode(render_mode)
         self.observation_space, self.action_space = _spaces(self.rows)
         self._number = self._next_number = self.task_pool.index(task)
@@ -143,6 +92,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             seed: start the random stream of (seed, row 0), in [0, 2**63); None: go on with the present one.
             options: without use.
         """
+        seed = _plain(seed)
         require(_seed_rule(seed))
         super().reset(seed=seed)
         if self._next_number != self._number:
@@ -165,7 +115,10 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         number = _as_int(action)
         if self._is_over or not 0 <= number < self._num_actions:
             require(
-                (0 <= number < self._num_actions, f"action must be in 0..{self._num_actions - 1}, got {action!r}"),
+                (
+                    0 <= number < self._num_actions,
+                    f"action must be an integer in 0..{self._num_actions - 1}, got {action!r}",
+                ),
                 (not self._is_over, "no episode is running: reset first"),
             )
         observation, done = self.rows.act(_as_tensor(number))
@@ -224,7 +177,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         self.task_pool = _pool(tasks, task_pool)
         self.rows = Rows(tasks, task_pool=self.task_pool)
         self.render_mode = _known_mode(render_mode)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = _spaces(self.rows)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -343,7 +296,9 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
 
     def _seeds_of(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
         """A seed or None for every row, from what `reset` is given."""
+        seed = _plain(seed)
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
+        seeds = tuple(map(_plain, seeds)) if isinstance(seeds, tuple) else seeds
         if isinstance(seed, int) and is_int(seed, 0):
             super().reset(seed=seed)
             seeds = tuple(range(seed, seed + self.num_envs))
@@ -356,10 +311,13 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         """Give the rows of a mask their next tasks."""
         if self._next_numbers is self._numbers:
             return
-        numbers = np.where(mask, self._next_numbers, self._numbers)
-        self._only(mask, lambda: self.rows.set_tasks([self.task_pool[number] for number in numbers]))
-        all_changed = (numbers == self._next_numbers).all()
-        self._numbers, self._next_numbers = numbers, numbers if all_changed else self._next_numbers
+        change = mask & (self._next_numbers != self._numbers)
+        if change.any():
+            numbers = np.where(change, self._next_numbers, self._numbers)
+            self._only(change, lambda: self.rows.set_tasks([self.task_pool[number] for number in numbers]))
+            self._numbers = numbers
+        if (self._numbers == self._next_numbers).all():
+            self._next_numbers = self._numbers
 
     def _only(self, mask: NDArray[np.bool_], change: Callable[[], None]) -> None:
         """A change that ends all episodes, in the rows of a mask only."""
@@ -390,6 +348,28 @@ def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """The spaces of one row."""
     white = 255 if len(rows.image_shape) == 3 else rows.white
     return spaces.Box(0, white, rows.image_shape, np.uint8), spaces.Discrete(rows.max_branching + 1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch from starting threads: `AsyncVectorEnv` forks the process, and a fork with threads waits for ever."""
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    choices = [choice.value for choice in AutoresetMode]
+    require((mode in choices or mode in list(AutoresetMode), f"autoreset_mode must be one of {choices}, got {mode!r}"))
+    return AutoresetMode(mode)
+
+
+def _plain(seed: Any) -> Any:
+    """NumPy's integers as Python's."""
+    return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def _seed_rule(seed: object) -> tuple[bool, str]:

@@ -1,12 +1,18 @@
-"""The baseline configurations of the CT-graph paper, and tasks of any size in their manner.
+"""The baseline configurations of the CT-graph paper, tasks of any size in their manner, and tasks by keywords.
 
 Soltoggio et al. 2023 (arXiv 2302.10887).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from difflib import get_close_matches
+from inspect import signature
+from os import PathLike
+from typing import Any
 
+from ctgraph_rl.checks import require
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.images import OneHot, PaperImages
 from ctgraph_rl.observations import Observations
@@ -110,3 +116,59 @@ def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
         image_seed: seed of the image set.
     """
     return replace(ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed), reward_std=0.1)
+
+
+CONFIGURATIONS: dict[str, Callable[..., Task]] = {
+    "CT-FO-B1": ct_fo_b1,
+    "CT-FO-B2": ct_fo_b2,
+    "CT-SU-B1": ct_su_b1,
+    "CT-CO-B1": ct_co_b1,
+    "CT-POSR-B1": ct_posr_b1,
+}
+"""The configurations of the paper by name."""
+
+Json = str | PathLike[str] | Mapping[str, Any]
+
+
+def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
+    """A task from what ``gymnasium.make`` is given.
+
+    Args:
+        task: a task, or the name of one of the paper's configurations.
+        config: a configuration file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
+        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` that shall be different. Without
+            task and config also the arguments of `ct_graph`.
+
+    Raises:
+        ValueError: for unknown names, and values out of range.
+    """
+    require((task is None or config is None, "give a task or a config, not both"))
+    if config is not None:
+        return _changed(Task.from_json(config, changes.pop("goal", None)), changes)
+    if task is None:
+        shape = {name: changes.pop(name) for name in signature(ct_graph).parameters if name in changes}
+        return _changed(ct_graph(**shape), changes)
+    if isinstance(task, str):
+        require((task in CONFIGURATIONS, f"task must be one of {', '.join(CONFIGURATIONS)}, got {task!r}"))
+        task = CONFIGURATIONS[task]()
+    require((isinstance(task, Task), f"task must be a Task or the name of a configuration, got {task!r}"))
+    return _changed(task, changes)
+
+
+def _changed(task: Task, changes: dict[str, Any]) -> Task:
+    """A task with other values of its fields, those of its graph and its observations among them."""
+    if "image_seed" in changes:
+        require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
+        changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]
+    for name in ("graph", "observations"):
+        part = getattr(task, name)
+        own = {field.name: changes.pop(field.name) for field in fields(part) if field.name in changes}
+        if own:
+            changes[name] = replace(part, **own)
+    unknown = sorted(changes.keys() - {field.name for field in fields(Task)})
+    parts = (Task, type(task.graph), type(task.observations))
+    known = ["config", "task", "task_pool", "image_seed", *(field.name for part in parts for field in fields(part))]
+    close = [f"; did you mean {match!r}?" for name in unknown for match in get_close_matches(name, known, 1)]
+    message = f"no field of a task, its graph or its observations: {', '.join(unknown)}{''.join(close)}"
+    require((not unknown, message))
+    return replace(task, **changes)

@@ -368,6 +368,7 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
 def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> dict[str, Any]:
     """A task as a configuration file of the 2023 dialect; see `Task.to_json`."""
     require(
+        (path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"),
         (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),
         *((holds, f"the file cannot express {what}") for holds, what in _expressible(task)),
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ctgraph_rl import dynamics, philox, reading
-from ctgraph_rl.checks import is_int, require, require_all
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.dynamics import (
     LegacyIndex,
     ObservationParams,
@@ -165,6 +165,8 @@ class Rows(nn.Module):
             goals = list(goals)
             n = self.num_rows
             require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
+            flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
+            require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
             changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, map(tuple, goals), strict=True)]
             goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
@@ -185,7 +187,7 @@ class Rows(nn.Module):
             seed: int64 [N], or [1] for all.
             row: int64 [N], the numbers that tell rows of one seed apart.
         """
-        self.seed, self.row = seed, row
+        self.seed, self.row = seed.clone(), row.clone()
         self.tick = torch.zeros_like(self.row)
         self._stock = self._now = None
         self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
@@ -308,6 +310,7 @@ class Rows(nn.Module):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
         self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
+        self.seed, self.row = self.seed.clone(), self.row.clone()
         super()._load_from_state_dict(*args, **kwargs)
         self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
 

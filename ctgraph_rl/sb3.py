@@ -69,8 +69,9 @@ class SB3VecEnv(VecEnv):
         return cast("Sequence[NDArray[np.uint8] | None]", frames or [None] * self.num_envs)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the batch, once for every row."""
-        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
+        """An attribute of the batch, once for every row; a space is that of one row."""
+        name = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
+        return [getattr(self.envs, name.get(attr_name, attr_name)) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the batch; ``indices`` must be None."""

@@ -22,6 +22,7 @@ NOISES = ("additive", "multiplicative")
 MAX_EPISODES = 2**31
 """Episodes are drawn with 32-bit words."""
 
+SMALLEST_CUED_REWARD = 1e-30
 LARGEST_REWARD = 1e30
 """Rewards are float32, and their sums and noise must stay finite."""
 
@@ -151,22 +152,33 @@ class Task:
             *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
             *((isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in switches),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
+            (self._noise_is_finite(), f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
             (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
             (
                 change is None or lasts,
                 f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}",
             ),
             (
-                not cue or (is_real(self.goal_reward, 0) and self.goal_reward != 0),
+                not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD),
                 f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}",
             ),
         ]
+
+    def _noise_is_finite(self) -> bool:
+        if self.reward_noise != "multiplicative" or not (is_real(self.goal_reward) and is_real(self.reward_std)):
+            return True
+        return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 
     def _goal_rule(self) -> tuple[bool, str]:
         b, d = self.graph.branching_factor, self.graph.depth
         goal = self.goal
         holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
-        return holds, f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
+        message = f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
+        if not holds and isinstance(goal, tuple) and 0 in goal and all(is_int(branch, 0, b - 1) for branch in goal):
+            message += (
+                f"; a path of the authors' implementation counts from 0: use {tuple(branch + 1 for branch in goal)}"
+            )
+        return holds, message
 
     @property
     def goal_leaf(self) -> int:

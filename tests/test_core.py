@@ -217,3 +217,52 @@ def test_an_observation_that_no_machine_can_hold_is_refused_before_it_is_made():
 
     with pytest.raises(ValueError, match=r"images and observations need 100,0.* bytes, this machine has"):
         CTGraphEnv([many])
+
+
+def test_loading_leaves_an_earlier_checkpoint_as_it_was():
+    env, other = make_env(seed=7), make_env(seed=99)
+    env.reset(), other.reset()
+    saved = env.state_dict()
+
+    env.load_state_dict(other.state_dict())
+
+    assert saved["rows.seed"].tolist() == [7]
+    assert env.rows.seed.tolist() == [99]
+
+
+def test_only_the_rows_that_are_set_need_a_running_state():
+    env = CTGraphEnv([surjective()] * 2, check_actions=False)
+    env.reset()
+    act(env, [0, 0])
+    act(env, [1, 0])
+    saved = env.get_state()
+    mask = torch.tensor([[False], [True]])
+
+    env.reset(TensorDict({"state": saved.clone(), "_reset": mask}, [2]), set_state=True)
+
+    with pytest.raises(ValueError, match=r"rows \[0\] of the given state"):
+        env.reset(TensorDict({"state": saved.clone(), "_reset": ~mask}, [2]), set_state=True)
+
+
+def test_a_given_state_keeps_the_types_of_the_rows_and_counts_from_zero():
+    env = CTGraphEnv([surjective()] * 2)
+    env.reset()
+    given = env.get_state()
+    given["state_type"], given["episode_reward"] = given["state_type"].long(), given["episode_reward"].double()
+
+    env.reset(TensorDict({"state": given.clone()}, [2]), set_state=True)
+
+    assert env.rows.state_type.dtype == torch.uint8
+    assert env.rows.episode_reward.dtype == torch.float32
+    given["tick"][1] = -1
+    with pytest.raises(ValueError, match=r"rows \[1\] of the given state"):
+        env.reset(TensorDict({"state": given}, [2]), set_state=True)
+
+
+def test_what_an_environment_tells_of_its_rows_is_a_copy():
+    env = CTGraphEnv([surjective()] * 2)
+    env.reset()
+
+    env.node[0], env.goal_leaf[0], env.state_type[0] = 5, 3, 4
+
+    assert (env.node[0], env.goal_leaf[0], env.state_type[0]) == (0, 0, 0)

@@ -46,7 +46,7 @@ CONFOUNDING = {"observations__W_IDs": [3, 102], "observations__D_IDs": [2, 2], "
 REFUSED = [
     (lambda: step(0, 1, 0), "no episode is running: reset first"),
     (lambda: step_row(0, 1, 0), "rows [0] are done: reset them first"),
-    (lambda: step(7), "action must be in 0..2, got 7"),
+    (lambda: step(7), "action must be an integer in 0..2, got 7"),
     (lambda: read(graph_shape__p=1.0), "wait_prob must be in [0, 1), got 1.0"),
     (lambda: read(graph_shape__d=0), "depth must be an integer >= 1, got 0"),
     (lambda: read(graph_shape__b=1), "branching_factor must be an integer >= 2, got 1"),
@@ -86,7 +86,10 @@ REFUSED = [
         "goal is not in the file and must be given: the authors' implementation draws one at random or sets it with "
         "set_high_reward_path, counting from 0; add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]",
     ),
-    (lambda: read(goal=(0, 1)), "goal must be 2 decisions in 1..2, such as (1, 1), got (0, 1)"),
+    (
+        lambda: read(goal=(0, 1)),
+        "goal must be 2 decisions in 1..2, such as (1, 1), got (0, 1); a path of the authors' implementation counts from 0: use (1, 2)",
+    ),
     (
         lambda: read(reward__min_static_reward_episodes=5, reward__max_static_reward_episodes=5),
         "reward.min_static_reward_episodes must be below max_static_reward_episodes, which is exclusive, and both "

@@ -185,11 +185,39 @@ def test_what_is_no_action_is_refused_and_the_rows_stay(actions, message):
 
 def test_buffers_of_other_rows_are_refused():
     rows, other = Rows([surjective()] * 2), Rows([surjective()] * 3)
+    actions, steps = torch.zeros(5, 2, dtype=torch.int64), Steps.empty(rows, 5)
 
-    with pytest.raises(ValueError, match=r"buffers must be those of Steps.empty\(rows, 5\), got \(6, 3, 1, 12, 12\)"):
-        rollout(rows, torch.zeros(5, 3, dtype=torch.int64), Steps.empty(other, 5))
+    with pytest.raises(
+        ValueError, match=r"Steps.empty\(rows, 5\), got observation torch.uint8 \[6, 3, 1, 12, 12\] on cpu"
+    ):
+        rollout(rows, actions, Steps.empty(other, 5))
+    with pytest.raises(ValueError, match=r"got reward torch.int64 \[5, 2\] on cpu"):
+        rollout(rows, actions, steps._replace(reward=steps.reward.long()))
     with pytest.raises(ValueError, match="num_steps must be an integer >= 1, got 0"):
         Steps.empty(rows, 0)
+
+
+@pytest.mark.parametrize("change", ["goals", "tasks", "reset"])
+def test_a_policy_that_changes_the_rows_is_refused(change):
+    rows = Rows([surjective()] * 2)
+    changes = {"goals": lambda: rows.set_goals([(2, 2)] * 2), "tasks": lambda: rows.set_tasks(rows.tasks)}
+
+    def policy(observation: torch.Tensor, is_init: torch.Tensor) -> torch.Tensor:
+        changes.get(change, rows.reset)()
+        return torch.zeros(2, dtype=torch.int64)
+
+    with pytest.raises(ValueError, match="a policy must leave the rows as they are during a rollout"):
+        rollout(rows, policy, Steps.empty(rows, 3))
+
+
+@pytest.mark.parametrize("policy", [None, [[0, 0]], torch.zeros(1, 2).numpy()])
+def test_what_is_no_policy_is_refused(policy):
+    rows = Rows([surjective()] * 2)
+
+    with pytest.raises(ValueError, match="policy must be a function or a tensor of actions"):
+        rollout(rows, policy, Steps.empty(rows, 1))
+    with pytest.raises(ValueError, match=r"actions must be int64 of shape \[2\]"):
+        rollout(rows, lambda observation, is_init: policy, Steps.empty(rows, 1))
 
 
 def test_nothing_is_learned_through_a_rollout():

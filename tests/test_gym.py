@@ -23,6 +23,7 @@ from oracles import confounding, fully_observable, one_hot, record, scripts, sur
 
 from ctgraph_rl import CTGraphEnv, Gradient, ReferenceOneHot, Task, paper
 from ctgraph_rl.gym import CONFIGURATIONS, CTGraphGymEnv, CTGraphVectorEnv, make_task
+from ctgraph_rl.paper import ct_su_b1
 
 MODES = tuple(AutoresetMode)
 IDS = ["ctgraph/CTGraph-v0", *(f"ctgraph/{name}-v0" for name in CONFIGURATIONS)]
@@ -370,7 +371,7 @@ def test_the_single_environment_refuses_wrong_actions(action):
     env = CTGraphGymEnv(surjective())
     env.reset(seed=0)
 
-    with pytest.raises(ValueError, match=r"action must be in 0\.\.2, got"):
+    with pytest.raises(ValueError, match=r"action must be an integer in 0\.\.2, got"):
         env.step(action)
 
 
@@ -610,3 +611,71 @@ def test_a_copy_of_an_environment_goes_on_as_the_original():
 
     assert_equal([env.step(0) for _ in range(1)], [twin.step(0) for _ in range(1)])
     assert_equal(env.reset(), twin.reset())
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_a_row_whose_task_stays_goes_on_with_its_goals_while_others_change(mode):
+    stays = replace(ct_su_b1(), goal_change=(1, 2))
+    other = replace(stays, goal=(2, 2))
+    envs = CTGraphVectorEnv(3, stays, task_pool=[stays, other], autoreset_mode=mode)
+    twins = [CTGraphGymEnv(stays, task_pool=[stays, other]) for _ in range(3)]
+    sync = SyncVectorEnv([lambda twin=twin: twin for twin in twins], autoreset_mode=AutoresetMode(mode))
+    envs.reset(seed=5), sync.reset(seed=5)
+    envs.set_tasks([stays, other, stays])
+    twins[1].set_task(other)
+    rng = np.random.default_rng(0)
+
+    for number in range(60):
+        mask = np.array([True, number % 3 == 2, number % 2 == 0])
+        if mode == "Disabled":
+            envs.reset(options={"reset_mask": mask})
+            sync.reset(options={"reset_mask": mask.copy()})
+        else:
+            actions = rng.integers(0, 3, 3)
+            envs.step(actions), sync.step(actions)
+        assert envs.rows.goal_leaf.tolist() == [twin.rows.goal_leaf.item() for twin in twins]
+
+
+def test_seeds_may_be_integers_of_numpy():
+    envs, single = CTGraphVectorEnv(2, "CT-CO-B1"), CTGraphGymEnv("CT-CO-B1")
+
+    assert_equal(envs.reset(seed=np.int64(3)), envs.reset(seed=np.array([3, 4])))
+    assert_equal(single.reset(seed=np.int64(3)), single.reset(seed=3))
+
+
+def test_the_rows_of_an_environment_can_be_loaded_after_a_reset():
+    env = CTGraphGymEnv("CT-POSR-B1")
+    env.reset(seed=1)
+    saved = {name: value.clone() for name, value in env.rows.state_dict().items()}
+    first = [env.step(0)[0] for _ in range(2)]
+
+    env.rows.load_state_dict(saved)
+
+    assert_equal([env.step(0)[0] for _ in range(2)], first)
+
+
+def test_environments_in_processes_of_their_own_run_with_any_number_of_threads():
+    code = """
+import gymnasium, numpy, ctgraph_rl.gym
+envs = gymnasium.make_vec("ctgraph/CT-CO-B1-v0", num_envs=2, vectorization_mode="async", read_noise=5)
+envs.reset(seed=0)
+print(envs.step(numpy.array([0, 1]))[0].shape)
+envs.close()
+"""
+    threads = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+
+    found = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, timeout=120)
+
+    assert found.stdout.strip() == "(2, 1, 12, 12)", found.stderr
+
+
+def test_a_wrong_keyword_is_answered_with_the_nearest_one():
+    with pytest.raises(ValueError, match="wait_probability; did you mean 'wait_prob'"):
+        make_task("CT-SU-B1", wait_probability=0.5)
+    with pytest.raises(ValueError, match=r"autoreset_mode must be one of \['NextStep', 'SameStep', 'Disabled'\]"):
+        CTGraphVectorEnv(2, autoreset_mode="same_step")
+
+
+def test_a_path_that_counts_from_zero_is_answered_with_the_goal():
+    with pytest.raises(ValueError, match=r"counts from 0: use \(1, 2\)"):
+        ct_su_b1(goal=(0, 1))

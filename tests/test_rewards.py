@@ -232,3 +232,10 @@ def test_the_noise_is_the_normal_number_of_the_word_where_the_step_begins_added_
     expected = torch.stack([3 + 0.5 * z[0], 3 * (1 + 0.5 * z[1])])
     torch.testing.assert_close(paid, expected, atol=1e-6, rtol=0)
     assert z.abs().min() > 0.01
+
+
+def test_rewards_whose_noise_would_be_infinite_are_refused():
+    with pytest.raises(ValueError, match=r"goal_reward times reward_std must be at most 1e\+30 in size"):
+        replace(surjective(), goal_reward=1e20, reward_std=1e20, reward_noise="multiplicative")
+    with pytest.raises(ValueError, match="reward_cue needs goal_reward > 0, got 1e-50"):
+        replace(surjective(reward_cue=True), goal_reward=1e-50)
