@@ -88,7 +88,8 @@ REFUSED = [
     ),
     (
         lambda: read(goal=(0, 1)),
-        "goal must be 2 decisions in 1..2, such as (1, 1), got (0, 1); a path of the authors' implementation counts from 0: use (1, 2)",
+        "goal must be 2 decisions in 1..2, such as (1, 1), got (0, 1); "
+        "a path of the authors' implementation counts from 0: use (1, 2)",
     ),
     (
         lambda: read(reward__min_static_reward_episodes=5, reward__max_static_reward_episodes=5),
