@@ -102,6 +102,7 @@ class Uses(NamedTuple):
     pixel_noise: bool = True
     noise_bank: int = 0  # how many noises an observation's is chosen from
     reward_noise: bool = True
+    multiplicative: bool = True  # some of that noise is a share of the reward
     fail_reward: bool = True
     step_reward: bool = True
     reward_cue: bool = True
@@ -367,7 +368,8 @@ def _paid(
     paid = _share(after, goal_leaf, params, uses) * g.goal_reward
     if uses.reward_noise:
         noise = (words[4] * g.reward_std).float()
-        paid = paid.double() + noise.double() * torch.where(g.multiplicative, paid, 1.0)
+        share = torch.where(g.multiplicative, paid, 1.0) * noise.double() if uses.multiplicative else noise
+        paid = paid.double() + share
     at_end = after.state_type == _END
     reward = torch.where(at_end if entered is None else at_end & entered, paid, 0.0)
     if uses.fail_reward:

@@ -37,6 +37,7 @@ def make_params(
         pixel_noise=any(x.read_noise for x in observations),
         noise_bank=noise_bank if any(x.read_noise for x in observations) else 0,
         reward_noise=any(task.reward_std for task in tasks),
+        multiplicative=any(task.reward_std and task.reward_noise == "multiplicative" for task in tasks),
         fail_reward=any(task.fail_reward for task in tasks),
         step_reward=any(task.step_reward for task in tasks),
         reward_cue=any(x.reward_cue for x in observations),

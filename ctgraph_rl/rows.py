@@ -345,12 +345,14 @@ class _Stock:
         self._place = torch.arange(num_rows, device=tick.device)
         ticks = tick + torch.arange(num_ticks, device=tick.device).unsqueeze(-1)
         self._words = [word.flatten() for word in dynamics.words_of(ticks, params, uses)]
+        self._used = (uses.waits, uses.waits, uses.drawn_ids, uses.views, uses.reward_noise)
 
     def at(self, tick: Tensor) -> Words:
         """The draws of ticks that are at most one ahead of those of the last call."""
         self.left -= 1
         index = (tick - self._tick) * len(tick) + self._place
-        return tuple(word.take(index) for word in self._words)
+        pairs = zip(self._words, self._used, strict=False)
+        return tuple(word.take(index) if used else index for word, used in pairs)  # what has no use is any tensor
 
 
 MAX_STOCK = 2**14
