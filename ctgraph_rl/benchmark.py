@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 
+import gymnasium
 import torch
 from rich.console import Console
 from rich.progress import track
@@ -29,6 +30,7 @@ from torchrl.envs import EnvBase
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.fast import Steps, rollout
+from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.paper import ct_co_b1, ct_su_b1
 from ctgraph_rl.rows import Rows
 from ctgraph_rl.task import Task
@@ -183,8 +185,6 @@ class _Random(TensorDictModuleBase):
 
 
 def _gymnasium(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
-    from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-
     envs = CTGraphVectorEnv(num_rows, task)
     envs.reset(seed=0)
     actions = torch.randint(0, 3, (16, num_rows)).numpy()
@@ -199,7 +199,7 @@ def _gymnasium(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], in
         yield "Gymnasium Env", _single(CTGraphGymEnv(task))
 
 
-def _single(env) -> Callable[[], int]:  # type: ignore[no-untyped-def]
+def _single(env: gymnasium.Env) -> Callable[[], int]:
     """Steps of any Gymnasium environment with random actions."""
     actions = torch.randint(0, 3, (256,)).tolist()
     env.reset(seed=0)
@@ -218,7 +218,6 @@ def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
     if find_spec("gym_CTgraph") is None:
         return
     import gym_CTgraph  # type: ignore[import-not-found]  # noqa: F401
-    import gymnasium
 
     yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
 

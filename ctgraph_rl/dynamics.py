@@ -7,6 +7,7 @@ Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -176,13 +177,7 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
         params: the rows' tasks.
         uses: what the rows have use for.
     """
-    seen = look(state, words, params, uses)
-    images = params.bank.index_select(0, seen.rows)
-    if uses.noise_bank:
-        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
-    elif uses.pixel_noise:
-        images = add_noise(images, seen.noise, params.x.read_noise)
-    return finish(images, seen.angle, state, params, uses)
+    return read(look(state, words, params, uses), state, params, uses)
 
 
 class Seen(NamedTuple):
@@ -206,11 +201,18 @@ def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
     return Seen(rows, angle, noise)
 
 
-def finish(images: Tensor, angle: Tensor, state: RowState, params: RowParams, uses: Uses) -> Tensor:
-    """Images with late rotation and reward cue; uint8 [N, *shape]."""
-    x = params.x
+def read(seen: Seen, state: RowState, params: RowParams, uses: Uses, noisy: Callable = add_noise) -> Tensor:
+    """The images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape].
+
+    ``noisy`` stands for `reading.add_noise`.
+    """
+    x, images = params.x, params.bank.index_select(0, seen.rows)
+    if uses.noise_bank:
+        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
+    elif uses.pixel_noise:
+        images = noisy(images, seen.noise, x.read_noise)
     if x.taps is not None:
-        images = turn(images, angle, x.taps)
+        images = turn(images, seen.angle, x.taps)
     if uses.reward_cue:
         level = cue_level(state.paid.double() / params.g.goal_reward, x.white, x.cue_wraps)
         images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
@@ -287,13 +289,18 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
     if mask is None:
         zeros = RowState(*map(torch.zeros_like, state))
         state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
-        return (
-            _count_episode(state, torch.ones_like(state.node, dtype=torch.bool), params) if uses.goal_change else state
-        )
+        mask = torch.ones_like(state.node, dtype=torch.bool)
+    else:
+        state = _cleared(state, mask, uses)
+    return _count_episode(state, mask, params) if uses.goal_change else state
+
+
+def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
+    """Back to the home state in the rows of a mask."""
     starts = mask.long()
     goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
     reward = torch.where(mask, nothing, state.reward)
-    state = state._replace(
+    return state._replace(
         state_type=state.state_type * goes_on.to(torch.uint8),  # the home state is 0; faster than filling by a mask
         node=state.node * goes_on,
         tick=state.tick + starts,
@@ -302,9 +309,6 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
         reward=reward,
         paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
     )
-    if uses.goal_change:
-        state = _count_episode(state, mask, params)
-    return state
 
 
 def restart(

@@ -14,7 +14,6 @@ from torch import Tensor
 from ctgraph_rl import dynamics, reading
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.dynamics import RowParams, RowState, Seen, Uses, Words
-from ctgraph_rl.reading import add_saturating
 from ctgraph_rl.rows import Rows
 
 Policy = Callable[[Tensor, Tensor], Tensor]
@@ -100,13 +99,8 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
         steps.is_init[t + 1] = done
         if plain:
             torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
-            continue
-        images = params.bank.index_select(0, seen.rows)
-        if uses.noise_bank:
-            images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
-        elif uses.pixel_noise:
-            images = noisy(images, seen.noise, params.x.read_noise)
-        steps.observation[t + 1] = dynamics.finish(images, seen.angle, state, params, uses)
+        else:
+            steps.observation[t + 1] = dynamics.read(seen, state, params, uses, noisy)
     rows.state = state
     return steps
 

@@ -46,10 +46,7 @@ def make_params(
         reward_fns=reward_fns,
     )
     reward_params = _reward_params(tasks, rows, reward_fns)
-    x = _observation_params(tasks, rows, bank)._replace(
-        noise_start=rows([bank.noise_levels.index(task.observations.read_noise) * noise_bank for task in tasks])
-    )
-    return _tree_params(tasks, rows), x, reward_params, uses
+    return _tree_params(tasks, rows), _observation_params(tasks, rows, bank, noise_bank), reward_params, uses
 
 
 def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
@@ -62,7 +59,7 @@ def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
     )
 
 
-def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> ObservationParams:
+def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank, noise_bank: int) -> ObservationParams:
     observations = [task.observations for task in tasks]
     by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
     views, starts = [_num_views(task) for task in tasks], [bank.start[_bank_key(task)] for task in tasks]
@@ -92,7 +89,7 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank) -> Ob
         cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
         cue_element=rows([task.images.shape[-1] - 1 for task in tasks]),
         white=rows([white_level(task.images) for task in tasks], torch.float64),
-        noise_start=bank_start,
+        noise_start=rows([bank.noise_levels.index(x.read_noise) * noise_bank for x in observations]),
         legacy=_legacy_index(tasks, rows, table) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
     )

@@ -86,13 +86,14 @@ class Rows(nn.Module):
         self._pool = frozenset(pool)
         self.max_branching = max(task.graph.branching_factor for task in pool)
         bank = shared_bank(pool, self.num_rows)
-        self._bank, self.image_shape = bank._replace(images=bank.images[:0]), bank.shape
+        no_images = bank.images.new_empty(0, *bank.shape)
+        self._bank, self.image_shape = bank._replace(images=no_images), bank.shape
         self.white = max(int(white_level(task.images)) for task in pool)
         self.register_buffer("seed", torch.tensor([seed], device=device))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self.register_buffer("bank", bank.images.to(device), persistent=False)
         has_noise = noise_bank > 0 and max(bank.noise_levels) > 0
-        noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else bank.images[:0]
+        noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else no_images
         self._noise_bank = noise_bank
         self.register_buffer("noises", noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)

@@ -279,3 +279,17 @@ def test_noise_of_many_rows_is_that_of_each_part_of_them():
     for part in (slice(0, 5), slice(_NOISE_ROWS - 2, _NOISE_ROWS + 2), slice(n - 4, n)):
         alone = add_noise(images[part], *(argument[part] for argument in arguments))
         assert torch.equal(whole[part], alone)
+
+
+@pytest.mark.parametrize("branching", [(2, 3), (61, 62), (62, 63), (2, 64, 1000)])
+def test_decisions_are_the_actions_up_to_each_rows_own_branching_factor(branching):
+    cases = [(b, a) for b in branching for a in (-2, -1, 0, 1, 2, b - 1, b, b + 1, b + 2, 10**6)]
+    factors, action = (torch.tensor(values) for values in zip(*cases, strict=True))
+    tree = make_tree(factors, torch.ones_like(factors), torch.zeros_like(factors))
+    state = State(torch.full_like(factors, DECISION), torch.zeros_like(factors))
+
+    after = transition(state, action, None, tree)
+
+    decided = [1 <= a <= b for b, a in cases]
+    assert after.state_type.tolist() == [WAIT if holds else FAIL for holds in decided]
+    assert after.node.tolist() == [a if holds else 0 for holds, (_, a) in zip(decided, cases, strict=True)]
