@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.curriculum import Block as Block
     from ctgraph_rl.curriculum import Curriculum as Curriculum
     from ctgraph_rl.curriculum import Evaluation as Evaluation
+    from ctgraph_rl.curriculum import Protocol as Protocol
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
     from ctgraph_rl.fast import Steps as Steps
     from ctgraph_rl.fast import rollout as rollout
@@ -56,6 +57,7 @@ _HOMES = {
     "Observations": "observations",
     "OneHot": "images",
     "PaperImages": "images",
+    "Protocol": "curriculum",
     "Rows": "rows",
     "RunLog": "log",
     "StateType": "graph",

@@ -27,16 +27,26 @@ class Agent(Protocol):
     policy: TensorDictModuleBase
     """Reads ``observation`` and ``is_init``, writes ``action``; explores unless TorchRL's exploration type forbids it.
 
+    Where the protocol gives a task id, ``observation_spec`` has ``task_id``, a one-hot uint8 [n], and so has the data.
+
     A recurrent policy reads its state under its own keys and writes the new one under ``("next", key)``. Where
     ``is_init`` is set, the state that it reads is that of `initial_state`.
     """
+
+    def policy_for(self, task: int) -> TensorDictModuleBase:
+        """What acts in a task, counted from 0, where the protocol tells the task; mostly `policy` itself."""
+        ...
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """The recurrent state of ``num_envs`` rows before their first observation; empty without memory."""
         ...
 
-    def start_task(self) -> None:
-        """Called before the first batch of a block whose start is announced."""
+    def start_task(self, task: int | None = None) -> None:
+        """Called before the first batch of a block whose start is announced.
+
+        Args:
+            task: position of the task in the curriculum, from 0, where the protocol tells it; None where it is hidden.
+        """
         ...
 
     def end_task(self) -> None:

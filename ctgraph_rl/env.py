@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,11 +12,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl import dynamics
-from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.dynamics import RowState, Shown
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.render import render
 from ctgraph_rl.rows import Rows, seed_rule
+from ctgraph_rl.switch import Switch
 from ctgraph_rl.task import Task
 
 
@@ -51,6 +52,9 @@ class CTGraphEnv(EnvBase):
         check_actions: refuse actions of a wrong shape, dtype or range, and steps of finished rows, with a
             ``ValueError``. False trusts them for speed; on a GPU the check waits for the device at every step.
         noise_bank: 0, or from how many noises drawn in advance an observation takes its own: see `Rows`.
+        task_ids: the id of each task, an integer >= 0. Observations then have ``task_id``, uint8 [N, num_task_ids]: the
+            row's id as one-hot, zeros for a task without one.
+        num_task_ids: length of ``task_id``; None: just enough.
 
     Raises:
         ValueError: for no tasks, values out of range, and observations of different shapes.
@@ -69,12 +73,19 @@ class CTGraphEnv(EnvBase):
         device: torch.device | str = "cpu",
         check_actions: bool = True,
         noise_bank: int = 0,
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
     ) -> None:
         require((isinstance(check_actions, bool), f"check_actions must be true or false, got {check_actions!r}"))
         tasks = require_all(Task, "tasks", tasks)
+        self.num_task_ids = _num_task_ids(task_ids, num_task_ids)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions = check_actions
         self.rows = Rows(tasks, seed, first_row, task_pool, self.device, noise_bank)
+        ids = {} if task_ids is None else task_ids
+        numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device)
+        self.register_buffer("_id_of_task", numbers, persistent=False)
+        self._task_id: tuple[Tensor | None, Tensor | None] = (None, None)
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -90,6 +101,10 @@ class CTGraphEnv(EnvBase):
             shape=(n,),
             device=device,
         )
+        if self.num_task_ids:
+            self.observation_spec["task_id"] = Bounded(
+                0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8, device=device
+            )
         self.action_spec = Categorical(self.rows.max_branching + 1, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32, device=device)
         flag = Binary(1, shape=(n, 1), dtype=torch.bool, device=device)
@@ -102,9 +117,24 @@ class CTGraphEnv(EnvBase):
         """The task of each row."""
         return self.rows.tasks
 
-    def set_tasks(self, tasks: Iterable[Task]) -> None:
-        """Give every row a task of the pool: see `Rows.set_tasks`."""
-        self.rows.set_tasks(tasks)
+    def set_tasks(self, tasks: Iterable[Task], at_episode_end: bool = False) -> None:
+        """Give every row a task of the pool, now or at the end of its episode: see `Rows.set_tasks`."""
+        self.rows.set_tasks(tasks, at_episode_end)
+
+    def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
+        """Let rows change between tasks from episode to episode: see `Rows.switch_tasks`."""
+        self.rows.switch_tasks(tasks, switch, at_episode_end)
+
+    def _with_task_id(self, data: TensorDictBase) -> TensorDictBase:
+        """The data with the rows' task ids, if this environment shows them."""
+        if not self.num_task_ids:
+            return data
+        of, shown = self._task_id
+        if of is not self.rows.task:
+            ids = self._id_of_task.index_select(0, self.rows.task)
+            shown = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
+            self._task_id = self.rows.task, shown
+        return data.set("task_id", shown.clone())  # type: ignore[union-attr]
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal: see `Rows.set_goals`. The outcome is told by the goal at the end of an episode."""
@@ -160,7 +190,9 @@ class CTGraphEnv(EnvBase):
         fields = {field: value.clone() for field, value in self.rows.state._asdict().items()}
         return TensorDict(fields, batch_size=self.batch_size, device=self.device)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
+    ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.view(-1)
         if set_state:
@@ -193,7 +225,7 @@ class CTGraphEnv(EnvBase):
             return RowState(*(value.clone() for value in state))
         return RowState(*(torch.where(mask, new, old) for old, new in zip(present, state, strict=True)))
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action", None)
         if self.check_actions:
             self.rows.check_actions(action)
@@ -213,7 +245,7 @@ class CTGraphEnv(EnvBase):
         done = tensordict.get(("next", "done"))
         observation = self.rows.restart(done.squeeze(-1))
         running = torch.zeros_like(done)
-        tensordict_.set("observation", observation)
+        self._with_task_id(tensordict_).set("observation", observation)
         tensordict_.set("is_init", done.clone())
         tensordict_.set("step_count", self.rows.step_count.unsqueeze(-1).clone())
         tensordict_.set("episode_reward", self.rows.episode_reward.unsqueeze(-1).clone())
@@ -224,10 +256,10 @@ class CTGraphEnv(EnvBase):
         tensordict_.set("truncated", running.clone())
         return tensordict, tensordict_
 
-    def _data(self, shown: Shown, is_init: Tensor) -> TensorDict:
+    def _data(self, shown: Shown, is_init: Tensor) -> TensorDictBase:
         """Observation, book-keeping and done flags; nothing shares memory with the state."""
         done = shown.done.unsqueeze(-1)
-        return TensorDict(
+        data = TensorDict(
             {
                 "observation": shown.observation,
                 "is_init": is_init.unsqueeze(-1),
@@ -242,6 +274,7 @@ class CTGraphEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+        return self._with_task_id(data)
 
     def render(self, size: int = 192) -> Tensor:
         """A picture of every row: the observation, and the tree with position and goal.
@@ -260,3 +293,16 @@ class CTGraphEnv(EnvBase):
         """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))
         self.rows.set_seed(seed)  # type: ignore[arg-type]
+
+
+def _num_task_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None) -> int:
+    """The length of ``task_id``; 0 for none."""
+    if task_ids is None:
+        require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
+        return 0
+    ids = list(task_ids.values())
+    require((bool(ids) and all(is_int(i, 0) for i in ids), f"task_ids must be integers >= 0, got {ids[:5]!r}"))
+    needed = max(ids) + 1
+    room = needed if num_task_ids is None else num_task_ids
+    require((is_int(room, needed), f"num_task_ids must be an integer >= {needed}, the largest id + 1, got {room!r}"))
+    return room

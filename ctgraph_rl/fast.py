@@ -70,6 +70,9 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
             were.
     """
     _check_buffers(rows, steps)
+    require(
+        (not rows.tasks_change, "rollout needs rows that keep their tasks; step rows with `Rows.act` and `restart`")
+    )
     is_policy = isinstance(policy, Tensor) or callable(policy)
     require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
     if isinstance(policy, Tensor):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from itertools import accumulate
 from typing import Any, Protocol
 
 import torch
@@ -13,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import at_least_one, is_int, require
-from ctgraph_rl.curriculum import Curriculum, Evaluation
+from ctgraph_rl.curriculum import Block, Curriculum, Evaluation
 from ctgraph_rl.dynamics import OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
@@ -40,10 +42,11 @@ def learn_curriculum(
     progress: Progress | None = None,
     device: torch.device | str = "cpu",
 ) -> RunLog:
-    """Let an agent learn a curriculum block by block, with all tasks evaluated before, between and after.
+    """Let an agent learn a curriculum block by block, evaluated as the curriculum says.
 
     Training randomness of the environment comes from ``seed``; the agent draws from torch's global generator, which
-    is the caller's to seed. Evaluation disturbs neither.
+    is the caller's to seed. Evaluation disturbs neither. Where boundaries are announced, a batch ends with its block;
+    where they are hidden, batches go over them.
 
     Args:
         curriculum: what to learn.
@@ -57,28 +60,72 @@ def learn_curriculum(
         The log; ``log.performance()`` is the performance matrix.
 
     Raises:
-        ValueError: before any work, if a block's frames are not a multiple of the agent's rows.
+        ValueError: before any work, if frames are not a multiple of the agent's rows.
         FloatingPointError: if a loss or weight is not finite; names it, block and frames.
     """
     log = RunLog() if log is None else log
     check_rows(curriculum, agent.num_envs)
-    rows = [block.rows(agent.num_envs) for block in curriculum.blocks]
-    env = CTGraphEnv(rows[0], seed=seed, task_pool=curriculum.tasks, device=device)
+    env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
+    examiner = Examiner(curriculum, seed, log, device)
+    examiner.examine(agent, 0)
     frames = 0
-    _evaluate_all(curriculum, agent, 0, frames, seed, log, device)
-    for number, block in enumerate(curriculum.blocks, 1):
-        env.set_tasks(rows[number - 1])
-        agent.start_task()
-        for batch in collect(env, agent.policy, block.num_frames, agent.num_steps, agent.initial_state):
+    for blocks in curriculum.stretches:
+        agent.start_task(_given_id(curriculum, blocks[0]))
+        for batch in _collect_blocks(env, agent, blocks, partial(examiner.examine, agent), frames):
             frames += batch.numel()
-            measurements = _learn(agent, batch, number, frames)
+            block = curriculum.block_at(frames)
+            measurements = _learn(agent, batch, block, frames)
             episodes = episode_means(batch["next"][batch["next", "done"].squeeze(-1)])
-            log.append("training", block=number, frames=frames, **episodes, **measurements)
+            log.append("training", block=block, frames=frames, **episodes, **measurements)
             if progress is not None:
-                progress.update(number, frames, episodes["return_mean"])
+                progress.update(block, frames, episodes["return_mean"])
         agent.end_task()
-        _evaluate_all(curriculum, agent, number, frames, seed, log, device)
+        examiner.examine(agent, frames)
     return log
+
+
+def make_env(
+    curriculum: Curriculum, tasks: Sequence[Task], seed: int, device: torch.device | str = "cpu"
+) -> CTGraphEnv:
+    """An environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
+
+    Held-out tasks have no id, which shows as zeros.
+    """
+    how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    if how.task_id != "one_hot":
+        return CTGraphEnv(tasks, seed, task_pool=pool, device=device)
+    length = how.length(len(curriculum.tasks))
+    return CTGraphEnv(tasks, seed, task_pool=pool, device=device, task_ids=curriculum.task_ids, num_task_ids=length)
+
+
+def _collect_blocks(
+    env: CTGraphEnv, agent: Agent, blocks: Sequence[Block], examine: Callable[[int], object], start: int
+) -> Iterator[TensorDictBase]:
+    """Batches of blocks with hidden boundaries between them, after ``start`` frames of the run."""
+    ends = accumulate(block.num_frames for block in blocks)
+    following = dict(zip(ends, blocks[1:], strict=False))
+    _enter(env, blocks[0])
+
+    def between_steps(frames: int) -> None:
+        examine(start + frames)
+        if frames in following:
+            _enter(env, following[frames], at_episode_end=True)
+
+    num_frames = sum(block.num_frames for block in blocks)
+    return collect(env, agent.policy, num_frames, agent.num_steps, agent.initial_state, between_steps)
+
+
+def _enter(env: CTGraphEnv, block: Block, at_episode_end: bool = False) -> None:
+    """Go over to a block's tasks."""
+    if block.switch is None:
+        env.set_tasks(block.rows(env.numel()), at_episode_end)
+    else:
+        env.switch_tasks(block.tasks, block.switch, at_episode_end)
+
+
+def _given_id(curriculum: Curriculum, block: Block) -> int | None:
+    """The task id that the agent is given at the start of a block, if it is."""
+    return curriculum.task_ids[block.tasks[0]] if curriculum.protocol.task_id == "at_boundaries" else None
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
@@ -87,8 +134,9 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     Raises:
         ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
     """
-    curriculum.evaluation.check(curriculum.tasks)
-    rules = {}
+    evaluation = curriculum.evaluation
+    evaluation.check((*curriculum.tasks, *evaluation.held_out))
+    rules: dict[Any, tuple[bool, str]] = {"every": evaluation.every_rule(num_envs)}
     for block in curriculum.blocks:
         block.rows(num_envs)
         alike = [str(i) for i, other in enumerate(curriculum.blocks, 1) if other.num_frames == block.num_frames]
@@ -103,6 +151,7 @@ def collect(
     num_frames: int,
     num_steps: int,
     initial_state: InitialState | None = None,
+    between_steps: Callable[[int], object] | None = None,
 ) -> Iterator[TensorDictBase]:
     """Batches of [rows, num_steps] in time order, from a reset on; the last one may be shorter.
 
@@ -112,6 +161,7 @@ def collect(
         num_frames: frames in all, a multiple of the rows.
         num_steps: steps in a batch.
         initial_state: gives the recurrent state that the rows start with.
+        between_steps: called with the frames collected so far between any two steps, after what was made of a batch.
 
     Raises:
         ValueError: for a number of frames that is not a multiple of the rows, and less than one step.
@@ -123,15 +173,16 @@ def collect(
     )
     start = _start(env, initial_state)
     carried = env.reset().update(start)
-    steps_left = num_frames // env.numel()
-    while steps_left:
-        steps = []
+    steps: list[TensorDictBase] = []
+    for frames in range(0, num_frames, env.numel()):
+        if between_steps is not None and frames:
+            between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
-            for _ in range(min(num_steps, steps_left)):
-                step, carried = _act(env, policy, carried, start)
-                steps.append(step)
-        steps_left -= len(steps)
-        yield torch.stack(steps, dim=1)
+            step, carried = _act(env, policy, carried, start)
+        steps.append(step)
+        if len(steps) == num_steps or frames + env.numel() == num_frames:
+            yield torch.stack(steps, dim=1)
+            steps = []
 
 
 @torch.no_grad()
@@ -144,6 +195,7 @@ def evaluate(
     initial_state: InitialState | None = None,
     device: torch.device | str = "cpu",
     episodes_per_row: int = 1,
+    curriculum: Curriculum | None = None,
 ) -> TensorDict:
     """Play the same number of episodes on every task, all in one batch; every row plays equally many.
 
@@ -159,6 +211,7 @@ def evaluate(
         device: where the environment lives.
         episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``. More than one is
             needed where the goal changes from episode to episode.
+        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
 
     Returns:
         ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
@@ -172,7 +225,8 @@ def evaluate(
     bound = isinstance(policy, RandomPolicy)
     require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
     num_rows = num_episodes // episodes_per_row
-    env = CTGraphEnv([task for task in tasks for _ in range(num_rows)], seed=seed, device=device)
+    rows = [task for task in tasks for _ in range(num_rows)]
+    env = CTGraphEnv(rows, seed, device=device) if curriculum is None else make_env(curriculum, rows, seed, device)
     acts = policy(env) if isinstance(policy, type) else policy
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
@@ -235,22 +289,79 @@ def derive_seed(seed: int, *purpose: str | int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
-def _evaluate_all(
-    curriculum: Curriculum, agent: Agent, block: int, frames: int, seed: int, log: RunLog, device: torch.device | str
-) -> None:
-    how = curriculum.evaluation
-    result = evaluate(
-        agent.policy,
-        curriculum.tasks,
-        how.num_episodes,
-        derive_seed(seed, "evaluation", block),
-        how.greedy,
-        agent.initial_state,
-        device,
-        how.episodes_per_row,
-    )
-    for number, (label, episodes) in enumerate(zip(curriculum.labels, result, strict=True), 1):
-        log.append("evaluation", block=block, frames=frames, task=number, label=label, **episode_means(episodes))
+class Examiner:
+    """Evaluates at the moments and in the way that a curriculum says, and writes what it finds to a log.
+
+    Args:
+        curriculum: says when and how.
+        seed: of the run; each evaluation derives its own.
+        log: where measurements go.
+        device: where the environments live.
+    """
+
+    def __init__(self, curriculum: Curriculum, seed: int, log: RunLog, device: torch.device | str = "cpu") -> None:
+        self.curriculum, self.seed, self.log, self.device = curriculum, seed, log, device
+
+    def examine(self, agent: Agent, frames: int) -> None:
+        """Evaluate the agent if an evaluation is due after ``frames`` frames of the run."""
+        tasks = self.examined(frames)
+        if not tasks:
+            return
+        how = self.curriculum.evaluation
+        result = evaluate(
+            self._policy(agent, tasks),
+            list(tasks),
+            how.num_episodes,
+            self.seed_at(frames),
+            how.greedy,
+            agent.initial_state,
+            self.device,
+            how.episodes_per_row,
+            self.curriculum,
+        )
+        self.record(frames, result)
+
+    def seed_at(self, frames: int) -> int:
+        """The seed of the evaluation after ``frames`` frames."""
+        return derive_seed(self.seed, "evaluation", frames)
+
+    def record(self, frames: int, result: TensorDict) -> None:
+        """Write the ends of the episodes, [tasks, episodes, 1], to the log."""
+        curriculum = self.curriculum
+        for (number, label), episodes in zip(self.examined(frames).values(), result, strict=True):
+            held_out = number > len(curriculum.tasks)
+            where = {"block": curriculum.block_at(frames), "frames": frames, "task": number, "label": label}
+            moment = curriculum.moment(frames)
+            self.log.append("evaluation", moment=moment, **where, held_out=held_out, **episode_means(episodes))
+
+    def examined(self, frames: int) -> dict[Task, tuple[int, str]]:
+        """The tasks that are to be evaluated after ``frames`` frames, with their numbers and labels; often none."""
+        curriculum = self.curriculum
+        if curriculum.moment(frames) is None:
+            return {}
+        held_out = curriculum.evaluation.held_out
+        named = dict(zip((*curriculum.tasks, *held_out), enumerate(curriculum.evaluated_labels, 1), strict=True))
+        if curriculum.evaluation.tasks == "all":
+            return named
+        seen = {task for block in curriculum.blocks[: curriculum.block_at(frames)] for task in block.tasks}
+        return {task: name for task, name in named.items() if task in seen or task in held_out}
+
+    def _policy(self, agent: Agent, tasks: Iterable[Task]) -> Policy:
+        """The agent's policy; where it is given task ids, the one for each task."""
+        if self.curriculum.protocol.task_id != "at_boundaries":
+            return agent.policy
+        ids = self.curriculum.task_ids
+        return _by_slices([agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
+
+
+def _by_slices(policies: Sequence[Policy]) -> Policy:
+    """A policy that gives each of as many equal slices of the rows to one of the policies."""
+
+    def act(data: TensorDictBase) -> TensorDictBase:
+        slices = data.chunk(len(policies))
+        return torch.cat([policy(part) for policy, part in zip(policies, slices, strict=True)])
+
+    return act
 
 
 def _learn(agent: Agent, batch: TensorDictBase, block: int, frames: int) -> dict[str, float]:

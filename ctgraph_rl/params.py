@@ -19,14 +19,14 @@ from ctgraph_rl.rotation import taps_of
 from ctgraph_rl.task import Task
 from ctgraph_rl.tree import TreeParams, tree_params
 
-Expand = Callable[..., Tensor]
-"""Makes a tensor with one entry per row from a list with one entry per different task, and a dtype (int64)."""
+MakeTensor = Callable[..., Tensor]
+"""Makes a tensor on the right device from a list with one entry per different task, and a dtype (int64)."""
 
 
 def make_params(
-    tasks: tuple[Task, ...], rows: Expand, bank: Bank, noise_bank: int
+    tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int
 ) -> tuple[TreeParams, ObservationParams, RewardParams, Uses]:
-    """The rows' parameters from their different tasks, and what they have use for."""
+    """The parameters of different tasks, and what they have use for; `Rows` hands them out to the rows."""
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
     observations = [task.observations for task in tasks]
     uses = Uses(
@@ -45,21 +45,21 @@ def make_params(
         max_depth=max(task.graph.depth for task in tasks),
         reward_fns=reward_fns,
     )
-    reward_params = _reward_params(tasks, rows, reward_fns)
-    return _tree_params(tasks, rows), _observation_params(tasks, rows, bank, noise_bank), reward_params, uses
+    reward_params = _reward_params(tasks, each, reward_fns)
+    return _tree_params(tasks, each), _observation_params(tasks, each, bank, noise_bank), reward_params, uses
 
 
-def _tree_params(tasks: tuple[Task, ...], rows: Expand) -> TreeParams:
+def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
     graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
     return tree_params(
-        branching_factor=rows([graph.branching_factor for graph in graphs]),
-        first_leaf=rows([graph.num_decision_states for graph in graphs]),
-        stay_below=rows([int(graph.wait_prob * 2**63) for graph in graphs]),
-        extra_end_step=rows(extra, torch.bool) if any(extra) else None,
+        branching_factor=each([graph.branching_factor for graph in graphs]),
+        first_leaf=each([graph.num_decision_states for graph in graphs]),
+        stay_below=each([int(graph.wait_prob * 2**63) for graph in graphs]),
+        extra_end_step=each(extra, torch.bool) if any(extra) else None,
     )
 
 
-def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank, noise_bank: int) -> ObservationParams:
+def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int) -> ObservationParams:
     observations = [task.observations for task in tasks]
     by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
     views, starts = [_num_views(task) for task in tasks], [bank.start[_bank_key(task)] for task in tasks]
@@ -74,28 +74,28 @@ def _observation_params(tasks: tuple[Task, ...], rows: Expand, bank: Bank, noise
     def table(values: list) -> Tensor:
         return torch.tensor(values, device=bank_start.device).flatten()
 
-    bank_start, angles = rows(starts), max(map(_num_angles, tasks))
+    bank_start, angles = each(starts), max(map(_num_angles, tasks))
     taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
     return ObservationParams(
-        first_kind=rows([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
+        first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
         first_view=table([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
         views_per_node=table([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
         num_ids=table([[num_ids(x, kind) for kind in StateType] for x in observations]),
         bank_start=bank_start,
-        num_views=rows(views),
-        num_angles=rows([_num_angles(task) for task in tasks]),
-        read_noise=rows([x.read_noise for x in observations]),
-        reward_cue=rows([x.reward_cue for x in observations], torch.bool),
-        cue_wraps=rows([x.cue_wraps for x in observations], torch.bool),
-        cue_element=rows([task.images.shape[-1] - 1 for task in tasks]),
-        white=rows([white_level(task.images) for task in tasks], torch.float64),
-        noise_start=rows([bank.noise_levels.index(x.read_noise) * noise_bank for x in observations]),
-        legacy=_legacy_index(tasks, rows, table) if any(x.legacy_index for x in observations) else None,
+        num_views=each(views),
+        num_angles=each([_num_angles(task) for task in tasks]),
+        read_noise=each([x.read_noise for x in observations]),
+        reward_cue=each([x.reward_cue for x in observations], torch.bool),
+        cue_wraps=each([x.cue_wraps for x in observations], torch.bool),
+        cue_element=each([task.images.shape[-1] - 1 for task in tasks]),
+        white=each([white_level(task.images) for task in tasks], torch.float64),
+        noise_start=each([bank.noise_levels.index(x.read_noise) * noise_bank for x in observations]),
+        legacy=_legacy_index(tasks, each, table) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
     )
 
 
-def _legacy_index(tasks: tuple[Task, ...], rows: Expand, table: Callable[[list], Tensor]) -> LegacyIndex:
+def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[list], Tensor]) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
     def level(task: Task, k: int) -> tuple[int, int]:
@@ -112,27 +112,27 @@ def _legacy_index(tasks: tuple[Task, ...], rows: Expand, table: Callable[[list],
     levels = range(max(task.graph.depth for task in tasks) + 1)
     by_level = [[level(task, k) for k in levels] for task in tasks]
     return LegacyIndex(
-        level_first=rows([[first for first, _ in pairs] for pairs in by_level]),
-        level_shift=rows([[shift for _, shift in pairs] for pairs in by_level]),
+        level_first=each([[first for first, _ in pairs] for pairs in by_level]),
+        level_shift=each([[shift for _, shift in pairs] for pairs in by_level]),
         num_ids=table([[num_ids(task, kind) for kind in StateType] for task in tasks]),
     )
 
 
-def _reward_params(tasks: tuple[Task, ...], rows: Expand, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
+def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
     changes = [task.goal_change or (0, 0) for task in tasks]
     pairs = list(zip(tasks, changes, strict=True))
     return RewardParams(
-        depth=rows([task.graph.depth for task in tasks]),
-        num_leaves=rows([task.graph.num_end_states for task in tasks]),
-        reward_fn=rows([reward_fns.index(task.reward_fn) for task in tasks]),
-        goal_reward=rows([task.goal_reward for task in tasks], torch.float32),
-        fail_reward=rows([task.fail_reward for task in tasks], torch.float32),
-        step_reward=rows([task.step_reward for task in tasks], torch.float32),
-        reward_std=rows([task.reward_std for task in tasks], torch.float32),
-        multiplicative=rows([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
-        change_first=rows([first for first, _ in changes]),
-        change_last=rows([last for _, last in changes]),
-        legacy_change=rows([task.legacy_goal_change and change[0] > 0 for task, change in pairs], torch.bool),
+        depth=each([task.graph.depth for task in tasks]),
+        num_leaves=each([task.graph.num_end_states for task in tasks]),
+        reward_fn=each([reward_fns.index(task.reward_fn) for task in tasks]),
+        goal_reward=each([task.goal_reward for task in tasks], torch.float32),
+        fail_reward=each([task.fail_reward for task in tasks], torch.float32),
+        step_reward=each([task.step_reward for task in tasks], torch.float32),
+        reward_std=each([task.reward_std for task in tasks], torch.float32),
+        multiplicative=each([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
+        change_first=each([first for first, _ in changes]),
+        change_last=each([last for _, last in changes]),
+        legacy_change=each([task.legacy_goal_change and change[0] > 0 for task, change in pairs], torch.bool),
     )
 
 

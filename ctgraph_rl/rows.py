@@ -25,6 +25,7 @@ from ctgraph_rl.dynamics import (
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import white_level
 from ctgraph_rl.params import make_params, shared_bank
+from ctgraph_rl.switch import Switch
 from ctgraph_rl.task import Task
 
 T = TypeVar("T")
@@ -64,6 +65,11 @@ class Rows(nn.Module):
     episodes_left: Tensor
     reward: Tensor
     paid: Tensor
+    task: Tensor
+    choice: Tensor
+    episodes: Tensor
+    tasks_change: bool
+    """Whether rows go over to other tasks where they start episodes."""
 
     def __init__(
         self,
@@ -83,7 +89,8 @@ class Rows(nn.Module):
             (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
         )
         super().__init__()
-        self._pool = frozenset(pool)
+        self.pool = pool
+        self._number = {task: number for number, task in enumerate(pool)}
         self.max_branching = max(task.graph.branching_factor for task in pool)
         bank = shared_bank(pool, self.num_rows)
         no_images = bank.images.new_empty(0, *bank.shape)
@@ -100,6 +107,8 @@ class Rows(nn.Module):
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field in RowState._fields:
             self.register_buffer(field, zeros.to(_STATE_DTYPES.get(field, torch.int64), copy=True))
+        for field in _PLACES:
+            self.register_buffer(field, zeros.clone())
         self._stock: _Stock | None = None
         self._now: Words | None = None
         self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
@@ -121,35 +130,110 @@ class Rows(nn.Module):
         self._stock = self._now = None
         self._buffers.update(zip(RowState._fields, state, strict=True))
 
-    def set_tasks(self, tasks: Iterable[Task]) -> None:
-        """Give every row a task, in place. All episodes end: `reset` before the next step.
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """The task of each row."""
+        return tuple(self.pool[number] for number in self.task.tolist())
+
+    def set_tasks(self, tasks: Iterable[Task], at_episode_end: bool = False) -> None:
+        """Give every row a task, in place.
 
         Args:
             tasks: one task of the pool per row.
+            at_episode_end: every row ends its episode first, and has the new task from its next reset on. False: all
+                episodes end at once: `reset` before the next step.
 
         Raises:
             ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
         """
-        tasks = require_all(Task, "tasks", tasks)
-        different = tuple(dict.fromkeys(tasks))
-        unknown = [task for task in different if task not in self._pool]
-        n = self.num_rows
-        require(
-            (len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"),
-            (not unknown, f"set_tasks got tasks that are not in task_pool: {unknown[:3]}; name them at construction"),
-        )
-        self.tasks = tasks
-        number = {task: i for i, task in enumerate(different)}
-        index = torch.tensor([number[task] for task in self.tasks], device=self.device)
+        tasks, n = require_all(Task, "tasks", tasks), self.num_rows
+        require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
+        self._plan(self._numbers(tasks), None, None, at_episode_end)
 
-        def rows(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
-            return torch.tensor(values, dtype=dtype, device=self.device).index_select(0, index)
+    def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
+        """Let the rows change between tasks from episode to episode, all of them beginning with the first.
 
-        tree, x, g, self.uses = make_params(different, rows, self._bank, self._noise_bank)
-        self.params = self._row_params(tree, x, g)
-        self._task_goals = rows([task.goal_leaf for task in different])
+        Args:
+            tasks: at least two tasks of the pool.
+            switch: decides the task of each episode; its clock starts now.
+            at_episode_end: as in `set_tasks`.
+
+        Raises:
+            ValueError: for less than two tasks, or one that is not in the pool.
+        """
+        choices = self._numbers(require_all(Task, "tasks", tasks))
+        require((len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"))
+        self._plan(choices[:1].expand(self.num_rows).clone(), choices, switch, at_episode_end)
+
+    def _numbers(self, tasks: tuple[Task, ...]) -> Tensor:
+        """Where tasks stand in the pool, int64."""
+        unknown = [task for task in dict.fromkeys(tasks) if task not in self._number]
+        message = f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"
+        require((not unknown, message))
+        return torch.tensor([self._number[task] for task in tasks], device=self.device)
+
+    def _plan(self, start: Tensor, choices: Tensor | None, switch: Switch | None, at_episode_end: bool) -> None:
+        """Which tasks the rows have from now on, or from their next episodes on."""
+        self._first, self._choices, self._switch = start, choices, switch
+        self.choice, self.episodes = torch.zeros_like(start), torch.zeros_like(start)
+        self.tasks_change = at_episode_end or switch is not None
+        if not at_episode_end:
+            self.task = start
+        self._make_params()
         self._stock = self._now = None
-        self._begin()
+        if not at_episode_end:
+            self._begin()
+
+    def _make_params(self) -> None:
+        """The parameters of all tasks that the rows have or may go over to, and of each row."""
+        parts = [self.task, self._first] if self._choices is None else [self.task, self._first, self._choices]
+        self._in_use = torch.cat(parts).unique()
+        different = tuple(self.pool[number] for number in self._in_use.tolist())
+
+        def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
+            return torch.tensor(values, dtype=dtype, device=self.device)
+
+        *tables, self.uses = make_params(different, each, self._bank, self._noise_bank)
+        self._tables = tuple(tables)
+        self._goals = each([task.goal_leaf for task in different])
+        self._take_params()
+
+    def _take_params(self) -> None:
+        """Each row's parameters, from those of its task."""
+        index = torch.searchsorted(self._in_use, self.task)
+        self.params = self._row_params(*(of_rows(part, index) for part in self._tables))
+        self._task_goals = self._goals.index_select(0, index)
+
+    def _start_episodes(self, mask: Tensor | None) -> None:
+        """Before the rows of a mask, or all, start an episode: go over to the tasks that are planned for them.
+
+        Only while a change is planned; the host then waits for the device.
+        """
+        if not self.tasks_change:
+            return
+        mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
+        begun = self.episodes + mask
+        planned = self._first if self._switch is None else self._switched(self._switch, begun)
+        task = torch.where(mask, planned, self.task)
+        changed, self.task, self.episodes = task != self.task, task, begun
+        if changed.any():
+            self._take_params()
+            self.goal_leaf = torch.where(changed, self._task_goals, self.goal_leaf)
+            self.episodes_left = torch.where(changed, 0, self.episodes_left)
+        self.tasks_change = self._switch is not None or bool((begun == 0).any())
+
+    def _switched(self, switch: Switch, begun: Tensor) -> Tensor:
+        """The pool's numbers of the tasks that a switch has for rows that have begun so many episodes."""
+        assert self._choices is not None
+        if switch.together:
+            clock, past = ((count.sum() // self.num_rows - 1).expand_as(count) for count in (begun, self.episodes))
+            place = self.seed[:1], self.row[:1], self.tick.amax(0, keepdim=True)
+        else:
+            clock, past, place = begun - 1, self.episodes - 1, (self.seed, self.row, self.tick)
+        words = philox.draw(*place, philox.STREAM_TASK)
+        following = switch.next_task(self.choice, clock, len(self._choices), words)
+        self.choice = torch.where((clock > past) & (clock > 0), following, self.choice)
+        return self._choices.index_select(0, self.choice)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
@@ -191,12 +275,15 @@ class Rows(nn.Module):
         self.seed, self.row = seed.clone(), row.clone()
         self.tick = torch.zeros_like(self.row)
         self._stock = self._now = None
+        if self.tasks_change:
+            self._plan(self._first, self._choices, self._switch, at_episode_end=False)
         self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
         self._begin()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
+        self._start_episodes(mask)
         words = self._draw(self.tick + mask)
         return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
 
@@ -217,6 +304,7 @@ class Rows(nn.Module):
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
+        self._start_episodes(mask)
         words = self._draw_next()
         return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
 
@@ -226,6 +314,7 @@ class Rows(nn.Module):
 
     def restart(self, mask: Tensor | None = None) -> Tensor:
         """`reset` of all rows, or of all finished ones, the mask: what all rows observe."""
+        self._start_episodes(mask)
         words = self._draw(self.tick + (1 if mask is None else mask))
         return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
 
@@ -312,24 +401,25 @@ class Rows(nn.Module):
         """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
         self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
         self.seed, self.row = self.seed.clone(), self.row.clone()
+        for field in _PLACES:
+            setattr(self, field, getattr(self, field).clone())
         super()._load_from_state_dict(*args, **kwargs)
-        self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
+        self.tasks_change = self._switch is not None or bool((self.task != self._first).any())
+        self._make_params()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
         """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
         self._stock = self._now = None
-        old = self.params
 
         def moved(part: Any) -> Any:
             if isinstance(part, tuple):
-                return tuple(map(moved, part))
+                return type(part)(*map(moved, part)) if hasattr(part, "_fields") else tuple(map(moved, part))
             return fn(part) if isinstance(part, Tensor) else part
 
-        legacy = old.x.legacy and LegacyIndex(*moved(old.x.legacy))
-        x = ObservationParams(*moved(old.x))._replace(legacy=legacy)
-        self._task_goals = fn(self._task_goals)
-        self.params = self._row_params(TreeParams(*moved(old.tree)), x, RewardParams(*moved(old.g)))
+        for name in ("_first", "_choices", "_in_use", "_goals", "_tables"):
+            setattr(self, name, moved(getattr(self, name)))
+        self._take_params()
         return self
 
     def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
@@ -355,6 +445,29 @@ class _Stock:
         pairs = zip(self._words, self._used, strict=False)
         return tuple(word.take(index) if used else index for word, used in pairs)  # what has no use is any tensor
 
+
+def of_rows(part: Any, index: Tensor) -> Any:
+    """Parameters of rows from those of their tasks; what is a table of all tasks stays one."""
+    rows = {}
+    for name, value in part._asdict().items():
+        if isinstance(value, LegacyIndex):
+            rows[name] = of_rows(value, index)
+        elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
+            rows[name] = value.index_select(0, index)
+    return part._replace(**rows)
+
+
+_TABLES: dict[type, tuple[str, ...]] = {
+    TreeParams: ("next_kind", "decides"),
+    ObservationParams: ("first_view", "views_per_node", "num_ids"),
+    LegacyIndex: ("num_ids",),
+    RewardParams: (),
+}
+"""What has not one entry for each task."""
+
+_PLACES = ("task", "choice", "episodes")
+"""Where each row is among the tasks: its task's number in the pool, its place among those that it changes between, and
+the episodes that it has begun since the last change of plan; int64."""
 
 MAX_STOCK = 2**14
 MAX_STOCK_TICKS = 256

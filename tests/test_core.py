@@ -140,7 +140,9 @@ def test_a_state_is_a_copy():
 def test_a_checkpoint_is_a_few_integers_per_row_without_images():
     state = make_env().state_dict()
 
-    assert set(state) == {f"rows.{name}" for name in (*dynamics.RowState._fields, "seed", "row")}
+    assert set(state) == {
+        f"rows.{name}" for name in (*dynamics.RowState._fields, "seed", "row", "task", "choice", "episodes")
+    }
     assert all(value.numel() in (1, 6) for value in state.values())
 
 

@@ -481,7 +481,7 @@ def test_set_tasks_ends_all_episodes():
 @pytest.mark.parametrize(
     ("tasks", "message"),
     [
-        ([FORKS[0], surjective(2, 3)], "set_tasks got tasks that are not in task_pool: .*name them at construction"),
+        ([FORKS[0], surjective(2, 3)], "tasks must be in task_pool, got .*name them at construction"),
         ([FORKS[0]], "set_tasks needs one task per row, 2 in all, got 1"),
         ([FORKS[0]] * 3, "set_tasks needs one task per row, 2 in all, got 3"),
         ([], "tasks must be a list with at least one Task, got none"),
@@ -498,7 +498,7 @@ def test_a_refused_set_tasks_leaves_the_environment_as_it_was():
     env = CTGraphEnv(FORKS[:2])
     env.reset()
 
-    with pytest.raises(ValueError, match="not in task_pool"):
+    with pytest.raises(ValueError, match="must be in task_pool"):
         env.set_tasks(FORKS[2:])
 
     assert env.tasks == tuple(FORKS[:2])
@@ -510,7 +510,7 @@ def test_a_refused_set_tasks_leaves_the_environment_as_it_was():
     [
         ({"tasks": []}, "tasks must be a list with at least one Task, got none"),
         ({"task_pool": []}, "task_pool"),
-        ({"task_pool": FORKS[1:]}, "set_tasks got tasks that are not in task_pool"),
+        ({"task_pool": FORKS[1:]}, "tasks must be in task_pool"),
         ({"seed": -1}, r"seed must be an integer in \[0, 2\*\*63\), got -1"),
         ({"seed": 2**63}, r"seed must be an integer in \[0, 2\*\*63\), got 9223372036854775808"),
         ({"seed": 0.5}, r"seed must be an integer in \[0, 2\*\*63\), got 0\.5"),

@@ -357,7 +357,7 @@ def test_a_configuration_file_of_the_authors_makes_an_environment(tmp_path):
         ({"one_hot": True, "task": "CT-FO-B1"}, "no field of .*: one_hot"),
         ({"task": one_hot(), "image_seed": 1}, "image_seed needs generated images, got OneHot"),
         ({"render_mode": "human"}, "render_mode must be None or one of"),
-        ({"task_pool": [surjective()]}, "tasks that are not in task_pool"),
+        ({"task_pool": [surjective()]}, "tasks must be in task_pool"),
     ],
 )
 def test_wrong_arguments_are_refused(arguments, message):

@@ -64,7 +64,7 @@ class Scripted:
     def initial_state(self, num_envs: int) -> TensorDict:
         return TensorDict(batch_size=[num_envs])
 
-    def start_task(self) -> None:
+    def start_task(self, task=None) -> None:
         self.events.append("start")
 
     def end_task(self) -> None:

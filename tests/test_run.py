@@ -181,7 +181,7 @@ def test_only_a_changed_curriculum_is_named_modified(compose):
 
 REFUSED = [
     (["curriculum=su_b2"], ["Could not find 'curriculum/su_b2'", "su_b1_4tasks"]),
-    (["agent=ppo"], ["Could not find 'agent/ppo'", "dqn", "lstm_ppo"]),
+    (["agent=sarsa"], ["Could not find 'agent/sarsa'", "dqn", "lstm_ppo"]),
     (["sed=1"], ["sed", "Choices: ", "seed", "num_threads", "overwrite"]),
     (["agent.hidden=8"], ["hidden", "Choices: ", "hidden_size", "num_envs"]),
     (["+agent.foo=1"], ["agent has no foo", "Choices: ", "hidden_size"]),
