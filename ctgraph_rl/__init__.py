@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
+    from ctgraph_rl.recorder import Recorder as Recorder
     from ctgraph_rl.reference import ReferenceImages as ReferenceImages
     from ctgraph_rl.reference import ReferenceOneHot as ReferenceOneHot
     from ctgraph_rl.rewards import Gradient as Gradient
@@ -51,6 +52,7 @@ _HOMES = {
     "ImageFile": "images",
     "Gradient": "rewards",
     "Needle": "rewards",
+    "Recorder": "recorder",
     "ReferenceImages": "reference",
     "ReferenceLinear": "rewards",
     "ReferenceOneHot": "reference",

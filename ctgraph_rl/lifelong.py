@@ -304,41 +304,35 @@ class Examiner:
 
     def examine(self, agent: Agent, frames: int) -> None:
         """Evaluate the agent if an evaluation is due after ``frames`` frames of the run."""
-        tasks = self.examined(frames)
+        moment = self.curriculum.moment(frames)
+        if moment is not None:
+            self.evaluate(self._policy(agent, self.examined(frames)), frames, moment, agent.initial_state)
+
+    def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
+        """Evaluate a policy after ``frames`` frames and write one line for each task."""
+        tasks, curriculum = self.examined(frames), self.curriculum
         if not tasks:
             return
-        how = self.curriculum.evaluation
+        how = curriculum.evaluation
         result = evaluate(
-            self._policy(agent, tasks),
+            policy,
             list(tasks),
             how.num_episodes,
-            self.seed_at(frames),
+            derive_seed(self.seed, "evaluation", frames),
             how.greedy,
-            agent.initial_state,
+            initial_state,
             self.device,
             how.episodes_per_row,
-            self.curriculum,
+            curriculum,
         )
-        self.record(frames, result)
-
-    def seed_at(self, frames: int) -> int:
-        """The seed of the evaluation after ``frames`` frames."""
-        return derive_seed(self.seed, "evaluation", frames)
-
-    def record(self, frames: int, result: TensorDict) -> None:
-        """Write the ends of the episodes, [tasks, episodes, 1], to the log."""
-        curriculum = self.curriculum
-        for (number, label), episodes in zip(self.examined(frames).values(), result, strict=True):
-            held_out = number > len(curriculum.tasks)
+        for (number, label), episodes in zip(tasks.values(), result, strict=True):
             where = {"block": curriculum.block_at(frames), "frames": frames, "task": number, "label": label}
-            moment = curriculum.moment(frames)
+            held_out = number > len(curriculum.tasks)
             self.log.append("evaluation", moment=moment, **where, held_out=held_out, **episode_means(episodes))
 
     def examined(self, frames: int) -> dict[Task, tuple[int, str]]:
-        """The tasks that are to be evaluated after ``frames`` frames, with their numbers and labels; often none."""
+        """The tasks that an evaluation after ``frames`` frames is of, with their numbers and labels."""
         curriculum = self.curriculum
-        if curriculum.moment(frames) is None:
-            return {}
         held_out = curriculum.evaluation.held_out
         named = dict(zip((*curriculum.tasks, *held_out), enumerate(curriculum.evaluated_labels, 1), strict=True))
         if curriculum.evaluation.tasks == "all":
@@ -351,10 +345,10 @@ class Examiner:
         if self.curriculum.protocol.task_id != "at_boundaries":
             return agent.policy
         ids = self.curriculum.task_ids
-        return _by_slices([agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
+        return by_slices([agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
 
 
-def _by_slices(policies: Sequence[Policy]) -> Policy:
+def by_slices(policies: Sequence[Policy]) -> Policy:
     """A policy that gives each of as many equal slices of the rows to one of the policies."""
 
     def act(data: TensorDictBase) -> TensorDictBase:

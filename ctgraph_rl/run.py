@@ -9,7 +9,6 @@ import hashlib
 import json
 import logging
 import os
-import platform
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -146,25 +145,25 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     import torch
 
     from ctgraph_rl import metrics
-    from ctgraph_rl.env import CTGraphEnv
-    from ctgraph_rl.lifelong import check_rows, learn_curriculum
+    from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
     from ctgraph_rl.log import RunLog, write_metrics, write_performance
     from ctgraph_rl.progress import ProgressBar
+    from ctgraph_rl.provenance import provenance
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)
     torch.manual_seed(cfg.seed)
-    curriculum = named(target(cfg, "curriculum")())
-    env = CTGraphEnv(curriculum.tasks)
+    curriculum = named(with_changes(target(cfg, "curriculum")(), cfg))
+    env = make_env(curriculum, curriculum.tasks, cfg.seed)
     agent = target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched).to(device)
     check_rows(curriculum, agent.num_envs)
     for name in RESULTS:
         (run_dir / name).unlink(missing_ok=True)
     write_configuration(cfg, run_dir / ".hydra")
     log = RunLog(run_dir / "run.jsonl")
-    log.append("run", **about(cfg, curriculum))
+    log.append("run", **provenance(curriculum), config=plain(cfg))
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames) as progress:
         learn_curriculum(curriculum, agent, cfg.seed, log, progress, device)
     log.close()
@@ -223,32 +222,24 @@ def named(curriculum: Curriculum) -> Curriculum:
     return replace(curriculum, name=f"{curriculum.name} (modified)")
 
 
-def about(cfg: DictConfig, curriculum: Curriculum) -> dict[str, Any]:
-    """What the first line of the log says: all that the numbers depend on."""
-    import tensordict
-    import torch
-    import torchrl
+def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
+    """The curriculum with what ``evaluation`` and ``protocol`` of the configuration change; null leaves a value.
 
-    from ctgraph_rl import __version__
-    from ctgraph_rl.log import SCHEMA
+    Raises:
+        ValueError: for values out of range.
+    """
+    from ctgraph_rl.curriculum import Protocol
 
-    return {
-        "schema": SCHEMA,
-        "curriculum": curriculum.name,
-        "version": curriculum.version,
-        "fingerprint": curriculum.fingerprint,
-        "source": curriculum.source,
-        "config": plain(cfg),
-        "versions": {
-            "ctgraph_rl": __version__,
-            "torch": torch.__version__,
-            "torchrl": torchrl.__version__,
-            "tensordict": tensordict.__version__,
-            "python": platform.python_version(),
-        },
-        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
-        "num_threads": torch.get_num_threads(),
-    }
+    evaluation, protocol = (
+        {key: value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
+        for part in ("evaluation", "protocol")
+    )
+    told = curriculum.protocol
+    if protocol.get("task_id") == "hidden":
+        told = Protocol(boundaries=told.boundaries)  # the ids go with the telling
+    return replace(
+        curriculum, evaluation=replace(curriculum.evaluation, **evaluation), protocol=replace(told, **protocol)
+    )
 
 
 def explain(error: BaseException) -> str:

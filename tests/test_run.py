@@ -72,7 +72,15 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
     assert first["kind"] == "run"
     assert (first["curriculum"], first["version"]) == ("su_b1_4tasks (modified)", published.version)
     assert first["fingerprint"] == curricula.su_b1_4tasks(num_frames=1024).fingerprint != published.fingerprint
-    assert set(first["config"]) == {"curriculum", "agent", "seed", "device", "num_threads"}
+    assert set(first["config"]) == {
+        "curriculum",
+        "agent",
+        "seed",
+        "device",
+        "num_threads",
+        "evaluation",
+        "protocol",
+    }
     assert first["config"]["curriculum"]["num_frames"] == 1024
     assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}
     assert (first["num_threads"], first["schema"]) == (1, 1)

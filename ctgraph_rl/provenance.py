@@ -1,0 +1,36 @@
+"""What a run's numbers depend on, for the first line of its log."""
+
+from __future__ import annotations
+
+import platform
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ctgraph_rl.curriculum import Curriculum
+
+
+def provenance(curriculum: Curriculum) -> dict[str, Any]:
+    """Curriculum, versions and machine; plain values for JSON."""
+    import tensordict
+    import torch
+    import torchrl
+
+    from ctgraph_rl import __version__
+    from ctgraph_rl.log import SCHEMA
+
+    return {
+        "schema": SCHEMA,
+        "curriculum": curriculum.name,
+        "version": curriculum.version,
+        "fingerprint": curriculum.fingerprint,
+        "source": curriculum.source,
+        "versions": {
+            "ctgraph_rl": __version__,
+            "torch": torch.__version__,
+            "torchrl": torchrl.__version__,
+            "tensordict": tensordict.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
+        "num_threads": torch.get_num_threads(),
+    }
