@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
-    """Curriculum, versions and machine; plain values for JSON."""
+    """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
     import tensordict
     import torch
     import torchrl
@@ -24,6 +24,8 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
         "version": curriculum.version,
         "fingerprint": curriculum.fingerprint,
         "source": curriculum.source,
+        "tasks": list(curriculum.labels),
+        "trained": [[number + 1 for number in block] for block in curriculum.trained],
         "versions": {
             "ctgraph_rl": __version__,
             "torch": torch.__version__,

@@ -167,7 +167,7 @@ def adapt(policy: Any, greedy: bool) -> Policy:
         ValueError: for what is no policy.
     """
     if isinstance(policy, TensorDictModuleBase | type):
-        return policy  # type: ignore[return-value]
+        return policy
     if hasattr(policy, "predict"):
         predict = policy.predict
         return _NumpyPolicy(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))

@@ -231,7 +231,7 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     from ctgraph_rl.curriculum import Protocol
 
     evaluation, protocol = (
-        {key: value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
+        {str(key): value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
         for part in ("evaluation", "protocol")
     )
     told = curriculum.protocol
