@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from itertools import accumulate
 from typing import Any
@@ -311,6 +311,34 @@ class Curriculum:
     def trained(self) -> tuple[tuple[int, ...], ...]:
         """For each block, the positions in ``tasks`` of the tasks that it trains."""
         return tuple(tuple(self.tasks.index(task) for task in dict.fromkeys(block.tasks)) for block in self.blocks)
+
+    def to_json(self, path: str | PathLike[str] | None = None) -> dict[str, Any]:
+        """This curriculum as JSON with every field written out; see `ctgraph_rl.exchange`.
+
+        Args:
+            path: where to write the file; None: nowhere.
+
+        Raises:
+            ValueError: for a file that exists, and rewards, image sets or switches that are not of this package.
+        """
+        from ctgraph_rl.exchange import write_curriculum
+
+        return write_curriculum(self, path)
+
+    @classmethod
+    def from_json(cls, path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Curriculum:
+        """The curriculum that `to_json` wrote. Only types of this package are made.
+
+        Args:
+            path_or_dict: the file, or its content.
+
+        Raises:
+            ValueError: for a file that cannot be read or is too large, another fingerprint than the file states, keys
+                that are missing or unknown, and values out of range; names the file and the key.
+        """
+        from ctgraph_rl.exchange import read_curriculum
+
+        return read_curriculum(path_or_dict)
 
     @property
     def fingerprint(self) -> str:

@@ -277,12 +277,20 @@ def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
         if name not in whole
     ]
     surplus = [
-        _surplus(section, key, dialect) for section in whole for key in content[section] if (section, key) not in wanted
+        _surplus(section, key, dialect)
+        for section in whole
+        for key in content[section]
+        if (section, key) not in wanted and not _says_nothing(section, key, content)
     ]
     missing = [
         f"{section}.{key} is missing" for section, key in wanted if section in whole and key not in content[section]
     ]
     return [*unknown, *no_section, *surplus, *missing]
+
+
+def _says_nothing(section: str, key: str, content: Mapping[str, Any]) -> bool:
+    """Files of 2023 may keep the older switch of reward noise; without noise it has no meaning."""
+    return (section, key) == ("reward", "stochastic_sampling") and content["reward"].get("std_r") == 0
 
 
 def _surplus(section: str, key: str, dialect: str) -> str:

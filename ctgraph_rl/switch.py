@@ -23,8 +23,10 @@ MOST_EPISODES = 2**31
 class Switch(Protocol):
     """Which task comes next. A user's own is a frozen dataclass with these members."""
 
-    together: bool
-    """All rows change by one clock and one draw; False: each row by its own."""
+    @property
+    def together(self) -> bool:
+        """All rows change by one clock and one draw; False: each row by its own."""
+        ...
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """The positions in the block of the tasks of the episodes that start now; tensors of one shape.
@@ -65,7 +67,7 @@ class AtRandom:
     A task lasts 1 / ``prob`` episodes in the mean.
 
     Args:
-        prob: in (0, 1].
+        prob: in (0, 1]; below 2**-32 it never changes.
         together: all rows change at once.
     """
 
@@ -75,6 +77,7 @@ class AtRandom:
     def __post_init__(self) -> None:
         holds = is_real(self.prob, 0, 1) and self.prob > 0
         require((holds, f"prob must be in (0, 1], got {self.prob!r}"), _together_rule(self.together))
+        object.__setattr__(self, "prob", float(self.prob))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""
@@ -103,6 +106,12 @@ class Drift:
         """See `Switch`."""
         is_next = randint(words[0], self.episodes) < clock % self.episodes
         return (clock // self.episodes + is_next).clamp_max(num_tasks - 1)
+
+
+def switch_rule(switch: object) -> tuple[bool, str]:
+    """The rule for switches, a user's own among them."""
+    holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)
+    return holds, f"switch must be one such as Drift(100), got {switch!r}"
 
 
 def _episodes_rule(episodes: object) -> tuple[bool, str]:

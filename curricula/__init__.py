@@ -1,31 +1,79 @@
-"""Named task sequences that a paper can cite; importable without Hydra, torchrl or a configuration file."""
+"""Named task sequences that a paper can cite; importable without Hydra, torchrl or a configuration file.
+
+``curricula.load("ct8")`` and ``curricula.ct8()`` are the curriculum as published; both take arguments that change it,
+such as ``num_frames``. `names` lists all. ``curricula.axes`` has what own sequences are made of.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from difflib import get_close_matches
+from functools import cache
+from importlib import import_module
+from inspect import getdoc, signature
+from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.curriculum import Curriculum
-from curricula.paper import su_b1_4tasks
+if TYPE_CHECKING:
+    from ctgraph_rl.curriculum import Curriculum
 
-__all__ = ["load", "names", "su_b1_4tasks"]
+_MODULES = ("adaptation", "masks", "nested", "paper", "sharing")
+"""Each has a table ``NAMED`` of its curricula by name."""
 
-_CURRICULA: dict[str, Callable[[], Curriculum]] = {function.__name__: function for function in (su_b1_4tasks,)}
+_HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "axes"}
+
+__all__ = ["MISSING", "from_axes", "from_meta_json", "load", "names", "sequence", "summary"]
 
 
 def names() -> list[str]:
     """Names of all curricula."""
-    return sorted(_CURRICULA)
+    return sorted(_named())
 
 
-def load(name: str) -> Curriculum:
-    """A curriculum by name, as published.
+def load(name: str, **arguments: Any) -> Curriculum:
+    """A curriculum by name, as published unless arguments change it.
+
+    Raises:
+        ValueError: for an unknown name or argument; lists the choices.
+    """
+    function = _function(name)
+    choices = list(signature(function).parameters)
+    unknown = [argument for argument in arguments if argument not in choices]
+    if unknown:
+        raise ValueError(f"{name} has no {', '.join(unknown)}. Choices: {', '.join(choices)}")
+    return function(**arguments)
+
+
+def summary(name: str) -> str:
+    """What a curriculum is, in a sentence.
 
     Raises:
         ValueError: for an unknown name; lists the choices.
     """
-    if name not in _CURRICULA:
-        near = get_close_matches(name, names(), n=1)
+    function = _function(name)
+    return (getdoc(getattr(function, "func", function)) or "").split("\n")[0]
+
+
+def _function(name: str) -> Callable[..., Curriculum]:
+    if name not in _named():
+        near = get_close_matches(str(name), names(), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"unknown curriculum {name!r}{hint} Choices: {', '.join(names())}")
-    return _CURRICULA[name]()
+    return _named()[name]
+
+
+@cache
+def _named() -> dict[str, Callable[..., Curriculum]]:
+    tables = (import_module(f"curricula.{module}").NAMED for module in _MODULES)
+    return {name: function for table in tables for name, function in table.items()}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"curricula.{_HOMES[name]}"), name)
+    if name.startswith("_") or name not in _named():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _named()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *names()])

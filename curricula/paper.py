@@ -1,25 +1,226 @@
 """Curricula over the configurations of the CT-graph paper.
 
-Soltoggio et al. 2023 (arXiv 2302.10887), section on lifelong learning.
+Soltoggio et al. 2023 (arXiv 2302.10887). Its section on lifelong learning names ways in which tasks can differ: the
+location of the goal, the depth of the graph, the distribution of inputs, and which features vary and which do not. A
+function here is one way, for any of the five baseline configurations: ``su_b1_4tasks`` is `goal_location` of CT-SU-B1.
+The paper gives neither orders nor budgets nor sizes of variations: all of these are choices of this package.
 """
 
 from __future__ import annotations
 
-from itertools import product
+from dataclasses import replace
+from functools import partial
 
-from ctgraph_rl.curriculum import Block, Curriculum
-from ctgraph_rl.paper import ct_su_b1
+from ctgraph_rl.checks import require
+from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.graph import CTGraph
+from ctgraph_rl.images import GroupedImages
+from ctgraph_rl.observations import Observations
+from ctgraph_rl.paper import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, ct_su_b1
+from ctgraph_rl.rewards import Gradient
+from ctgraph_rl.task import Task
+from curricula.axes import (
+    OneOrMore,
+    all_goals,
+    growing_depth,
+    image_seeds,
+    new_images,
+    observability,
+    random_goals,
+    reshaped,
+    sequence,
+)
 
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
+KINDS = {
+    "fo_b1": "full",
+    "fo_b2": "full",
+    "su_b1": "surjective",
+    "co_b1": "confounding",
+    "posr_b1": "surjective",
+}
+"""How each configuration shows its states; see `curricula.axes.observability`."""
 
-def su_b1_4tasks(num_frames: int = 204_800, image_seed: int = 1) -> Curriculum:
-    """The four goals of CT-SU-B1 one after the other, in lexicographic order: (1,1), (1,2), (2,1), (2,2).
+DEPTHS = (2, 3, 4, 5)
+DEEPEST_GOAL = (1, 2, 1, 2, 2)
+NUM_VARIATIONS = 4
+FRAMES = 204_800
+
+
+def configured(configuration: str, image_seed: int = 1) -> Task:
+    """The task of a configuration such as ``su_b1``, its goal at the first branches.
+
+    Raises:
+        ValueError: for an unknown configuration; lists the choices.
+    """
+    require((configuration in KINDS, f"configuration must be one of {', '.join(KINDS)}, got {configuration!r}"))
+    return CONFIGURATIONS[f"CT-{configuration.replace('_', '-').upper()}"](image_seed=image_seed)
+
+
+def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """All goals of one graph one after the other, in lexicographic order: does a new goal overwrite the old one?
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+    """
+    tasks = all_goals(configured(configuration, image_seed))
+    return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames)
+
+
+def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """Depth 2 to 5 with nested goals: is a path reused whose end is the way to the next goal?
+
+    The goal of the deepest graph is (1, 2, 1, 2, 2), and each shallower goal is the beginning of it. All graphs use
+    the deepest one's images, so that no image changes its role.
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+    """
+    task = configured(configuration, image_seed)
+    deepest = reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
+    return _curriculum(f"{configuration}_depth2to5", growing_depth(deepest, DEPTHS), num_frames)
+
+
+def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """One graph and one goal, shown through four image sets: is the same decision found behind other inputs?
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the first image set; the others have the next three.
+    """
+    tasks = image_seeds(configured(configuration), _seeds(image_seed))
+    return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames)
+
+
+def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """Four tasks with nothing in common but the shape of the graph: each has its own goal and image set.
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the first image set; the others have the next three. It also draws the goals.
+    """
+    shown = image_seeds(configured(configuration), _seeds(image_seed))
+    goals = random_goals(shown[0], NUM_VARIATIONS, image_seed)
+    tasks = [replace(task, goal=other.goal) for task, other in zip(shown, goals, strict=True)]
+    return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames)
+
+
+def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """One goal; decision states get new images with each task, all others keep theirs: variant features.
+
+    What was learned of wait states stays right, so only decisions have to be learned anew.
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+    """
+    tasks = new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("decision",))
+    return _curriculum(f"{configuration}_new_decisions", tasks, num_frames)
+
+
+def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """One goal; wait states get new images with each task, all others keep theirs: variant features.
+
+    What was learned of decisions stays right, so only waiting has to be learned anew.
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+    """
+    tasks = new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("wait",))
+    return _curriculum(f"{configuration}_new_waits", tasks, num_frames)
+
+
+def fo_b2_gradient(num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """The eight goals of CT-FO-B2 with gradient rewards: every end state pays by its distance from the goal.
 
     Args:
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    goals = product((1, 2), repeat=2)
-    blocks = tuple(Block((ct_su_b1(goal, image_seed),), num_frames) for goal in goals)
-    return Curriculum("su_b1_4tasks", 1, PAPER, blocks)
+    task = replace(ct_fo_b2(image_seed=image_seed), reward_fn=Gradient())
+    return _curriculum("fo_b2_gradient", all_goals(task), num_frames)
+
+
+def fo_b1_noisy(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float = 0.5) -> Curriculum:
+    """The four goals of CT-FO-B1 with noisy rewards: end states pay a draw from N(c, reward_std).
+
+    Args:
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+        reward_std: standard deviation of what end states pay.
+    """
+    task = replace(ct_fo_b1(image_seed=image_seed), reward_std=reward_std)
+    return _curriculum("fo_b1_noisy", all_goals(task), num_frames)
+
+
+def stochastic_grouped(
+    num_frames: int = FRAMES, image_seed: int = 1, group_size: int = 10, within: float = 0.1, between: float = 0.3
+) -> Curriculum:
+    """The four goals of a fully stochastic graph, b=2, d=2, p=0: all five kinds of states draw images from groups.
+
+    Each observation of a kind of state is one of its group's images, similar to each other and less so to others.
+
+    Args:
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+        group_size: images of each kind of state.
+        within: expected distance of images of one group; see `GroupedImages`.
+        between: expected distance of images of different groups.
+    """
+    images = GroupedImages((group_size,) * 5, within, between, image_seed)
+    names = ("home_ids", "fail_ids", "decision_ids", "wait_ids", "end_ids")
+    ids = {name: (i * group_size, (i + 1) * group_size - 1) for i, name in enumerate(names)}
+    task = Task(CTGraph(2, 2), (1, 1), Observations(**ids), images)  # type: ignore[arg-type]
+    return _curriculum("stochastic_grouped", all_goals(task), num_frames)
+
+
+def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_images: int = 500) -> Curriculum:
+    """The four goals of the hardest confounding graph that the paper compares learners on: p=0.9, 500 wait images.
+
+    The comparison is that of Ladosz et al. 2021, whose configuration was not published; b=2 and d=2 as CT-CO-B1.
+
+    Args:
+        num_frames: frames per task; an episode without fail takes 33 frames in the mean.
+        image_seed: seed of the image set that all tasks share.
+        num_wait_images: images that wait states draw from.
+    """
+    task = replace(ct_su_b1(image_seed=image_seed), graph=CTGraph(2, 2, 0.9))
+    tasks = all_goals(observability(task, ["confounding"], num_wait_images))
+    return _curriculum("co_hard_4tasks", tasks, num_frames)
+
+
+def _seeds(first: int) -> range:
+    return range(first, first + NUM_VARIATIONS)
+
+
+def _curriculum(name: str, tasks: OneOrMore, num_frames: int) -> Curriculum:
+    return sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, 1, PAPER)
+
+
+WAYS = {
+    "depth2to5": depth_growth,
+    f"{NUM_VARIATIONS}images": input_variation,
+    "uncorrelated": uncorrelated,
+    "new_decisions": new_decisions,
+    "new_waits": new_waits,
+}
+
+NAMED = {
+    **{f"{name}_{'8' if name == 'fo_b2' else '4'}tasks": partial(goal_location, name) for name in KINDS},
+    **{f"{name}_{way}": partial(function, name) for way, function in WAYS.items() for name in KINDS},
+    "fo_b2_gradient": fo_b2_gradient,
+    "fo_b1_noisy": fo_b1_noisy,
+    "stochastic_grouped": stochastic_grouped,
+    "co_hard_4tasks": co_hard_4tasks,
+}
+"""The curricula of this module by name."""

@@ -42,7 +42,8 @@ def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(whe
     assert "ctgraph_rl/conf/config.yaml" in conf
     assert code | conf | {"ctgraph_rl/py.typed"} <= found
     rest = {name for name in found - code - conf if ".dist-info/" not in name}
-    assert rest <= {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
+    typed = {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
+    assert rest <= {*typed, "curricula/fingerprints.json"}
 
 
 def test_the_wheel_declares_version_licence_and_console_script(wheel):
@@ -55,7 +56,7 @@ def test_the_wheel_declares_version_licence_and_console_script(wheel):
 
     assert (metadata["Name"], metadata["Version"]) == ("ctgraph_rl", ctgraph_rl.__version__)
     assert metadata["License-Expression"] == "Apache-2.0"
-    assert dict(scripts["console_scripts"]) == {"ctgraph-rl": "ctgraph_rl.run:main"}
+    assert dict(scripts["console_scripts"]) == {"ctgraph-rl": "ctgraph_rl.cli:main"}
 
 
 def test_the_wheel_runs_from_an_empty_directory_and_writes_only_under_runs(wheel, tmp_path):

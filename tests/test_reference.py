@@ -286,6 +286,14 @@ def test_the_file_of_2021_changes_the_goal_every_5000_episodes():
     )
 
 
+def test_the_older_switch_of_reward_noise_is_read_over_where_there_is_none():
+    plain = Task.from_json(changed(SHIPPED_2023, reward__std_r=0), goal=(1, 1))
+
+    for switch in (False, True):
+        file = changed(SHIPPED_2023, reward__std_r=0, reward__stochastic_sampling=switch)
+        assert Task.from_json(file, goal=(1, 1)) == plain
+
+
 def test_the_shipped_file_of_2023_has_rotations_below_ten_degrees_and_no_noise():
     task = Task.from_json(SHIPPED_2023, goal=[1, 1])
 
@@ -455,7 +463,7 @@ def test_every_missing_key_is_named_with_its_section(year):
         ),
         (
             "2023",
-            {"reward__stochastic_sampling": False},
+            {"reward__stochastic_sampling": False, "reward__std_r": 0.1},
             r"reward\.stochastic_sampling is of the 2019 dialect, the other keys of the 2023 one: leave it out",
         ),
         (

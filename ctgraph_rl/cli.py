@@ -1,0 +1,35 @@
+"""The console script ``ctgraph-rl``: a first word chooses a command, settings alone start a run."""
+
+from __future__ import annotations
+
+import sys
+from difflib import get_close_matches
+from importlib import import_module
+
+COMMANDS = {"curricula": "curricula.__main__", "report": "ctgraph_rl.report", "export": "ctgraph_rl.export"}
+"""Commands and the modules whose ``main`` they are; each is imported when it is called."""
+
+
+def main() -> None:
+    """``ctgraph-rl curricula|report|export ...``; anything else is for `ctgraph_rl.run`."""
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    if word in COMMANDS:
+        _require_ours(COMMANDS[word])
+        sys.argv = [f"ctgraph-rl {word}", *sys.argv[2:]]
+        import_module(COMMANDS[word]).main()
+    elif word.isidentifier():  # settings have a sign: seed=1, ~logger, -m
+        near = [f"; did you mean {match!r}?" for match in get_close_matches(word, COMMANDS, 1)]
+        choices = f"Commands: {', '.join(COMMANDS)}; or settings of a run, such as seed=1"
+        sys.exit(f"error: unknown command {word!r}{''.join(near)} {choices}")
+    else:
+        import_module("ctgraph_rl.run").main()
+
+
+def _require_ours(module: str) -> None:
+    """Refuse a package of the working directory that has the name of ours."""
+    if module.startswith("ctgraph_rl."):
+        return
+    try:
+        import_module("ctgraph_rl.run").check_packages()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

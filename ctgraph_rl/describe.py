@@ -1,0 +1,329 @@
+"""What a reader wants to know of a curriculum before any run, as tables for the terminal, Markdown and LaTeX.
+
+``python -m curricula`` lists all, ``python -m curricula describe NAME`` describes one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ctgraph_rl.checks import positive, require
+from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.exchange import bank_bytes
+from ctgraph_rl.task import Task
+
+FRAMES_PER_SECOND = 18_000
+"""What the LSTM-PPO agent of this package learns from on one core, roughly; for estimates of time."""
+
+UNKNOWN = "-"
+
+LISTED = {"name": "l", "version": "r", "tasks": "r", "frames": "r", "fingerprint": "l", "source": "l"}
+
+DEFINITIONS = (
+    "P_R: probability that a uniformly random policy over the b + 1 actions reaches the goal in an episode.",
+    "E[rho]: mean steps of an episode that gets to an end state, of a policy that waits when it must.",
+    "random frames: mean frames of the uniformly random policy until it reaches the goal for the first time, failed "
+    "episodes included.",
+    "ceiling: the best mean return of a policy without memory, deterministic and stochastic.",
+)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table in no particular format.
+
+    Args:
+        title: a line above it.
+        columns: the columns' names, each with ``l`` or ``r`` for its alignment.
+        rows: texts, one for each column.
+        notes: lines below it.
+    """
+
+    title: str
+    columns: Mapping[str, str]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+def random_episode_length(task: Task) -> float:
+    """Mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
+
+    A wait state takes (b + 1) / (b + 1 - p) steps and is left for what it leads to with probability
+    w = (1 - p) / (b + 1 - p); a decision state leads on with probability c = b / (b + 1). Hence
+
+        1 + (b + 1) / (b + 1 - p) sum_{k=0..d} (w c)^k + w sum_{k=0..d-1} (w c)^k,
+
+    and w (w c)^d more with an ``extra_end_step``. Correctly rounded, for the float that ``wait_prob`` is.
+    """
+    return float(_random_episode_length(task))
+
+
+def random_frames_to_goal(task: Task) -> float:
+    """Mean frames of the same policy until it first reaches the goal, that step included; failed episodes count.
+
+    Episodes are independent, so this is `random_episode_length` over P_R (Wald's identity), less the step after the
+    goal with an ``extra_end_step``. A goal that changes alters nothing, as the policy prefers none. inf beyond floats.
+    """
+    frames = _random_episode_length(task) / task.graph._exact_reward_prob_random - task.extra_end_step
+    try:
+        return float(frames)
+    except OverflowError:
+        return math.inf
+
+
+def _random_episode_length(task: Task) -> Fraction:
+    b, d, p = task.graph.branching_factor, task.graph.depth, Fraction(task.graph.wait_prob)
+    wait, leaves = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p)
+    reached = [(leaves * b / (b + 1)) ** k for k in range(d + 1)]
+    return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
+
+
+def memory(curriculum: Curriculum) -> tuple[int, int]:
+    """Bytes of the image bank of a curriculum's tasks, and of each row: two observations, as a step holds."""
+    one = max(math.prod(task.images.shape) for task in curriculum.tasks)
+    return bank_bytes(curriculum.tasks), 2 * one
+
+
+def describe(curriculum: Curriculum, frames_per_second: float = FRAMES_PER_SECOND) -> list[Sheet]:
+    """The curriculum at large, its blocks and its tasks.
+
+    Args:
+        curriculum: any curriculum.
+        frames_per_second: the rate that the estimated time is for.
+
+    Raises:
+        ValueError: for a rate that is not above 0.
+    """
+    require(*positive(frames_per_second=frames_per_second))
+    return [_overview(curriculum, frames_per_second), _blocks(curriculum), _task_numbers(curriculum)]
+
+
+def _overview(curriculum: Curriculum, frames_per_second: float) -> Sheet:
+    bank, per_row = memory(curriculum)
+    time = f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s, an estimate"
+    rows = {
+        "version": str(curriculum.version),
+        "fingerprint": curriculum.fingerprint,
+        "source": curriculum.source,
+        "blocks": f"{len(curriculum.blocks):,}",
+        "tasks": f"{len(curriculum.tasks):,}",
+        "frames": f"{curriculum.num_frames:,}",
+        "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
+        "evaluation": evaluation_in_words(curriculum.evaluation),
+        "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
+        "time": f"{time} without evaluations",
+    }
+    return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))
+
+
+def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
+    """What the learner is told."""
+    told = {
+        "hidden": "The learner is not told its task.",
+        "one_hot": f"Every observation comes with a one-hot task id of length {protocol.length(num_tasks)}.",
+        "at_boundaries": "The learner is given the task's id where a block begins and where it is evaluated.",
+    }
+    boundaries = {
+        "announced": "A new block ends all episodes, and the learner is told.",
+        "hidden": "A row goes over to the next block when its episode ends, and nobody is told.",
+    }
+    return f"{told[protocol.task_id]} {boundaries[protocol.boundaries]}"
+
+
+def evaluation_in_words(evaluation: Evaluation) -> str:
+    """When and how performance is measured."""
+    how = "greedy" if evaluation.greedy else "sampled"
+    in_row = f", {evaluation.episodes_per_row} in a row" if evaluation.episodes_per_row > 1 else ""
+    moments = [
+        *(["before training"] if evaluation.before else []),
+        *([f"every {evaluation.every:,} frames"] if evaluation.every else []),
+        *(["at block ends"] if evaluation.at_block_ends else []),
+    ]
+    held_out = f" and {len(evaluation.held_out)} held out" if evaluation.held_out else ""
+    which = {"all": "all tasks", "seen": "the tasks seen so far"}[evaluation.tasks]
+    episodes = f"{evaluation.num_episodes} {how} episodes{in_row}"
+    return f"{episodes} on each of {which}{held_out}: {', '.join(moments)}."
+
+
+def _blocks(curriculum: Curriculum) -> Sheet:
+    columns = {"block": "r", "task": "l", "b": "r", "d": "r", "p": "r", "goal": "l", "frames": "r"}
+    switches = any(block.switch is not None for block in curriculum.blocks)
+    labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
+    rows = [row for number, block in enumerate(curriculum.blocks, 1) for row in _block_rows(number, block, labels)]
+    shown = rows if switches else [row[:-1] for row in rows]
+    return Sheet("Blocks", columns | ({"switch": "l"} if switches else {}), tuple(shown))
+
+
+def _block_rows(number: int, block: Block, labels: Mapping[Task, str]) -> Iterator[tuple[str, ...]]:
+    """A row for each different task; what is of the whole block stands in the first."""
+    frames, switch = f"{block.num_frames:,}", "" if block.switch is None else repr(block.switch)
+    for i, task in enumerate(dict.fromkeys(block.tasks)):
+        graph, of_block = task.graph, (str(number), frames, switch) if i == 0 else ("", "", "")
+        shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
+        yield of_block[0], labels[task], *shape, ".".join(map(str, task.goal)), *of_block[1:]
+
+
+def _task_numbers(curriculum: Curriculum) -> Sheet:
+    columns = {"task": "l", "P_R": "r", "E[rho]": "r", "random frames": "r", "ceiling det.": "r", "ceiling stoch.": "r"}
+    rows = []
+    reasons: dict[str, None] = {}
+    for task, label in zip(curriculum.tasks, curriculum.labels, strict=True):
+        ceilings, reason = _ceilings(task)
+        reasons[reason] = None
+        graph = task.graph
+        closed = (graph.reward_prob_random, graph.expected_episode_length, random_frames_to_goal(task))
+        rows.append((label, *map(_number, closed), *ceilings))
+    unknown = tuple(f"{UNKNOWN}: {reason}" for reason in reasons if reason)
+    return Sheet("Tasks", columns, tuple(rows), (*DEFINITIONS, *unknown))
+
+
+def _ceilings(task: Task) -> tuple[list[str], str]:
+    """The ceilings of deterministic and of stochastic policies, or why they are not known."""
+    try:
+        return [_number(task.memoryless_ceiling(deterministic)) for deterministic in (True, False)], ""
+    except ValueError as error:
+        return [UNKNOWN, UNKNOWN], str(error)
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if 1e4 <= value < 1e7 else f"{value:.4g}"
+
+
+def _duration(seconds: float) -> str:
+    units = {"days": 86_400, "hours": 3600, "minutes": 60}
+    unit, size = next(((unit, size) for unit, size in units.items() if seconds >= 2 * size), ("seconds", 1))
+    return f"{seconds / size:.3g} {unit}"
+
+
+def listing(curricula: Iterable[Curriculum]) -> Sheet:
+    """Name, version, tasks, frames, fingerprint and source of each."""
+    rows = [
+        (c.name, str(c.version), f"{len(c.tasks):,}", f"{c.num_frames:,}", c.fingerprint, c.source) for c in curricula
+    ]
+    return Sheet("Curricula", LISTED, tuple(rows))
+
+
+def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
+    """Print a table on the terminal; into a pipe 200 characters wide."""
+    console = Console() if console is None else console
+    if not console.is_terminal:
+        console.width = 200
+    table = Table(title=Text(sheet.title), title_justify="left", caption_justify="left")
+    for i, (name, side) in enumerate(sheet.columns.items()):
+        table.add_column(Text(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
+    for row in sheet.rows:
+        table.add_row(*map(Text, row))
+    console.print(table)
+    for note in sheet.notes:
+        console.print(Text(note))
+
+
+def to_markdown(sheet: Sheet) -> str:
+    """A table in Markdown, with its title as a heading."""
+    sides = ["--:" if side == "r" else ":--" for side in sheet.columns.values()]
+    lines = ["| " + " | ".join(map(_markdown, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
+    notes = [line for note in sheet.notes for line in ("", f"{_markdown(note)}")]
+    return "\n".join([f"## {_markdown(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""])
+
+
+def _markdown(text: str) -> str:
+    """Text that Markdown shows as it is; underscores within words mean nothing there."""
+    return re.sub(r"([\\|`*<>\[\]])|(?<!\w)_|_(?!\w)", lambda found: "\\" + found[0], " ".join(text.split()))
+
+
+LATEX = {
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
+}
+MATHS = {"P_R": "$P_R$", "E[rho]": r"$E[\rho]$", "b": "$b$", "d": "$d$", "p": "$p$"}
+WIDE = 60
+"""Characters from which on a column of a LaTeX table is broken into lines."""
+
+
+def to_latex(sheet: Sheet) -> str:
+    """A table in LaTeX, for the package booktabs; title and notes as comments."""
+    sides = [_latex_side(i, side, sheet.rows) for i, side in enumerate(sheet.columns.values())]
+    header = " & ".join(MATHS.get(name, _latex(name)) for name in sheet.columns)
+    lines = [" & ".join(map(_latex, row)) + r" \\" for row in sheet.rows]
+    notes = [f"% {' '.join(line.split())}" for line in (sheet.title, *sheet.notes)]
+    begin, end = rf"\begin{{tabular}}{{{''.join(sides)}}}", r"\end{tabular}"
+    return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
+
+
+def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
+    return r"p{0.6\linewidth}" if any(len(row[column]) > WIDE for row in rows) else side
+
+
+def _latex(text: str) -> str:
+    return "".join(LATEX.get(character, character) for character in " ".join(text.split()))
+
+
+def _show(sheets: Sequence[Sheet], form: str) -> None:
+    if form == "text":
+        for sheet in sheets:
+            print_sheet(sheet)
+    else:
+        print("\n".join(map({"markdown": to_markdown, "latex": to_latex}[form], sheets)), end="")
+
+
+def main(
+    names: Callable[[], Sequence[str]],
+    load: Callable[[str], Curriculum],
+    prog: str | None = None,
+    argv: Sequence[str] | None = None,
+) -> None:
+    """The command line: list curricula, or describe one.
+
+    Args:
+        names: gives the names of all.
+        load: gives one by name.
+        prog: how the command is called; None: as the process is.
+        argv: its arguments; None: those of the process.
+    """
+    parser = _parser(prog)
+    arguments = parser.parse_args(argv)
+    try:
+        if arguments.command is None:
+            _show([listing(map(load, names()))], arguments.format)
+        else:
+            is_file = arguments.name.endswith(".json") or Path(arguments.name).is_file()
+            _describe(Curriculum.from_json(arguments.name) if is_file else load(arguments.name), arguments)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+
+
+def _parser(prog: str | None) -> argparse.ArgumentParser:
+    form = argparse.ArgumentParser(add_help=False)
+    form.add_argument("--format", choices=("text", "markdown", "latex"), default="text", help="default: text")
+    parser = argparse.ArgumentParser(prog=prog, description="List all curricula, or describe one.", parents=[form])
+    one = parser.add_subparsers(dest="command").add_parser("describe", help="describe one", parents=[form])
+    one.add_argument("name", help="a name of the list, or a curriculum as a JSON file")
+    one.add_argument("--frames-per-second", type=float, default=FRAMES_PER_SECOND, help="for the estimated time")
+    one.add_argument("--figure", type=Path, help="draw graphs and goals into this file (.png, .pdf, .svg)")
+    one.add_argument("--similarity", type=Path, help="draw how alike the tasks are into this file")
+    one.add_argument("--json", type=Path, help="write the curriculum into this file, a new one")
+    return parser
+
+
+def _describe(curriculum: Curriculum, arguments: argparse.Namespace) -> None:
+    from ctgraph_rl.draw import draw_graphs
+    from ctgraph_rl.similarity import draw_similarity
+
+    _show(describe(curriculum, arguments.frames_per_second), arguments.format)
+    if arguments.figure is not None:
+        draw_graphs(curriculum, arguments.figure)
+    if arguments.similarity is not None:
+        draw_similarity(curriculum, arguments.similarity)
+    if arguments.json is not None:
+        curriculum.to_json(arguments.json)

@@ -1,0 +1,88 @@
+"""Published sequences that test how fast a learner adapts to goals that change unannounced."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.curriculum import Curriculum, Evaluation, Protocol
+from ctgraph_rl.task import Task
+from curricula.axes import all_goals, cycle, given_goals, random_goals, sequence
+from curricula.published import environment, full_mdp, goal_of
+
+SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"
+PENN_A = "Ben-Iwhiwhu et al. 2020, GECCO; github.com/dlpbc/penn-a"
+NM = "Ben-Iwhiwhu et al. 2022, Neural Networks; github.com/dlpbc/nm-metarl"
+
+UNANNOUNCED = Protocol(boundaries="hidden")
+
+
+def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
+    """Statistical context detection: the four goals of a depth-2 graph in reverse order, twice, unannounced.
+
+    A stay is 750 iterations of 4 workers x 128 steps; a configuration file of the repository has 16 workers instead.
+    Episodes were cut at every iteration there, which is not done here. How the authors evaluated is not known: our
+    defaults.
+
+    Args:
+        num_frames: frames per stay.
+    """
+    goals = [goal_of(path) for path in ("11", "10", "01", "00")]
+    tasks = given_goals(full_mdp("00", 1, fail_reward=-0.1), goals)
+    return sequence("swoks_2x4", cycle(tasks, 2), num_frames, 1, SWOKS, UNANNOUNCED)
+
+
+def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 256, seed: int = 0) -> Curriculum:
+    """The goal swap of evolved neuromodulated networks: a goal, then unannounced another one, drawn uniformly.
+
+    There a trial had 100 episodes and the swap came at a random one of the episodes 35 to 65. Here each row plays a
+    trial, and the swap comes after the frames that 50 of the longest episodes take: frames, not episodes, are counted,
+    and the moment does not vary. An agent's fitness was the mean of 4 trials; how often to evaluate is our default.
+
+    Args:
+        num_frames: frames of each half, all rows together; None: 50 episodes of 2 d + 3 steps for each row.
+        depth: 2 or 3.
+        num_rows: trials side by side, for the default of ``num_frames``.
+        seed: draws the two goals.
+    """
+    require((depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"))
+    unique = (False, False)
+    config = environment(depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=unique)
+    tasks = random_goals(Task.from_json(config, (1,) * depth), 2, seed)
+    frames = 50 * _longest_episode(depth) * num_rows if num_frames is None else num_frames
+    return sequence("penn_a_swap", tasks, frames, 1, PENN_A, UNANNOUNCED)
+
+
+META_BATCHES = {2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}
+"""By depth: batches, tasks in a batch, episodes of a task before and again after its adaptation, test episodes."""
+
+
+def nm_uniform_goals(num_frames: int | None = None, depth: int = 2) -> Curriculum:
+    """The meta-learning tasks of the neuromodulated-context paper: a uniform random goal for each task.
+
+    The observations are vectors of a fully observable graph. A goal lasts as long as a task there: the episodes before
+    and after its adaptation; then the row draws another, the same one among them. Rows begin with all goals equally.
+    The authors count batches: the frames are what these would take with the longest episodes, a bound from above,
+    rounded up to a multiple of 512. A test has as many episodes of one goal as theirs has between adaptations, sampled.
+
+    Args:
+        num_frames: frames of all rows together; None: the bound.
+        depth: 2, 3 or 4.
+    """
+    require((depth in META_BATCHES, f"depth must be 2, 3 or 4, as published, got {depth!r}"))
+    batches, tasks_a_batch, episodes, test_episodes = META_BATCHES[depth]
+    task = full_mdp("0" * depth, 1, fail_reward=-0.01, one_hot=True)
+    tasks = all_goals(replace(task, goal_change=(2 * episodes, 2 * episodes)))
+    bound = batches * tasks_a_batch * 2 * episodes * _longest_episode(depth)
+    frames = -(-bound // 512) * 512 if num_frames is None else num_frames
+    evaluation = Evaluation(test_episodes, greedy=False, episodes_per_row=test_episodes)
+    return sequence("nm_uniform_goals", [tasks], frames, 1, NM, evaluation=evaluation)
+
+
+def _longest_episode(depth: int) -> int:
+    """Steps for p=0: home, a wait and a decision for each level, a wait, and the extra step at the end."""
+    return 2 * depth + 3
+
+
+NAMED = {f.__name__: f for f in (nm_uniform_goals, penn_a_swap, swoks_2x4)}
+"""The curricula of this module by name."""

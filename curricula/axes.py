@@ -1,0 +1,457 @@
+"""The axes along which tasks differ, and ways to put tasks in order.
+
+An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine by
+applying one to what another returns: ``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1,
+then every goal with those of seed 2. `product` writes the same as a list. `sequence` makes a `Curriculum` of tasks.
+
+Whatever is random comes from a seed through ``random.Random(seed).random()``, the one method whose numbers Python
+guarantees not to change between versions; no global generator is read or disturbed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, replace
+from math import prod
+from typing import Any
+
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.graph import CTGraph, StateType
+from ctgraph_rl.images import ImageSet, PaperImages
+from ctgraph_rl.observations import Observations
+from ctgraph_rl.switch import Switch
+from ctgraph_rl.task import Task
+
+Tasks = tuple[Task, ...]
+OneOrMore = Task | Iterable[Task]
+Axis = Callable[[Tasks], Tasks]
+
+MOST_TASKS = 100_000
+"""More tasks than this are refused before they are built."""
+
+OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
+MOVABLE = ("home", "fail", "wait", "decision", "end")
+
+
+# goal location
+
+
+def all_goals(tasks: OneOrMore) -> Tasks:
+    """Every goal of each task's graph, in lexicographic order."""
+    return goals_sharing(tasks, 0)
+
+
+def given_goals(tasks: OneOrMore, goals: Iterable[Sequence[int]]) -> Tasks:
+    """Each task with each of the goals.
+
+    Args:
+        tasks: a task or several.
+        goals: decisions in 1..b, as many as the graph is deep.
+    """
+    listed = as_tuple(goals)
+    if not isinstance(listed, tuple) or not listed:
+        raise ValueError(f"goals must be a list of goals such as [[1, 2], [2, 1]], got {goals!r}")
+    return _each(tasks, lambda task: [replace(task, goal=goal) for goal in listed])
+
+
+def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
+    """Every goal that shares its first decisions with the task's own, in lexicographic order.
+
+    Args:
+        tasks: a task or several.
+        num_decisions: k in 0..d; 0 gives all goals, d the task alone.
+    """
+
+    def vary(task: Task) -> Iterable[Task]:
+        b, d = task.graph.branching_factor, task.graph.depth
+        require((is_int(num_decisions, 0, d), f"num_decisions must be in 0..{d}, the depth, got {num_decisions!r}"))
+        _check_number(b ** (d - num_decisions))
+        ends = itertools.product(range(1, b + 1), repeat=d - num_decisions)
+        return (replace(task, goal=task.goal[:num_decisions] + end) for end in ends)
+
+    return _each(tasks, vary)
+
+
+def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
+    """Different goals drawn uniformly; the same ones for all tasks whose graphs have one shape.
+
+    Args:
+        tasks: a task or several.
+        num_goals: how many, at most b^d.
+        seed: an integer >= 0.
+    """
+
+    def vary(task: Task) -> list[Task]:
+        graph, generator = task.graph, _generator(seed)
+        _check_draws("num_goals", num_goals, graph.num_end_states)
+        return _different(num_goals, lambda: replace(task, goal=_random_goal(graph, generator)))
+
+    return _each(tasks, vary)
+
+
+# input distribution
+
+
+def image_seeds(tasks: OneOrMore, seeds: Iterable[int]) -> Tasks:
+    """Each task with the image sets of other seeds."""
+    listed = require_all(int, "seeds", seeds)
+
+    def vary(task: Task) -> list[Task]:
+        require((task.image_seed is not None, f"image seeds need generated images, got {task.images!r}"))
+        return [replace(task, images=replace(task.images, seed=seed)) for seed in listed]  # type: ignore[type-var]
+
+    return _each(tasks, vary)
+
+
+def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
+    """Each task with other image sets, such as ``ImageFile.of("digits.npy")``; all of one shape."""
+    listed = tuple(sets)
+    return _each(tasks, lambda task: [replace(task, images=images) for images in listed])
+
+
+def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = ("wait", "decision", "end")) -> Tasks:
+    """Each task with the images of some kinds of states moved to higher ids of the same image set.
+
+    Generated sets grow to the longest that is needed, for all shifts alike, and longer sets begin with shorter ones:
+    what is not moved looks the same in all tasks.
+
+    Args:
+        tasks: a task or several.
+        shifts: how far ids move; 0 is the task itself.
+        kinds: which states: some of home, fail, wait, decision and end.
+    """
+    listed, moved = require_all(int, "shifts", shifts), require_all(str, "kinds", kinds)
+    unknown = [kind for kind in moved if kind not in MOVABLE]
+    require((not unknown, f"kinds must be some of {', '.join(MOVABLE)}, got {', '.join(unknown)}"))
+
+    def vary(task: Task) -> list[Task]:
+        shown = [_shifted(task.observations, shift, moved) for shift in listed]
+        images = _with_room(task.images, max(observations.last_id for observations in shown) + 1)
+        return [replace(task, observations=observations, images=images) for observations in shown]
+
+    return _each(tasks, vary)
+
+
+def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decision",)) -> Tasks:
+    """Each task, and again with images never seen before for some kinds of states; the others keep theirs.
+
+    The paper's variant and invariant features: new decision images with shared wait images, or the other way round.
+
+    Args:
+        tasks: a task or several.
+        num_sets: how many sets of images, the task's own included.
+        kinds: the states whose images change.
+    """
+    require((is_int(num_sets, 1, MOST_TASKS), f"num_sets must be an integer >= 1, got {num_sets!r}"))
+
+    def vary(task: Task) -> Tasks:
+        ranges = [task.observations.ids(StateType[kind.upper()]) for kind in kinds if kind in MOVABLE]
+        first, last = min(ranges, default=(0, 0))[0], max((last for _, last in ranges), default=0)
+        start = task.observations.last_id + 1 - first
+        shifts = (0, *(start + i * (last - first + 1) for i in range(num_sets - 1)))
+        return shifted_ids(task, shifts, kinds)
+
+    return _each(tasks, vary)
+
+
+# shape
+
+
+def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) -> Tasks:
+    """The graph of each task cut to other depths, every one with the id ranges of the deepest: no image changes role.
+
+    Args:
+        tasks: the deepest graph with its goal, or several.
+        depths: each at most the graph's own.
+        nested: the goal at a depth is the first decisions of the task's goal, so a shallow goal is on the path of
+            every deeper one. False: its last decision is another one, so that no shallow goal is on a deeper path.
+    """
+    listed = require_all(int, "depths", depths)
+
+    def vary(task: Task) -> list[Task]:
+        deepest = task.graph.depth
+        bad = [depth for depth in listed if not is_int(depth, 1, deepest)]
+        require((not bad, f"depths must be in 1..{deepest}, the depth of the task, got {bad}; give a deeper task"))
+        return [_cut(task, depth, nested) for depth in listed]
+
+    return _each(tasks, vary)
+
+
+def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
+    """Each task with other branching factors; the task is the widest, whose id ranges serve all."""
+    listed = require_all(int, "factors", factors)
+
+    def vary(task: Task) -> list[Task]:
+        widest = task.graph.branching_factor
+        bad = [factor for factor in listed if not is_int(factor, 2, widest)]
+        require((not bad, f"factors must be in 2..{widest}, the task's own, got {bad}; give a wider task"))
+        return [replace(task, graph=replace(task.graph, branching_factor=factor)) for factor in listed]
+
+    return _each(tasks, vary)
+
+
+def wait_probs(tasks: OneOrMore, probs: Iterable[float]) -> Tasks:
+    """Each task with other wait probabilities, in [0, 1)."""
+    listed = tuple(probs)
+    return _each(tasks, lambda task: [replace(task, graph=replace(task.graph, wait_prob=p)) for p in listed])
+
+
+# observability
+
+
+def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int = 100) -> Tasks:
+    """Each task as more or less of its state is seen.
+
+    Args:
+        tasks: a task or several, with images for every id or a generated set, which gets the length it needs.
+        kinds: some of ``full``, an image for each state; ``decisions``, as full but one image for all wait states;
+            ``surjective``, one image for each kind of state; ``confounding``, as surjective but wait states draw one
+            of ``num_wait_images`` at every observation.
+        num_wait_images: for ``confounding``.
+    """
+    listed = require_all(str, "kinds", kinds)
+    return _each(tasks, lambda task: [reshaped(task, task.graph, kind, task.goal, num_wait_images) for kind in listed])
+
+
+def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wait_images: int = 100) -> Task:
+    """A task on another graph, observed in one of the ways of `observability`; all else stays."""
+    observations = _observations(graph, kind, num_wait_images)
+    images = _with_room(task.images, observations.last_id + 1, exact=True)
+    return replace(task, graph=graph, goal=tuple(goal), observations=observations, images=images)
+
+
+# random graphs
+
+
+def random_tasks(
+    num_tasks: int,
+    seed: int,
+    branching_factors: Sequence[int] = (2, 3),
+    depths: Sequence[int] = (2, 3, 4),
+    wait_probs: Sequence[float] = (0.0, 0.5),
+    kinds: Sequence[str] = ("full",),
+    image_seeds: Sequence[int] = tuple(range(1, 101)),
+) -> Tasks:
+    """Different tasks on random graphs: each choice is uniform and independent, then a uniform goal.
+
+    Args:
+        num_tasks: how many.
+        seed: an integer >= 0.
+        branching_factors: choices of b.
+        depths: choices of d.
+        wait_probs: choices of p.
+        kinds: choices of `observability`.
+        image_seeds: choices of the image seed.
+    """
+    choices: list[tuple[Any, ...]] = [
+        tuple(dict.fromkeys(c)) for c in (branching_factors, depths, wait_probs, kinds, image_seeds)
+    ]
+    require(
+        (
+            all(map(bool, choices)),
+            "branching_factors, depths, wait_probs, kinds and image_seeds need at least one choice each",
+        )
+    )
+    goals = sum(CTGraph(b, d).num_end_states for b, d in itertools.product(*choices[:2]))
+    _check_draws("num_tasks", num_tasks, goals * prod(map(len, choices[2:])))
+    generator = _generator(seed)
+    return tuple(_different(num_tasks, lambda: _random_task(choices, generator)))
+
+
+def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
+    """Tasks to train and tasks to hold out, drawn without replacement; both keep their order.
+
+    Args:
+        tasks: different tasks.
+        num_held_out: how many to hold out, fewer than there are.
+        seed: an integer >= 0.
+    """
+    everything = as_tasks(tasks)
+    count = len(everything)
+    require(
+        (is_int(num_held_out, 1, count - 1), f"num_held_out must be in 1..{count - 1}, got {num_held_out!r}"),
+        (len(set(everything)) == count, "tasks to split must differ, else a task is both trained and held out"),
+    )
+    held_out = set(_shuffled(range(count), seed)[:num_held_out])
+    rest = tuple(task for i, task in enumerate(everything) if i not in held_out)
+    return rest, tuple(everything[i] for i in sorted(held_out))
+
+
+# order
+
+
+def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
+    """Axes applied one after the other: the last one varies fastest."""
+    varied = as_tasks(tasks)
+    for axis in axes:
+        varied = axis(varied)
+    return varied
+
+
+def concatenate(*sequences: OneOrMore) -> Tasks:
+    """One sequence after the other."""
+    return tuple(task for tasks in sequences for task in as_tasks(tasks))
+
+
+def interleave(*sequences: OneOrMore) -> Tasks:
+    """The first task of each sequence, then the second of each; a sequence that has ended is left out."""
+    rounds = itertools.zip_longest(*map(as_tasks, sequences))
+    return tuple(task for turn in rounds for task in turn if task is not None)
+
+
+def repeat(tasks: OneOrMore, times: int) -> Tasks:
+    """Each task several times in a row: A A B B."""
+    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+    return _each(tasks, lambda task: [task] * times)
+
+
+def cycle(tasks: OneOrMore, times: int) -> Tasks:
+    """The whole sequence several times: A B A B."""
+    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+    return as_tasks(tasks) * times
+
+
+def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
+    """The tasks in an order drawn uniformly from a seed, an integer >= 0."""
+    return tuple(_shuffled(as_tasks(tasks), seed))
+
+
+def reverse(tasks: OneOrMore) -> Tasks:
+    """The last task first."""
+    return as_tasks(tasks)[::-1]
+
+
+# curriculum
+
+
+def sequence(
+    name: str,
+    tasks: Iterable[OneOrMore],
+    num_frames: int | Sequence[int],
+    version: int = 1,
+    source: str = "",
+    protocol: Protocol | None = None,
+    evaluation: Evaluation | None = None,
+    switch: Switch | None = None,
+) -> Curriculum:
+    """A curriculum with a block for each item.
+
+    Args:
+        name: name that a paper cites.
+        tasks: a task, or several that share a block, for each block.
+        num_frames: frames of every block, or a list with those of each.
+        version: raised when the content changes.
+        source: where the sequence comes from.
+        protocol: what the learner is told; None: no task ids, announced boundaries.
+        evaluation: how performance is measured; None: the defaults of `Evaluation`.
+        switch: how rows change between the tasks of a block.
+    """
+    items = [tasks] if isinstance(tasks, Task) else list(tasks)
+    frames = as_tuple(num_frames)
+    budgets = frames if isinstance(frames, tuple) else (num_frames,) * len(items)
+    require((len(budgets) == len(items), f"num_frames must be one for each of {len(items)} blocks, got {len(budgets)}"))
+    blocks = tuple(Block(as_tasks(item), n, switch) for item, n in zip(items, budgets, strict=True))
+    return Curriculum(name, version, source, blocks, evaluation or Evaluation(), protocol or Protocol())
+
+
+def as_tasks(tasks: OneOrMore) -> Tasks:
+    """A task or several as a tuple.
+
+    Raises:
+        ValueError: for anything else, and for no task.
+    """
+    return (tasks,) if isinstance(tasks, Task) else require_all(Task, "tasks", tasks)
+
+
+def _each(tasks: OneOrMore, vary: Callable[[Task], Iterable[Task]]) -> Tasks:
+    return tuple(varied for task in as_tasks(tasks) for varied in vary(task))
+
+
+def _check_number(count: int) -> None:
+    require((count <= MOST_TASKS, f"{count} tasks are too many: at most {MOST_TASKS}; use random_goals for a sample"))
+
+
+def _check_draws(name: str, wanted: object, available: int) -> None:
+    most = min(available, MOST_TASKS)
+    require((is_int(wanted, 1, most), f"{name} must be in 1..{most}, as many as differ, got {wanted!r}"))
+
+
+def _generator(seed: int) -> random.Random:
+    require((is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"))
+    return random.Random(seed)
+
+
+def _below(generator: random.Random, count: int) -> int:
+    """An integer in [0, count); for the small counts here, uniform to within 2**-36."""
+    return int(generator.random() * count)
+
+
+def _shuffled(items: Iterable[Any], seed: int) -> list[Any]:
+    shuffled, generator = list(items), _generator(seed)
+    for i in range(len(shuffled) - 1, 0, -1):
+        j = _below(generator, i + 1)
+        shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
+    return shuffled
+
+
+def _different(count: int, draw: Callable[[], Task]) -> list[Task]:
+    """Draws until enough are different."""
+    found: dict[Task, None] = {}
+    while len(found) < count:
+        found[draw()] = None
+    return list(found)
+
+
+def _random_goal(graph: CTGraph, generator: random.Random) -> tuple[int, ...]:
+    return tuple(1 + _below(generator, graph.branching_factor) for _ in range(graph.depth))
+
+
+def _random_task(choices: Sequence[Sequence[Any]], generator: random.Random) -> Task:
+    b, d, p, kind, seed = (choice[_below(generator, len(choice))] for choice in choices)
+    graph = CTGraph(b, d, p)
+    observations = _observations(graph, kind)
+    goal = _random_goal(graph, generator)
+    return Task(graph, goal, observations, PaperImages(observations.last_id + 1, seed))
+
+
+def _cut(task: Task, depth: int, nested: bool) -> Task:
+    goal = task.goal[:depth]
+    if not nested and depth < task.graph.depth:
+        goal = (*goal[:-1], goal[-1] % task.graph.branching_factor + 1)
+    return replace(task, graph=replace(task.graph, depth=depth), goal=goal)
+
+
+def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Observations:
+    ids: dict[str, Any] = {}
+    for kind in kinds:
+        first, last = observations.ids(StateType[kind.upper()])
+        ids[f"{kind}_ids"] = (first + shift, last + shift)
+    return replace(observations, **ids)
+
+
+def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageSet:
+    """A generated set of at least, or exactly, so many images; any other set as it is."""
+    settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
+    fits = images.num_images == num_images if exact else images.num_images >= num_images
+    return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore
+
+
+def _observations(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Observations:
+    """Ids from 2 on: waits, decisions and ends where states have images of their own, else decisions first."""
+    require(
+        (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
+        (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
+    )
+    unique = kind in ("full", "decisions")
+    waits = {"full": graph.num_wait_states, "confounding": num_wait_images}.get(kind, 1)
+    decisions, ends = (graph.num_decision_states, graph.num_end_states) if unique else (1, 1)
+    order = [("wait", waits), ("decision", decisions)] if unique else [("decision", decisions), ("wait", waits)]
+    ids: dict[str, Any] = {}
+    first = 2
+    for name, size in (*order, ("end", ends)):
+        ids[f"{name}_ids"] = (first, first + size - 1)
+        first += size
+    return Observations(**ids, unique_waits=kind == "full", unique_decisions=unique)

@@ -1,0 +1,146 @@
+"""A curriculum whose axes are plain arguments, so that a command line can set them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.switch import AtRandom, ByEpisode, Drift, Switch
+from ctgraph_rl.task import Task
+from curricula import axes
+from curricula.axes import Tasks
+from curricula.paper import KINDS, configured
+
+GOALS = ("all", "random", "nested")
+ORDERS = ("product", "interleave", "shuffle", "reverse")
+SWITCHES: dict[str, Callable[[int], Any]] = {
+    "by_episode": ByEpisode,
+    "at_random": lambda episodes: AtRandom(1 / episodes),
+    "drift": Drift,
+}
+
+
+def from_axes(
+    configuration: str = "su_b1",
+    branching_factor: int | None = None,
+    depth: int | Sequence[int] | None = None,
+    wait_prob: float | Sequence[float] | None = None,
+    image_seeds: int | Sequence[int] = 1,
+    goals: str | Sequence[Sequence[int]] = "all",
+    num_goals: int = 4,
+    order: str = "product",
+    repeats: int = 1,
+    seed: int = 0,
+    num_frames: int | Sequence[int] = 204_800,
+    switch: str | None = None,
+    switch_episodes: int = 100,
+    name: str = "axes",
+) -> Curriculum:
+    """Tasks that differ in goal, images, depth and wait probability, in a chosen order.
+
+    Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. What the learner
+    is told and how it is evaluated are not said here: a run has ``protocol`` and ``evaluation`` for any curriculum.
+
+    Args:
+        configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        branching_factor: another b; None: as configured.
+        depth: another d, or several: then all have the ids of the deepest graph. None: as configured.
+        wait_prob: another p, or several; None: as configured.
+        image_seeds: seed of the image set, or several.
+        goals: ``all``; ``random``, ``num_goals`` of each graph; ``nested``, one random goal of the deepest graph and
+            its beginnings at the other depths; or a list of goals, each for the graphs of its depth.
+        num_goals: for ``random``.
+        order: ``product``; ``interleave``, where image seeds take turns, or the graphs if there is one seed;
+            ``shuffle`` from the seed; or ``reverse``, the product from its end.
+        repeats: how often the whole sequence comes.
+        seed: draws random goals and the shuffled order.
+        num_frames: frames per block, or a list with those of each.
+        switch: None: a block for each task. Else one block with all tasks, between which each row changes: in turns of
+            ``switch_episodes`` (``by_episode``), with probability 1 / ``switch_episodes`` (``at_random``), or by
+            drifting from each task to the next in that many episodes (``drift``).
+        switch_episodes: for ``switch``.
+        name: of the curriculum.
+
+    Raises:
+        ValueError: for values out of range; lists the choices.
+    """
+    require((order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"))
+    task, depths = _deepest(configuration, branching_factor, depth)
+    _check_goals(goals, depths)
+    if goals == "nested":
+        (task,) = axes.random_goals(task, 1, seed)
+    probs = _several(task.graph.wait_prob if wait_prob is None else wait_prob)
+    by_seed = [
+        [
+            _with_goals(graph, goals, num_goals, seed)
+            for graph in axes.growing_depth(axes.wait_probs(shown, probs), depths)
+        ]
+        for shown in axes.image_seeds(task, _several(image_seeds))
+    ]
+    tasks = axes.cycle(_ordered(by_seed, order, seed), repeats)
+    changes = _switch(switch, switch_episodes)
+    return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
+
+
+def _deepest(configuration: str, branching_factor: int | None, depth: int | Sequence[int] | None) -> tuple[Task, tuple]:
+    """The configured task on its deepest graph, and all depths."""
+    task = configured(configuration)
+    depths = _several(task.graph.depth if depth is None else depth)
+    whole = bool(depths) and all(is_int(d, 1) for d in depths)
+    require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
+    b = task.graph.branching_factor if branching_factor is None else branching_factor
+    graph = replace(task.graph, branching_factor=b, depth=max(depths))
+    return axes.reshaped(task, graph, KINDS[configuration], (1,) * graph.depth), depths
+
+
+def _check_goals(goals: object, depths: tuple[int, ...]) -> None:
+    """Goals are named or listed, and the lengths of listed ones are the depths."""
+    if isinstance(goals, str):
+        require((goals in GOALS, f"goals must be one of {', '.join(GOALS)}, or a list of goals, got {goals!r}"))
+        return
+    listed = as_tuple(goals)
+    is_list = isinstance(listed, tuple) and all(isinstance(as_tuple(goal), tuple) for goal in listed)
+    require((is_list, f"goals must be one of {', '.join(GOALS)}, or a list such as [[1, 2]], got {goals!r}"))
+    lengths = {len(goal) for goal in listed}  # type: ignore[attr-defined]
+    rule = f"goals must have as many decisions as the depths, {sorted(set(depths))}, and some for each; got {goals!r}"
+    require((lengths == set(depths), rule))
+
+
+def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int, seed: int) -> Tasks:
+    """A graph with its goals."""
+    if isinstance(goals, str):
+        vary = {
+            "all": axes.all_goals,
+            "random": lambda graph: axes.random_goals(graph, num_goals, seed),
+            "nested": axes.as_tasks,
+        }
+        return vary[goals](task)
+    return axes.given_goals(task, [goal for goal in goals if len(goal) == task.graph.depth])
+
+
+def _ordered(by_seed: list[list[Tasks]], order: str, seed: int) -> Tasks:
+    """The tasks of each graph of each image seed in one order."""
+    sequences = [axes.concatenate(*graphs) for graphs in by_seed]
+    if order == "interleave":
+        return axes.interleave(*(sequences if len(sequences) > 1 else by_seed[0]))
+    tasks = axes.concatenate(*sequences)
+    if order == "shuffle":
+        return axes.shuffle(tasks, seed)
+    return axes.reverse(tasks) if order == "reverse" else tasks
+
+
+def _switch(switch: str | None, episodes: int) -> Switch | None:
+    known = switch is None or switch in SWITCHES
+    require(
+        (known, f"switch must be one of {', '.join(SWITCHES)}, or null, got {switch!r}"),
+        (is_int(episodes, 1), f"switch_episodes must be an integer >= 1, got {episodes!r}"),
+    )
+    return None if switch is None else SWITCHES[switch](episodes)
+
+
+def _several(value: object) -> tuple:
+    listed = as_tuple(value)
+    return listed if isinstance(listed, tuple) else (value,)

@@ -1,0 +1,67 @@
+"""The sequences of the modulating-masks paper and of the baselines that were compared with it.
+
+Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), repository dlpbc/mask-lrl, its data in anon-6994/mmn-lrl. Image seed 1
+and one image for all wait states throughout. A one-hot task id is part of the input of every method. PPO had 4 workers
+x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
+"""
+
+from __future__ import annotations
+
+from ctgraph_rl.curriculum import Curriculum
+from curricula.published import labelled, one_wait_image, pool_ids, words
+
+MASKS = "Ben-Iwhiwhu et al. 2023, arXiv 2212.11110; github.com/dlpbc/mask-lrl"
+BASELINES = "github.com/DMIU-ShELL/LRL-Baselines (2026)"
+
+
+def ct8(num_frames: int = 102_400) -> Curriculum:
+    """CT8: the eight goals of a depth-3 graph in lexicographic order.
+
+    Args:
+        num_frames: frames per task.
+    """
+    listing = "1:000 1:001 1:010 1:011 1:100 1:101 1:110 1:111"
+    return _curriculum("ct8", MASKS, listing, range(8), 8, num_frames)
+
+
+def ct12(num_frames: int = 102_400) -> Curriculum:
+    """CT12: the goals of a depth-2 and a depth-3 graph in turns, then the rest of the depth-3 graph.
+
+    Args:
+        num_frames: frames per task.
+    """
+    listing = "1:00 1:000 1:01 1:001 1:10 1:010 1:11 1:011 1:100 1:101 1:110 1:111"
+    return _curriculum("ct12", MASKS, listing, range(12), 12, num_frames)
+
+
+def ct8_md(num_frames: int = 102_400) -> Curriculum:
+    """CT8 multi-depth: the first two goals of depth 2, 3, 4 and 5; the ids are those of all 60 goals.
+
+    Args:
+        num_frames: frames per task.
+    """
+    listing = "1:00 1:01 1:000 1:001 1:0000 1:0001 1:00000 1:00001"
+    ids = pool_ids(words(listing), [(1, depth) for depth in range(2, 6)])
+    return _curriculum("ct8_md", MASKS, listing, ids, 60, num_frames)
+
+
+def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
+    """The interfering pair: the first and the last goal of a depth-3 graph, with no decision in common.
+
+    The budget is that of the launcher for elastic weight consolidation and synaptic intelligence.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _curriculum("ct2_interfering", BASELINES, "1:000 1:111", (0, 7), 8, num_frames)
+
+
+def _curriculum(
+    name: str, source: str, listing: str, ids: range | list[int] | tuple[int, ...], num_ids: int, num_frames: int
+) -> Curriculum:
+    tasks = tuple(one_wait_image(path, seed) for seed, path in words(listing))
+    return labelled(name, source, tasks, ids, num_ids, num_frames)
+
+
+NAMED = {f.__name__: f for f in (ct2_interfering, ct8, ct8_md, ct12)}
+"""The curricula of this module by name."""

@@ -1,0 +1,241 @@
+"""Curricula from the JSON files of the labs: a list of environments, and which of their goals in which order.
+
+The labs' wrappers number all goals of all environments and choose by number. ``config_paths`` names the environment
+files, relative to the file itself; ``task_order`` puts their goals one environment after the other (``default``) or in
+turns (``interleaved``); ``filter_tasks`` chooses from that list, in its own order, repeats allowed; ``num_tasks`` cuts
+what is chosen. The one-hot label of a task has length ``label_dim`` and is its number in the whole list, or, by
+``task_label_mode``, its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says (``explicit``).
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from itertools import accumulate
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as short
+from typing import Any
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.curriculum import Curriculum, Protocol
+from ctgraph_rl.reference import read_task
+from ctgraph_rl.task import Task
+from curricula.axes import MOST_TASKS, Tasks, sequence
+from curricula.published import one_id_each
+
+MOST_BYTES = 4 * 2**20
+MOST_NESTING = 8
+MOST_CONFIGS = 1000
+MOST_LABELS = 1_000_000
+
+REQUIRED = ("config_paths", "task_order", "label_dim", "one_hot")
+OPTIONAL = ("num_tasks", "filter_tasks", "task_label_mode", "label_by_curriculum_index", "task_label_ids")
+ORDERS = ("default", "interleaved")
+LABEL_MODES = ("global_task_id", "curriculum_index", "explicit")
+
+
+def from_meta_json(
+    path: str | PathLike[str],
+    num_frames: int | Sequence[int],
+    name: str | None = None,
+) -> Curriculum:
+    """The curriculum that a meta-JSON file describes, on environments as the authors' implementation has them.
+
+    The learner sees the labels as one-hot task ids; how performance is measured is our default, as the files have
+    neither that nor budgets. ``dataclasses.replace(curriculum, protocol=Protocol())`` hides the labels.
+
+    Args:
+        path: the meta-JSON file; its environment files may have the keys of 2019, 2021 or 2023.
+        num_frames: frames per task, or a list with those of each.
+        name: of the curriculum; None: that of the file.
+
+    Raises:
+        ValueError: names file and key, for files that cannot be read, are too large or too deeply nested, keys that
+            are missing or unknown, numbers out of range, and what cannot be reproduced (the order ``random``, labels
+            that are not one-hot).
+    """
+    file = Path(path)
+    meta = _read(file)
+    with _named(file):
+        require(*_key_rules(meta))
+        require(*_value_rules(meta))
+        environments = [read_environment(file.parent / config) for config in meta["config_paths"]]
+        pool = Pool([graph_goals(environment) for environment in environments], meta["task_order"])
+        numbers = _chosen(meta, pool.size)
+        tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
+        source = f"meta-JSON file {file.name}"
+        return sequence(name or file.stem, tasks, num_frames, 1, source, _labels(meta, tasks, numbers))
+
+
+class Pool:
+    """All goals of several environments, numbered in one of the orders.
+
+    Args:
+        sizes: number of goals of each environment.
+        order: ``default`` or ``interleaved``.
+    """
+
+    def __init__(self, sizes: Sequence[int], order: str) -> None:
+        self.size = sum(sizes)
+        self.at: Callable[[int], tuple[int, int]] = self._in_turns if order == "interleaved" else self._in_a_row
+        self._sizes = tuple(sizes)
+
+    def _in_a_row(self, number: int) -> tuple[int, int]:
+        """The environment and the goal of a number."""
+        starts = [0, *accumulate(self._sizes)]
+        config = bisect_right(starts, number) - 1
+        return config, number - starts[config]
+
+    def _in_turns(self, number: int) -> tuple[int, int]:
+        """The same where environments take turns; those without a further goal are left out."""
+        done = 0
+        for end in sorted(set(self._sizes)):
+            active = [config for config, size in enumerate(self._sizes) if size > done]
+            if number < len(active) * (end - done):
+                break
+            number -= len(active) * (end - done)
+            done = end
+        return active[number % len(active)], done + number // len(active)
+
+
+def read_environment(path: Path) -> dict[str, Any]:
+    """The arguments of `Task` for an environment file, its goal still missing."""
+    content = _read(path)
+    with _named(path):
+        return read_task(content, ())
+
+
+def graph_goals(environment: dict[str, Any]) -> int:
+    """The number of goals of an environment."""
+    return environment["graph"].num_end_states
+
+
+def _task(environment: dict[str, Any], leaf: int) -> Task:
+    graph = environment["graph"]
+    b = graph.branching_factor
+    goal = tuple(leaf // b**place % b + 1 for place in reversed(range(graph.depth)))
+    return Task(**{**environment, "goal": goal})
+
+
+def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
+    """The numbers of the tasks in the order of the curriculum."""
+    listed = meta.get("filter_tasks")
+    count = pool_size if listed is None else len(listed)
+    count = min(count, meta.get("num_tasks", count))
+    require((count <= MOST_TASKS, f"{count} tasks are too many, at most {MOST_TASKS}: use filter_tasks or num_tasks"))
+    numbers = list(range(count)) if listed is None else listed[:count]
+    outside = [number for number in numbers if number >= pool_size]
+    range_rule = f"filter_tasks must be in 0..{pool_size - 1}, the goals of config_paths, got {short(outside)}"
+    require((not outside, range_rule))
+    return numbers
+
+
+def _labels(meta: dict[str, Any], tasks: Tasks, numbers: list[int]) -> Protocol:
+    labels, length = _label_of_each(meta, numbers), meta["label_dim"]
+    require(
+        (len(labels) == len(tasks), f"task_label_ids must be one for each of {len(tasks)} tasks, got {len(labels)}"),
+        (max(labels) < length, f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}"),
+    )
+    ids = tuple(one_id_each(tasks, labels).values())
+    return Protocol("one_hot", num_task_ids=length, task_ids=ids)
+
+
+def _label_of_each(meta: dict[str, Any], numbers: list[int]) -> list[int]:
+    if "task_label_ids" in meta:
+        return meta["task_label_ids"]
+    by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
+    return list(range(len(numbers))) if by_place else numbers
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Raises:
+        ValueError: for anything else, and for more bytes or levels than such a file can need.
+    """
+    with _named(path):
+        try:
+            size = path.stat().st_size
+            require((size <= MOST_BYTES, f"must be at most {MOST_BYTES} bytes, got {size}"))
+            content = json.loads(path.read_bytes())
+        except OSError as error:
+            raise ValueError(f"must be a file that can be read: {error.strerror or error}") from error
+        except RecursionError as error:
+            raise ValueError(f"must be nested at most {MOST_NESTING} levels deep") from error
+        require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
+        require((_nesting(content) <= MOST_NESTING, f"must be nested at most {MOST_NESTING} levels deep"))
+    return content
+
+
+def _nesting(value: Any) -> int:
+    """The number of levels of lists and objects, counted up to one more than allowed."""
+    level, values = 0, [value]
+    while values and level <= MOST_NESTING:
+        nested = [v for v in values if isinstance(v, (list, dict))]
+        values = [item for v in nested for item in (v.values() if isinstance(v, dict) else v)]
+        level += bool(nested)
+    return level
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors begin with the file that they are about, the innermost of several."""
+    try:
+        yield
+    except ValueError as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"{path}: {error}") from error
+
+
+class FileError(ValueError):
+    """What is wrong with a file, its path in front."""
+
+
+def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
+    known = (*REQUIRED, *OPTIONAL)
+    unknown = [key for key in meta if key not in known]
+    near = [f"; did you mean {match!r}?" for key in unknown for match in get_close_matches(key, known, 1)]
+    missing = [key for key in REQUIRED if key not in meta]
+    return [
+        (not unknown, f"unknown key {short(unknown)}{''.join(near)} The keys are {', '.join(known)}"),
+        (not missing, f"missing key {', '.join(missing)}"),
+    ]
+
+
+def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
+    paths, order = meta["config_paths"], meta["task_order"]
+    mode = meta.get("task_label_mode", LABEL_MODES[0])
+    random_order = "; random is drawn from a global generator, so it cannot be reproduced" if order == "random" else ""
+    only_paths = isinstance(paths, list) and 1 <= len(paths) <= MOST_CONFIGS and all(isinstance(p, str) for p in paths)
+    in_turns = order != "interleaved" or (only_paths and len(paths) >= 2)
+    return [
+        (only_paths, f"config_paths must be a list of 1 to {MOST_CONFIGS} paths, got {short(paths)}"),
+        (order in ORDERS, f"task_order must be {' or '.join(ORDERS)}, got {short(order)}{random_order}"),
+        (in_turns, "task_order interleaved needs at least two config_paths"),
+        _int_rule("label_dim", meta["label_dim"], MOST_LABELS),
+        (meta["one_hot"] is True, f"one_hot must be true, got {short(meta['one_hot'])}; other labels are random there"),
+        _int_rule("num_tasks", meta.get("num_tasks", 1)),
+        _ints_rule("filter_tasks", meta.get("filter_tasks", [0])),
+        _ints_rule("task_label_ids", meta.get("task_label_ids", [0])),
+        (mode in LABEL_MODES, f"task_label_mode must be one of {', '.join(LABEL_MODES)}, got {short(mode)}"),
+        (mode != "explicit" or "task_label_ids" in meta, "task_label_mode explicit needs task_label_ids"),
+        (
+            isinstance(meta.get("label_by_curriculum_index", False), bool),
+            f"label_by_curriculum_index must be true or false, got {short(meta.get('label_by_curriculum_index'))}",
+        ),
+    ]
+
+
+def _int_rule(key: str, value: object, most: float = float("inf")) -> tuple[bool, str]:
+    limit = "" if most == float("inf") else f" and <= {most}"
+    return is_int(value, 1, most), f"{key} must be an integer >= 1{limit}, got {short(value)}"
+
+
+def _ints_rule(key: str, value: object) -> tuple[bool, str]:
+    holds = isinstance(value, list) and 1 <= len(value) <= MOST_TASKS and all(is_int(number, 0) for number in value)
+    return holds, f"{key} must be a list of 1 to {MOST_TASKS} integers >= 0, got {short(value)}"

@@ -1,0 +1,227 @@
+"""CT28 and its relatives: nested goals of growing depth on graphs with up to four image seeds.
+
+MaskSC and AMSC ("Lifelong Context-Aware Retrieval and Composition for Scalable Knowledge Reuse", 2026), LRL-Baselines
+(2026), MOSAIC (Nath et al. 2025, arXiv 2506.05577) and its predecessor; repositories under github.com/DMIU-ShELL. One
+image for all wait states. A task id is the number of the task among all goals of depth 2 to 11 of four image seeds.
+
+A family is one image seed and one path; its task at depth d has the first d decisions of the path. The fourth family
+exists twice: consistent, or skipping depth 5, so that its tasks have the depths 2, 3, 4, 6, 7, 8 and 9 in the groups of
+depth 2 to 8. Curricula with the latter are named ``..._skips_d5``.
+
+Single agents had 51,200 frames a task in the launchers, where the scripts' default is 102,400, and were evaluated as in
+`curricula.masks`. The launcher of AMSC hides the task ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.curriculum import Curriculum, Evaluation
+from curricula.published import MASK_EVALUATION, chosen, labelled, one_wait_image, pool_ids, words
+
+MASKSC = "github.com/DMIU-ShELL/MaskSC (2026)"
+AMSC = "github.com/DMIU-ShELL/AMSC (2026)"
+LRL = "github.com/DMIU-ShELL/LRL-Baselines (2026)"
+MOSAIC = "Nath et al. 2025, arXiv 2506.05577; github.com/DMIU-ShELL/MOSAIC"
+L2D2C = "github.com/DMIU-ShELL/L2D2-C"
+
+PATHS = {1: "01011010010", 2: "11010101101", 3: "00100110", 4: "10011100"}
+"""The consistent families; the first two go down to depth 11."""
+
+FOURTH_SKIPS_D5 = ["11", "110", "1101", "110111", "1101110", "11011100", "110111001"]
+
+SEED_SETS = {1: (1, 2, 3, 4), 2: (3, 4, 5, 6), 3: (5, 6, 7, 8), 4: (7, 8, 9, 10), 5: (9, 10, 11, 12)}
+"""The image seeds of the four families in each set of files."""
+
+Named = tuple[int, str]
+"""A task as (family, path)."""
+
+
+def ct28(num_frames: int = 51_200) -> Curriculum:
+    """CT28 interleaved: four families with nested goals, depth 2 to 8; at each depth one task of every family.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct28", MASKSC, _turns(*map(_family, (1, 2, 3, 4))), num_frames)
+
+
+def ct28_interleaved_skips_d5(num_frames: int = 51_200) -> Curriculum:
+    """CT28 interleaved as in an older file: its fourth family skips depth 5, an inconsistency.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct28_interleaved_skips_d5", MASKSC, _turns(*_inconsistent()), num_frames)
+
+
+def ct28_blocked_skips_d5(num_frames: int = 51_200, seed_set: int = 1) -> Curriculum:
+    """CT28 family after family; its fourth family skips depth 5, an inconsistency.
+
+    Args:
+        num_frames: frames per task.
+        seed_set: which of the five published sets of image seeds, 1..5.
+    """
+    return _single("ct28_blocked_skips_d5", LRL, [*chain(*_inconsistent())], num_frames, seed_set)
+
+
+def ct28_random_skips_d5(num_frames: int = 51_200) -> Curriculum:
+    """CT28 in one fixed random order; its fourth family skips depth 5, an inconsistency.
+
+    Args:
+        num_frames: frames per task.
+    """
+    listing = """3:001001 3:0010011 2:11010101 3:00100 1:01011 1:010 3:001 2:1101010 1:01 4:110111 4:11 2:110101
+        4:110111001 3:00 1:0101 2:110 4:1101 4:11011100 1:0101101 2:11 2:11010 3:00100110 2:1101 1:010110 4:110 3:0010
+        4:1101110 1:01011010"""
+    return _single("ct28_random_skips_d5", LRL, words(listing), num_frames)
+
+
+def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: int | None = None) -> Curriculum:
+    """CT28 of MOSAIC; its fourth family skips depth 5, an inconsistency.
+
+    There 28 agents that exchange what they know had one task each. Whether they saw task ids is not known. Fifty
+    episodes evaluated a task; when is not known, and greedy actions are our choice.
+
+    Args:
+        num_frames: frames per task.
+        seed_set: which of the five sets of image seeds, 1..5.
+        agent: the task of one agent alone, 0..27; None: all tasks one after the other, which is ours.
+    """
+    tasks = _of_agent([*chain(*_inconsistent())], agent)
+    return _curriculum("ct28_mosaic_skips_d5", MOSAIC, tasks, num_frames, seed_set, Evaluation(num_episodes=50))
+
+
+def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
+    """The first family of CT28 alone with image seed 9, depth 2 to 8; the published file is not valid JSON.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct28_one_branch", LRL, _family(1), num_frames, seed_set=5)
+
+
+def ct10(num_frames: int = 51_200) -> Curriculum:
+    """CT10: one family with nested goals, depth 2 to 11.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct10", LRL, _family(1, deepest=11), num_frames)
+
+
+def ct14_half_1(num_frames: int = 51_200) -> Curriculum:
+    """CT14, first half: the first family, depth 2 to 8.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct14_half_1", LRL, _family(1), num_frames)
+
+
+def ct14_half_2(num_frames: int = 51_200) -> Curriculum:
+    """CT14, second half: the second family, depth 2 to 8.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct14_half_2", LRL, _family(2), num_frames)
+
+
+def ct14_md(num_frames: int = 51_200) -> Curriculum:
+    """CT14 multi-depth: the first and the second family in turns, depth 2 to 8.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct14_md", LRL, _turns(_family(1), _family(2)), num_frames)
+
+
+def ct8_interleaved(num_frames: int = 51_200) -> Curriculum:
+    """CT8 interleaved: the first and the second family in turns, depth 2 to 5.
+
+    Args:
+        num_frames: frames per task.
+    """
+    return _single("ct8_interleaved", MASKSC, _turns(_family(1, deepest=5), _family(2, deepest=5)), num_frames)
+
+
+def ct29_recovery(num_frames: int = 51_200) -> Curriculum:
+    """CT29 recovery: three families in turns, then depth 8 of the fourth unprepared, its ladder, and depth 8 again.
+
+    Args:
+        num_frames: frames per task.
+    """
+    ladder = _family(4)
+    tasks = [*_turns(*map(_family, (1, 2, 3))), ladder[-1], *ladder]
+    return _single("ct29_recovery", AMSC, tasks, num_frames)
+
+
+def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
+    """CT20: two families with nested goals, depth 2 to 11, one after the other.
+
+    Twenty agents that exchange what they know had one task each. Which of several files the published results used is
+    not known; this is the one with 20 tasks. Nor is known when and how long tasks were evaluated: our defaults.
+
+    Args:
+        num_frames: frames per task.
+        agent: the task of one agent alone, 0..19; None: all tasks one after the other, which is ours.
+    """
+    everything = [*_family(1, deepest=11), *_family(2, deepest=11)]
+    tasks = _of_agent(everything, agent)
+    pool = [(family, depth) for family in (1, 2) for depth in range(2, 12)]
+    made = tuple(one_wait_image(path, family) for family, path in tasks)
+    return labelled("ct20", L2D2C, made, pool_ids(tasks, pool), 8184, num_frames, Evaluation())
+
+
+def _family(number: int, deepest: int = 8) -> list[Named]:
+    return [(number, PATHS[number][:depth]) for depth in range(2, deepest + 1)]
+
+
+def _inconsistent() -> list[list[Named]]:
+    return [*map(_family, (1, 2, 3)), [(4, path) for path in FOURTH_SKIPS_D5]]
+
+
+def _turns(*families: list[Named]) -> list[Named]:
+    return [*chain(*zip(*families, strict=True))]
+
+
+def _of_agent(tasks: list[Named], agent: int | None) -> list[Named]:
+    return tasks if agent is None else [chosen("agent", agent, tasks)]
+
+
+def _single(name: str, source: str, tasks: Sequence[Named], num_frames: int, seed_set: int = 1) -> Curriculum:
+    return _curriculum(name, source, tasks, num_frames, seed_set, MASK_EVALUATION)
+
+
+def _curriculum(
+    name: str, source: str, tasks: Sequence[Named], num_frames: int, seed_set: int, evaluation: Evaluation
+) -> Curriculum:
+    """Tasks with the ids, and the length of ids, that the files of a set of image seeds have."""
+    require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
+    ids = pool_ids(tasks, [(family, depth) for family in PATHS for depth in range(2, 12)])
+    made = tuple(one_wait_image(path, SEED_SETS[seed_set][family - 1]) for family, path in tasks)
+    return labelled(name, source, made, ids, 16_368 if seed_set == 1 else 16_370, num_frames, evaluation)
+
+
+NAMED = {
+    f.__name__: f
+    for f in (
+        ct8_interleaved,
+        ct10,
+        ct14_half_1,
+        ct14_half_2,
+        ct14_md,
+        ct20,
+        ct28,
+        ct28_blocked_skips_d5,
+        ct28_interleaved_skips_d5,
+        ct28_mosaic_skips_d5,
+        ct28_one_branch,
+        ct28_random_skips_d5,
+        ct29_recovery,
+    )
+}
+"""The curricula of this module by name."""

@@ -1,0 +1,239 @@
+"""What the published sequences share: the labs' environments, task ids and evaluation; and what cannot be recovered.
+
+The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal (2, 2, 1)
+with the images of seed 2. Environments are those of the authors' implementation, its switches on, as
+`Task.from_json` reads their files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.curriculum import Curriculum, Evaluation, Protocol
+from ctgraph_rl.task import Task
+from curricula.axes import Tasks, sequence
+
+Pool = Sequence[tuple[int, int]]
+"""(image seed, depth) of each environment whose goals the labs number one after the other."""
+
+MASK_EVALUATION = Evaluation(num_episodes=10, greedy=True, every=5120)
+"""Ten greedy episodes of all tasks every 5,120 frames (10 iterations of 4 workers x 128 steps).
+
+That is the protocol of the modulating-masks code and of those built on it. The evaluation before training is ours.
+"""
+
+
+def environment(
+    depth: int,
+    wait_ids: Sequence[int],
+    decision_ids: Sequence[int],
+    end_ids: Sequence[int],
+    image_seed: int = 1,
+    fail_reward: float = 0.0,
+    unique: tuple[bool, bool] = (True, True),
+    one_hot: bool = False,
+) -> dict[str, Any]:
+    """A configuration file as the labs have them: b=2, p=0, one goal, reward 1, no noise; ids are consecutive.
+
+    Args:
+        depth: d.
+        wait_ids: first and last.
+        decision_ids: first and last.
+        end_ids: first and last; the last image.
+        image_seed: seed of the image set.
+        fail_reward: reward of the fail state.
+        unique: whether decision states and wait states have images of their own.
+        one_hot: vectors instead of images.
+    """
+    return {
+        "graph_shape": {"d": depth, "b": 2, "p": 0.0},
+        "reward": {
+            "high_r": 1.0,
+            "fail_r": fail_reward,
+            "std_r": 0.0,
+            "min_static_reward_episodes": 0,
+            "max_static_reward_episodes": 0,
+            "reward_distribution": "needle_in_haystack",
+        },
+        "observations": {
+            "MDP_D": unique[0],
+            "MDP_W": unique[1],
+            "W_IDs": list(wait_ids),
+            "D_IDs": list(decision_ids),
+            "graph_ends": list(end_ids),
+        },
+        "image_dataset": {
+            "seed": image_seed,
+            "1D": one_hot,
+            "nr_of_images": end_ids[1] + 1,
+            "noise_on_read": 0,
+            "rotation_on_read": 1,
+        },
+    }
+
+
+def goal_of(path: str) -> tuple[int, ...]:
+    """A goal as the labs write it, ``011``, as decisions: (1, 2, 2)."""
+    return tuple(int(branch) + 1 for branch in path)
+
+
+def one_wait_image(path: str, image_seed: int) -> Task:
+    """A task of the labs' ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
+    depth, n = len(path), 2 ** len(path)
+    unique = (True, False)
+    config = environment(depth, (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=unique)
+    return Task.from_json(config, goal_of(path))
+
+
+def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
+    """A task of the labs' fully observable environments: an image, or a vector, for each state."""
+    depth, n = len(path), 2 ** len(path)
+    ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
+    return Task.from_json(environment(depth, *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
+
+
+def words(listing: str) -> list[tuple[int, str]]:
+    """``1:01 2:11`` as image seeds and paths."""
+    pairs = [word.split(":") for word in listing.split()]
+    return [(int(seed), path) for seed, path in pairs]
+
+
+def pool_ids(tasks: Iterable[tuple[int, str]], pool: Pool) -> list[int]:
+    """The labs' number of each task: environments one after the other, goals in lexicographic order."""
+    first: dict[tuple[int, int], int] = {}
+    total = 0
+    for entry in pool:
+        first[entry] = total
+        total += 2 ** entry[1]
+    return [first[seed, len(path)] + int(path, 2) for seed, path in tasks]
+
+
+def labelled(
+    name: str,
+    source: str,
+    tasks: Tasks,
+    ids: Sequence[int],
+    num_task_ids: int,
+    num_frames: int,
+    evaluation: Evaluation = MASK_EVALUATION,
+    version: int = 1,
+) -> Curriculum:
+    """A block for each task, announced, with a one-hot task id.
+
+    Args:
+        name: of the curriculum.
+        source: paper and repository.
+        tasks: in order; a task may come again.
+        ids: the id of each.
+        num_task_ids: length of the one-hot id.
+        num_frames: frames of each block.
+        evaluation: how performance is measured.
+        version: raised when the content changes.
+    """
+    by_task = one_id_each(tasks, ids)
+    protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
+    return sequence(name, tasks, num_frames, version, source, protocol, evaluation)
+
+
+def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:
+    """The id of each different task, in the order of first appearance.
+
+    Raises:
+        ValueError: for a task with two ids.
+    """
+    by_task: dict[Task, int] = {}
+    for task, number in zip(tasks, ids, strict=True):
+        known = by_task.setdefault(task, number)
+        rule = f"a task has one id in a curriculum, but {task.label_parts['goal']} would have {known} and {number}"
+        require((known == number, rule))
+    return by_task
+
+
+def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
+    """The choice of a number counted from 0.
+
+    Raises:
+        ValueError: for a number that is none; names those that are.
+    """
+    require((is_int(number, 0, len(choices) - 1), f"{what} must be in 0..{len(choices) - 1}, got {number!r}"))
+    return choices[number]
+
+
+class Missing(NamedTuple):
+    """A published experiment, or a part of one, that no curriculum stands for."""
+
+    name: str
+    what: str
+    why: str
+
+
+MISSING = (
+    Missing(
+        "ct29_recovery with unique labels",
+        "AMSC: the two visits to one task have the labels 21 and 28",
+        "here a task has one id; ct29_recovery has the same tasks with the labels of the whole pool",
+    ),
+    Missing(
+        "ct28_blocked, consistent",
+        "CT28 family after family with the consistent fourth family",
+        "no such file was found: every blocked file skips depth 5 (ct28_blocked_skips_d5)",
+    ),
+    Missing(
+        "ct28, other image seeds",
+        "CT28 interleaved with other image seeds than 1 to 4",
+        "no such file was found; blocked files exist for five sets of seeds (argument seed_set)",
+    ),
+    Missing(
+        "ct36",
+        "L2D2-C: 36 tasks on four graphs with branching factor 3, depth 2",
+        "two of the four environment files were not found, and the others have 8 images for 9 end states",
+    ),
+    Missing(
+        "ct134, each agent's order",
+        "L2D2-C: 135 agents",
+        "the order of 12 agents is known, and it is that of ct134; the others could not be read",
+    ),
+    Missing(
+        "ct16_64 and 32x32",
+        "L2D2-C: 64 slots of 12,800 frames over 16 tasks, and 32 tasks of 40,960 frames",
+        "only parts of the lists could be read, and they are random without a recorded seed",
+    ),
+    Missing(
+        "the RLlib baselines of L2D2-C",
+        "PPO, DD-PPO and IMPALA: 12 slots of 84,480 steps over 4 goals at p = 0.5",
+        "the environment redrew its goal every 5,000 episodes of a worker, in no fixed relation to the slots",
+    ),
+    Missing(
+        "the ladders of MOSAIC",
+        "ct28_md (4 agents x 10 depths), ct14_md_seed1 and ct14_md_seed2 (depths 2 to 14)",
+        "the files give goals without image seeds, and their environments were not found",
+    ),
+    Missing(
+        "ctwtf_half",
+        "L2D2-C: 14 tasks of two families",
+        "half of its indices are beyond its own pool of 1,016 tasks",
+    ),
+    Missing(
+        "context detection, 2020",
+        "Dick et al., Frontiers in Neurorobotics: a pair of depth-2 graphs that differ in one transition",
+        "no CT-graph configuration was published",
+    ),
+    Missing(
+        "the confounding graphs of MOHQA",
+        "Ladosz et al., TNNLS 2021: p = 0.9, up to 500 wait images",
+        "the published configuration is another, fully observable one; co_hard_4tasks is rebuilt from the numbers",
+    ),
+    Missing(
+        "PEARL on the CT-graph",
+        "a baseline of the neuromodulated meta-learning paper",
+        "its public code has no CT-graph",
+    ),
+    Missing(
+        "the goals of penn_a_swap",
+        "which goals the authors' trials had",
+        "they were drawn anew in every generation; penn_a_swap draws by the same rule from a seed of its own",
+    ),
+)
+"""What cannot be recovered, and why; nothing here is guessed."""
