@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ctgraph_rl.log import RunLog
+
+MOST_COLUMNS = 6
+"""Tasks that the performance matrix is printed for; more do not fit on a terminal."""
+
+MOST_NUMBERS = 10
+"""Tasks that the figure has names and numbers for; more do not fit."""
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
@@ -25,15 +32,36 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
 
 
 def performance_table(run_dir: Path | str) -> Table:
-    """The performance matrix: mean return on each task after each block."""
+    """The performance matrix: mean return on each task after each block; for many tasks, what matters of each."""
     with open(Path(run_dir) / "performance.csv", newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file))
+    values = [[float(value) for value in row[2:]] for row in rows]
+    if len(header) > 2 + MOST_COLUMNS:
+        return _task_table(Path(run_dir).name, header[2:], values)
     table = Table(title=f"{Path(run_dir).name}: mean return on each task after each block")
     for name in header:
         table.add_column(name, justify="right")
-    for block, frames, *values in rows:
-        table.add_row(block, f"{int(frames):,}", *(f"{float(value):.2f}" for value in values))
+    for (block, frames, *_), row in zip(rows, values, strict=True):
+        table.add_row(block, f"{int(frames):,}", *map(_shown, row))
     return table
+
+
+def _task_table(name: str, labels: list[str], values: list[list[float]]) -> Table:
+    """A line for each task: its return before training, the best one after a block, and the last one."""
+    table = Table(
+        title=f"{name}: mean return on each task; performance.csv has it after each of {len(values) - 1} blocks"
+    )
+    for column in ("task", "before", "best", "after block", "at the end"):
+        table.add_column(column, justify="left" if column == "task" else "right")
+    for label, column in zip(labels, zip(*values, strict=True), strict=True):
+        known = [(value, -block) for block, value in enumerate(column) if block and not math.isnan(value)]
+        best, block = max(known, default=(math.nan, 0))
+        table.add_row(label, _shown(column[0]), _shown(best), str(-block) if known else "-", _shown(column[-1]))
+    return table
+
+
+def _shown(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.2f}"
 
 
 def metrics_table(run_dir: Path | str) -> Table:
@@ -64,27 +92,30 @@ def draw_figure(run_dir: Path | str, path: Path | str) -> None:
         raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
     log = RunLog.read(Path(run_dir) / "run.jsonl")
     performance = log.performance()
-    labels = [m["label"] for m in log.of_kind("evaluation") if m["block"] == 0]
+    labels = list({m["task"]: m["label"] for m in log.of_kind("evaluation") if not m["held_out"]}.values())
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     curve, matrix = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_curve(curve, log)
-    low, high = min(0.0, performance.min().item()), max(1.0, performance.max().item())
+    known = performance[~performance.isnan()]
+    low, high = min(0.0, known.min().item()), max(1.0, known.max().item())
     image = matrix.imshow(performance, cmap="viridis", vmin=low, vmax=high, aspect="auto")
-    matrix.set_xticks(range(len(labels)), labels, rotation=30, ha="right", fontsize=7)
-    matrix.set(ylabel="after block", yticks=range(len(performance)))
+    matrix.set_ylabel("after block")
     matrix.set_title("Mean return on each task", fontsize=9)
-    for i, row in enumerate(performance.tolist()):
-        for j, value in enumerate(row):
-            matrix.text(
-                j,
-                i,
-                f"{value:.2f}",
-                ha="center",
-                va="center",
-                color="white" if value < low + 0.6 * (high - low) else "black",
-            )
+    if len(labels) > MOST_NUMBERS:
+        matrix.set_xlabel("task, counted from 0")
+    else:
+        matrix.set_xticks(range(len(labels)), labels, rotation=30, ha="right", fontsize=7)
+        matrix.set_yticks(range(len(performance)))
+        _write_numbers(matrix, performance.tolist(), low + 0.6 * (high - low))
     figure.colorbar(image, ax=matrix)
     figure.savefig(path, dpi=160)
+
+
+def _write_numbers(axes: Any, rows: list[list[float]], bright: float) -> None:
+    """Each value in its cell, dark on bright ones."""
+    for i, row in enumerate(rows):
+        for j, value in enumerate(row):
+            axes.text(j, i, _shown(value), ha="center", va="center", color="white" if value < bright else "black")
 
 
 def _draw_curve(axes: Any, log: RunLog) -> None:

@@ -23,7 +23,8 @@ def run_dir(tmp_path):
             log.append("training", block=block, frames=frames - 512, return_mean=float("nan"))
             log.append("training", block=block, frames=frames, return_mean=0.5)
         for task, (label, value) in enumerate(zip(LABELS, returns, strict=True), 1):
-            log.append("evaluation", block=block, frames=frames, task=task, label=label, return_mean=value)
+            where = {"block": block, "frames": frames, "task": task, "label": label, "held_out": False}
+            log.append("evaluation", moment="after", **where, return_mean=value)
     log.close()
     write_performance(tmp_path / "performance.csv", log, LABELS)
     write_metrics(tmp_path / "metrics.json", metrics.summary(log.performance(), [(0,), (1,)]))
@@ -48,6 +49,20 @@ def test_the_summary_shows_the_performance_matrix_and_every_metric(run_dir):
     assert ["forward transfer", "0.25", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])"] in rows
     assert ["backward transfer", "-0.25", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])"] in rows
     assert ["forgetting", "0.25", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])"] in rows
+
+
+def test_many_tasks_are_a_line_each(run_dir):
+    labels = [f"goal{number}" for number in range(7)]
+    lines = [[0, 0, *[0.0] * 7], [1, 64, 1.0, *[0.25] * 6], [2, 128, 0.5, *[0.25] * 5, "nan"]]
+    text = [["block", "frames", *labels], *lines]
+    (run_dir / "performance.csv").write_text("\n".join(",".join(map(str, line)) for line in text), encoding="utf-8")
+
+    rows = shown(run_dir, 80)
+
+    assert ["task", "before", "best", "after block", "at the end"] in rows
+    assert ["goal0", "0.00", "1.00", "1", "0.50"] in rows
+    assert ["goal1", "0.00", "0.25", "1", "0.25"] in rows
+    assert ["goal6", "0.00", "0.25", "1", "-"] in rows
 
 
 def test_an_undefined_metric_shows_why(run_dir):
