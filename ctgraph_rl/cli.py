@@ -6,12 +6,18 @@ import sys
 from difflib import get_close_matches
 from importlib import import_module
 
-COMMANDS = {"curricula": "curricula.__main__", "report": "ctgraph_rl.report", "export": "ctgraph_rl.export"}
+COMMANDS = {
+    "agents": "baselines.__main__",
+    "curricula": "curricula.__main__",
+    "export": "ctgraph_rl.export",
+    "report": "ctgraph_rl.report",
+    "results": "ctgraph_rl.results",
+}
 """Commands and the modules whose ``main`` they are; each is imported when it is called."""
 
 
 def main() -> None:
-    """``ctgraph-rl curricula|report|export ...``; anything else is for `ctgraph_rl.run`."""
+    """``ctgraph-rl agents|curricula|export|report|results ...``; anything else is for `ctgraph_rl.run`."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in COMMANDS:
         _require_ours(COMMANDS[word])

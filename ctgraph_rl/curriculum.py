@@ -8,10 +8,11 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from itertools import accumulate
+from os import PathLike
 from typing import Any
 
 from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require
-from ctgraph_rl.switch import Switch
+from ctgraph_rl.switch import Switch, switch_rule
 from ctgraph_rl.task import Task
 
 FINGERPRINT_SCHEMA = 1
@@ -21,6 +22,8 @@ FINGERPRINT_SCHEMA = 1
 TASK_IDS = ("hidden", "one_hot", "at_boundaries")
 BOUNDARIES = ("announced", "hidden")
 EVALUATED = ("all", "seen")
+MOST_IDS = 2**20
+"""One-hot ids are held for every row."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,14 @@ class Block:
         tasks = (self.tasks,) if isinstance(self.tasks, Task) else as_tuple(self.tasks)
         object.__setattr__(self, "tasks", tasks)
         only_tasks = isinstance(tasks, tuple) and bool(tasks) and all(isinstance(task, Task) for task in tasks)
-        switches = hasattr(self.switch, "next_task") and not isinstance(self.switch, type)
+        switches = is_dataclass(self.switch) and switch_rule(self.switch)[0]
         require(
             (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
             (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
-            (self.switch is None or switches, f"switch must be one such as Drift(100), or None, got {self.switch!r}"),
+            (
+                self.switch is None or switches,
+                f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}",
+            ),
         )
         enough = self.switch is None or len(tasks) > 1  # type: ignore
         require((enough, "a block with a switch needs at least two tasks, got one; leave the switch out"))
@@ -92,7 +98,7 @@ class Evaluation:
         held_out: further tasks that are evaluated each time and never trained.
 
     Raises:
-        ValueError: for values out of range, and where nothing would ever be evaluated.
+        ValueError: for values out of range.
     """
 
     num_episodes: int = 100
@@ -117,10 +123,8 @@ class Evaluation:
             _one_of("tasks", self.tasks, EVALUATED),
             (only_tasks, f"held_out must be tasks, got {held_out!r}"),
         )
-        ever = self.before or self.every or self.at_block_ends
         require(
             (n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"),
-            (bool(ever), "nothing would be evaluated: set before, every or at_block_ends"),
             (len(set(held_out)) == len(held_out), "held_out tasks must differ"),  # type: ignore
         )
 
@@ -166,17 +170,17 @@ class Protocol:
     def __post_init__(self) -> None:
         ids = as_tuple(self.task_ids)
         object.__setattr__(self, "task_ids", ids)
-        is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0) for i in ids))
+        is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0, MOST_IDS) for i in ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
         require(
             _one_of("task_id", self.task_id, TASK_IDS),
             _one_of("boundaries", self.boundaries, BOUNDARIES),
             (
-                self.num_task_ids is None or is_int(self.num_task_ids, 1),
-                f"num_task_ids must be an integer >= 1, got {self.num_task_ids!r}",
+                self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS),
+                f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}",
             ),
-            (is_ids, f"task_ids must be integers >= 0, one for each task, got {ids!r}"),
+            (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
             (names_ids, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
             (not hidden_gift, "task_id cannot be given at_boundaries that are hidden; use one_hot, or announced ones"),
         )
@@ -251,7 +255,13 @@ class Curriculum:
             (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
             (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
             (one_each, "task ids given at_boundaries need blocks of one task each"),
+            (self._ever_evaluates(), "nothing would be evaluated: set before, every or at_block_ends"),
         ]
+
+    def _ever_evaluates(self) -> bool:
+        how = self.evaluation
+        at_once = how.before and (how.tasks == "all" or bool(how.held_out))
+        return how.at_block_ends or at_once or 0 < how.every <= self.num_frames
 
     @property
     def tasks(self) -> tuple[Task, ...]:

@@ -300,7 +300,7 @@ def _num_task_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None)
     if task_ids is None:
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
         return 0
-    ids = list(task_ids.values())
+    ids = list(task_ids.values()) if isinstance(task_ids, Mapping) else [task_ids]
     require((bool(ids) and all(is_int(i, 0) for i in ids), f"task_ids must be integers >= 0, got {ids[:5]!r}"))
     needed = max(ids) + 1
     room = needed if num_task_ids is None else num_task_ids

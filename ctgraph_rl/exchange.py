@@ -71,8 +71,10 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         "blocks": [_plain(block, places) for block in curriculum.blocks],
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
-        _DERIVED: _about(curriculum),
     }
+    with _within(curriculum.name):
+        _check_form(content)
+    content[_DERIVED] = _about(curriculum)
     if path is not None:
         Path(path).write_text(_text(content) + "\n", encoding="utf-8")
     return content
@@ -82,7 +84,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Cu
     """The curriculum of a JSON file or of its content; see `Curriculum.from_json`."""
     source, content = _load(path_or_dict)
     with _within(source):
-        _check_form(content)
+        _check_form({key: value for key, value in content.items() if key != _DERIVED})
         schema = content.get("schema")
         newer = f"schema {schema} is newer than {SCHEMA}, the newest that is known here; update ctgraph_rl"
         require((not is_int(schema, SCHEMA + 1), newer))

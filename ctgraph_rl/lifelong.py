@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import at_least_one, is_int, require
 from ctgraph_rl.curriculum import Block, Curriculum, Evaluation
-from ctgraph_rl.dynamics import OUTCOME_GOAL
+from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.policies import RandomPolicy
@@ -107,9 +107,11 @@ def _collect_blocks(
     _enter(env, blocks[0])
 
     def between_steps(frames: int) -> None:
-        examine(start + frames)
-        if frames in following:
-            _enter(env, following[frames], at_episode_end=True)
+        if frames:
+            examine(start + frames)
+        next_end = frames + env.numel()
+        if next_end in following:  # so that a row whose episode ends with the block does not begin another of its task
+            _enter(env, following[next_end], at_episode_end=True)
 
     num_frames = sum(block.num_frames for block in blocks)
     return collect(env, agent.policy, num_frames, agent.num_steps, agent.initial_state, between_steps)
@@ -161,7 +163,7 @@ def collect(
         num_frames: frames in all, a multiple of the rows.
         num_steps: steps in a batch.
         initial_state: gives the recurrent state that the rows start with.
-        between_steps: called with the frames collected so far between any two steps, after what was made of a batch.
+        between_steps: called before every step with the frames collected so far, after what was made of a batch.
 
     Raises:
         ValueError: for a number of frames that is not a multiple of the rows, and less than one step.
@@ -175,7 +177,7 @@ def collect(
     carried = env.reset().update(start)
     steps: list[TensorDictBase] = []
     for frames in range(0, num_frames, env.numel()):
-        if between_steps is not None and frames:
+        if between_steps is not None:
             between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
             step, carried = _act(env, policy, carried, start)
@@ -270,7 +272,9 @@ def _act(
 
 
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
-    """Number of finished episodes and their mean return, success rate and length; NaN for none.
+    """Number of finished episodes, their mean return and length, and the shares at the goal and at any end state.
+
+    NaN for none.
 
     Args:
         ends: the data of the last step of each episode.
@@ -279,6 +283,7 @@ def episode_means(ends: TensorDictBase) -> dict[str, Any]:
         "episodes": ends.batch_size[0],
         "return_mean": ends["episode_reward"].double().mean().item(),
         "success_rate": (ends["outcome"] == OUTCOME_GOAL).double().mean().item(),
+        "end_rate": (ends["outcome"] != OUTCOME_FAIL).double().mean().item(),
         "length_mean": ends["step_count"].double().mean().item(),
     }
 

@@ -97,67 +97,111 @@ class RunLog:
         """Measurements of one kind, in order."""
         return [measurement for measurement in self.measurements if measurement["kind"] == kind]
 
-    def performance(self) -> Tensor:
-        """The performance matrix so far: mean return, float64 [blocks evaluated, tasks]; NaN where not evaluated."""
-        return _matrix(self._points(("block",), during=False).values())
+    def performance(self, num_tasks: int = 0) -> Tensor:
+        """The performance matrix: mean return, float64 [blocks + 1, tasks]; NaN where not, or not yet, evaluated.
+
+        Blocks and tasks are those that the log says are trained; where it does not say, those so far.
+
+        Args:
+            num_tasks: columns that there are at least, for tasks that were never evaluated.
+        """
+        num_rows = max(len(self.ends()), 1 + len(self._said()))
+        rows: dict[int, dict[int, float]] = {block: {} for block in range(num_rows)}
+        for m in self._evaluations(during=False):
+            rows[m["block"]][m["task"]] = m["return_mean"]
+        return self._matrix(rows.values(), num_tasks)
+
+    def ends(self) -> list[int]:
+        """Frames of the run at the end of each block so far; 0 for block 0, before any training."""
+        ends = {0: 0}
+        for m in self.measurements:
+            if m["kind"] in ("training", "evaluation"):
+                ends[m["block"]] = m["frames"]
+        return [ends.get(block, 0) for block in range(max(ends) + 1)]
+
+    def training(self, name: str, block: int | None = None) -> Tensor:
+        """A field of the training intervals, of one block or of all, float64 [intervals]; NaN where it is null."""
+        intervals = [m for m in self.of_kind("training") if block in (None, m["block"])]
+        return _row([m.get(name) for m in intervals])
+
+    def last(self, name: str, num_tasks: int = 0) -> Tensor:
+        """A field of the last evaluation of each task at a boundary, float64 [tasks]; NaN where there is none.
+
+        Args:
+            name: the field.
+            num_tasks: see `performance`.
+        """
+        return self._matrix([{m["task"]: m.get(name) for m in self._evaluations(during=False)}], num_tasks)[0]
 
     def curves(self, trained: Sequence[Sequence[int]] | None = None) -> Curves:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.
 
         Args:
             trained: for each block, its tasks counted from 0; default: as the log says.
+
+        Raises:
+            ValueError: if nothing was evaluated.
         """
-        points = self._points(("block", "frames", "moment"), during=True)
-        blocks, frames = zip(*((block, frames) for block, frames, _ in points), strict=True)
-        return Curves(_matrix(points.values()), blocks, frames, self._trained(trained))
+        points: dict[tuple[int, int], dict[int, float]] = {}
+        for m in self._evaluations(during=True):
+            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m["return_mean"]
+        require((bool(points), "this log has no evaluation"))
+        blocks, frames = zip(*points, strict=True)
+        of_blocks = self._trained(trained)
+        num_tasks = 1 + max(task for block in of_blocks for task in block)
+        return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
 
     def regimes(self, trained: Sequence[Sequence[int]] | None = None) -> list[Regime]:
         """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
 
-        An experience is a training interval with finished episodes; evaluations during blocks are left out.
+        An experience is a training interval with finished episodes. Evaluations during blocks and of held-out tasks
+        are left out.
 
         Args:
             trained: for each block, its tasks counted from 0; default: as the log says.
 
         Raises:
-            ValueError: for a block that trains several tasks, whose effects cannot be told apart.
+            ValueError: for a block that trains several tasks, whose effects cannot be told apart, one without a
+                finished episode, and a task that was never evaluated.
         """
         tasks = [sorted(set(block)) for block in self._trained(trained)]
         mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
         require(
             (not mixed, f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several")
         )
-        labels = {m["task"]: m["label"] for m in self._evaluations(during=False)}
+        labels = {m["task"] - 1: m["label"] for m in self._evaluations(during=True)}
+        require((all(block[0] in labels for block in tasks), "lifelong metrics need an evaluation of every task"))
         regimes = []
         for block in range(len(tasks) + 1):
             if block:
-                regimes.append(Regime(labels[tasks[block - 1][0] + 1], True, self._training_returns(block)))
+                returns = self.training("return_mean", block)
+                regimes.append(Regime(labels[tasks[block - 1][0]], True, returns[~returns.isnan()]))
             at_end = [m for m in self._evaluations(during=False) if m["block"] == block]
             regimes += [Regime(m["label"], False, _row([m["return_mean"]])) for m in at_end]
         return regimes
 
     def _trained(self, trained: Sequence[Sequence[int]] | None) -> tuple[tuple[int, ...], ...]:
         if trained is None:
-            said = [run["trained"] for run in self.of_kind("run") if "trained" in run]
-            require((bool(said), "this log does not say what each block trained: give trained, Curriculum.trained"))
-            trained = [[number - 1 for number in block] for block in said[0]]
+            trained = self._said()
+            require((bool(trained), "this log does not say what each block trained: give trained, Curriculum.trained"))
         return tuple(tuple(block) for block in trained)
+
+    def _said(self) -> list[list[int]]:
+        """The tasks of each block, counted from 0, if the first line says them."""
+        said = [run["trained"] for run in self.of_kind("run") if "trained" in run]
+        return [[number - 1 for number in block] for block in said[0]] if said else []
 
     def _evaluations(self, during: bool) -> Iterator[dict[str, Any]]:
         """Evaluations of the curriculum's own tasks."""
         own = (m for m in self.of_kind("evaluation") if not m.get("held_out"))
         return (m for m in own if during or m.get("moment") != "during")
 
-    def _points(self, key: tuple[str, ...], during: bool) -> dict[tuple[Any, ...], dict[int, float]]:
-        """Mean returns by task, for each point in time."""
-        points: dict[tuple[Any, ...], dict[int, float]] = {}
-        for m in self._evaluations(during):
-            points.setdefault(tuple(m.get(name) for name in key), {})[m["task"]] = m["return_mean"]
-        return points
-
-    def _training_returns(self, block: int) -> Tensor:
-        means = [m["return_mean"] for m in self.of_kind("training") if m["block"] == block]
-        return _row([mean for mean in means if mean is not None])
+    def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
+        """Rows of values by task number, NaN where a row has none."""
+        trained = [number + 1 for block in self._said() for number in block]
+        evaluated = [m["task"] for m in self._evaluations(during=True)]
+        tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
+        return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
 
 
 def _measurement(line: bytes) -> dict[str, Any]:
@@ -165,13 +209,6 @@ def _measurement(line: bytes) -> dict[str, Any]:
     if not (isinstance(measurement, dict) and "kind" in measurement):
         raise ValueError(f"a measurement is an object with a kind, got {line!r}")
     return measurement
-
-
-def _matrix(rows: Iterable[Mapping[int, float | None]]) -> Tensor:
-    """Rows of values by task number, NaN where a row has none."""
-    rows = list(rows)
-    tasks = range(1, max((task for row in rows for task in row), default=0) + 1)
-    return torch.stack([_row([row.get(task) for task in tasks]) for row in rows]) if rows else _row([])
 
 
 def _row(values: Sequence[float | None]) -> Tensor:
@@ -183,19 +220,19 @@ def _finite(value: Any) -> Any:
 
 
 def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> None:
-    """Write the performance matrix as CSV: one line per block, block 0 before any training.
+    """Write the performance matrix as CSV: one line per block so far, block 0 before any training.
 
     Args:
         path: file to write.
         log: the run's log.
         labels: a name per task, the last columns.
     """
-    frames = {m["block"]: m["frames"] for m in log.of_kind("evaluation") if m.get("moment") != "during"}
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["block", "frames", *labels])
-        for block, row in enumerate(log.performance().tolist()):
-            writer.writerow([block, frames[block], *row])
+        so_far = zip(log.ends(), log.performance().tolist(), strict=False)
+        for block, (frames, row) in enumerate(so_far):
+            writer.writerow([block, frames, *row])
 
 
 def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:

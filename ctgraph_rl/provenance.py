@@ -9,13 +9,27 @@ if TYPE_CHECKING:
     from ctgraph_rl.curriculum import Curriculum
 
 
-def provenance(curriculum: Curriculum) -> dict[str, Any]:
-    """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
+def versions() -> dict[str, str]:
+    """Versions of this package and of what computes its numbers."""
     import tensordict
     import torch
     import torchrl
 
     from ctgraph_rl import __version__
+
+    return {
+        "ctgraph_rl": __version__,
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def provenance(curriculum: Curriculum) -> dict[str, Any]:
+    """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
+    import torch
+
     from ctgraph_rl.log import SCHEMA
 
     return {
@@ -26,13 +40,7 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
         "source": curriculum.source,
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
-        "versions": {
-            "ctgraph_rl": __version__,
-            "torch": torch.__version__,
-            "torchrl": torchrl.__version__,
-            "tensordict": tensordict.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
         "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
         "num_threads": torch.get_num_threads(),
     }

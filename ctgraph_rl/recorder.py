@@ -14,12 +14,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from ctgraph_rl import metrics
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.lifelong import Examiner, Policy, by_slices
 from ctgraph_rl.log import RunLog, write_metrics, write_performance
 from ctgraph_rl.provenance import provenance
+from ctgraph_rl.scores import scores
+from ctgraph_rl.tables import write_tables
 
 
 class Recorder:
@@ -47,7 +48,7 @@ class Recorder:
 
     Args:
         curriculum: what is learned.
-        run_dir: where run.jsonl, performance.csv and metrics.json go; None: measurements stay in ``log``.
+        run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
         seed: of the run; evaluations derive theirs from it, in [0, 2**63).
         about: what else the first line of the log should tell, such as the learner's name and settings.
 
@@ -125,12 +126,13 @@ class Recorder:
     @property
     def metrics(self) -> dict[str, Any]:
         """The metrics of the evaluations so far; what is missing makes them undefined, with the reason."""
-        return dict(metrics.summary(self.log.performance(), self.curriculum.trained))
+        return dict(scores(self.log, self.curriculum))
 
     def close(self) -> None:
-        """Write performance.csv and metrics.json, and close the log."""
+        """Write tables and metrics, and close the log."""
         self.log.close()
         if self.run_dir is not None:
+            write_tables(self.log, self.run_dir, parquet=False)
             write_performance(self.run_dir / "performance.csv", self.log, self.curriculum.labels)
             write_metrics(self.run_dir / "metrics.json", self.metrics)
 

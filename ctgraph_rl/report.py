@@ -17,6 +17,10 @@ from rich.table import Table
 
 from ctgraph_rl.log import RunLog
 
+ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
+WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
+"""Metrics that are shown; the others are in the file."""
+
 MOST_COLUMNS = 6
 """Tasks that the performance matrix is printed for; more do not fit on a terminal."""
 
@@ -51,9 +55,10 @@ def _task_table(name: str, labels: list[str], values: list[list[float]]) -> Tabl
     table = Table(
         title=f"{name}: mean return on each task; performance.csv has it after each of {len(values) - 1} blocks"
     )
-    for column in ("task", "before", "best", "after block", "at the end"):
-        table.add_column(column, justify="left" if column == "task" else "right")
-    for label, column in zip(labels, zip(*values, strict=True), strict=True):
+    for heading in ("task", "before", "best", "after block", "at the end"):
+        table.add_column(heading, justify="left" if heading == "task" else "right")
+    for task, label in enumerate(labels):
+        column = [row[task] for row in values]
         known = [(value, -block) for block, value in enumerate(column) if block and not math.isnan(value)]
         best, block = max(known, default=(math.nan, 0))
         table.add_row(label, _shown(column[0]), _shown(best), str(-block) if known else "-", _shown(column[-1]))
@@ -65,12 +70,13 @@ def _shown(value: float) -> str:
 
 
 def metrics_table(run_dir: Path | str) -> Table:
-    """The metrics with their definitions; an undefined one shows why."""
+    """The main metrics with their definitions; an undefined one shows why. Those against experts only where defined."""
     metrics: dict[str, dict[str, Any]] = json.loads((Path(run_dir) / "metrics.json").read_text(encoding="utf-8"))
-    table = Table(title="Metrics")
+    table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name, metric in metrics.items():
+    for name in (*ALWAYS, *(name for name in WITH_EXPERTS if metrics.get(name, {}).get("value") is not None)):
+        metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
         table.add_row(name.replace("_", " "), value, metric["undefined"] or metric["formula"].replace("[", r"\["))
     return table

@@ -25,7 +25,7 @@ from ctgraph_rl.dynamics import (
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import white_level
 from ctgraph_rl.params import make_params, shared_bank
-from ctgraph_rl.switch import Switch
+from ctgraph_rl.switch import Switch, switch_rule
 from ctgraph_rl.task import Task
 
 T = TypeVar("T")
@@ -148,7 +148,7 @@ class Rows(nn.Module):
         """
         tasks, n = require_all(Task, "tasks", tasks), self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
-        self._plan(self._numbers(tasks), None, None, at_episode_end)
+        self._plan(self._whole_pool(), self._numbers(tasks), None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
         """Let the rows change between tasks from episode to episode, all of them beginning with the first.
@@ -159,11 +159,12 @@ class Rows(nn.Module):
             at_episode_end: as in `set_tasks`.
 
         Raises:
-            ValueError: for less than two tasks, or one that is not in the pool.
+            ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
         """
         choices = self._numbers(require_all(Task, "tasks", tasks))
-        require((len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"))
-        self._plan(choices[:1].expand(self.num_rows).clone(), choices, switch, at_episode_end)
+        enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
+        require(enough, switch_rule(switch))
+        self._plan(choices, torch.zeros_like(self.row), switch, at_episode_end)
 
     def _numbers(self, tasks: tuple[Task, ...]) -> Tensor:
         """Where tasks stand in the pool, int64."""
@@ -172,22 +173,34 @@ class Rows(nn.Module):
         require((not unknown, message))
         return torch.tensor([self._number[task] for task in tasks], device=self.device)
 
-    def _plan(self, start: Tensor, choices: Tensor | None, switch: Switch | None, at_episode_end: bool) -> None:
-        """Which tasks the rows have from now on, or from their next episodes on."""
-        self._first, self._choices, self._switch = start, choices, switch
-        self.choice, self.episodes = torch.zeros_like(start), torch.zeros_like(start)
-        self.tasks_change = at_episode_end or switch is not None
+    def _whole_pool(self) -> Tensor:
+        """The pool's numbers, int64: what rows choose from without a switch."""
+        return torch.arange(len(self.pool), device=self.device)
+
+    def _plan(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
+        """Which of the choices the rows have from now on, or from their next episodes on."""
+        self._choices, self._switch = choices, switch
+        self.choice, self.episodes = choice, torch.zeros_like(choice)
         if not at_episode_end:
-            self.task = start
+            self.task = self._planned()
+        self.tasks_change = self._may_change()
         self._make_params()
         self._stock = self._now = None
         if not at_episode_end:
             self._begin()
 
+    def _planned(self) -> Tensor:
+        """The pool's numbers of the tasks that the rows were last to have."""
+        return self._choices.index_select(0, self.choice)
+
+    def _may_change(self) -> bool:
+        """Whether a row that starts an episode may go over to another task."""
+        return self._switch is not None or bool((self.task != self._planned()).any())
+
     def _make_params(self) -> None:
         """The parameters of all tasks that the rows have or may go over to, and of each row."""
-        parts = [self.task, self._first] if self._choices is None else [self.task, self._first, self._choices]
-        self._in_use = torch.cat(parts).unique()
+        following = self._planned() if self._switch is None else self._choices
+        self._in_use = torch.cat([self.task, following]).unique()
         different = tuple(self.pool[number] for number in self._in_use.tolist())
 
         def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
@@ -213,27 +226,26 @@ class Rows(nn.Module):
             return
         mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
         begun = self.episodes + mask
-        planned = self._first if self._switch is None else self._switched(self._switch, begun)
-        task = torch.where(mask, planned, self.task)
+        if self._switch is not None:
+            self._change_choice(self._switch, begun)
+        task = torch.where(mask, self._planned(), self.task)
         changed, self.task, self.episodes = task != self.task, task, begun
         if changed.any():
             self._take_params()
             self.goal_leaf = torch.where(changed, self._task_goals, self.goal_leaf)
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
-        self.tasks_change = self._switch is not None or bool((begun == 0).any())
+        self.tasks_change = self._may_change()
 
-    def _switched(self, switch: Switch, begun: Tensor) -> Tensor:
-        """The pool's numbers of the tasks that a switch has for rows that have begun so many episodes."""
-        assert self._choices is not None
+    def _change_choice(self, switch: Switch, begun: Tensor) -> None:
+        """Ask a switch for the tasks of rows that have begun so many episodes."""
         if switch.together:
             clock, past = ((count.sum() // self.num_rows - 1).expand_as(count) for count in (begun, self.episodes))
             place = self.seed[:1], self.row[:1], self.tick.amax(0, keepdim=True)
         else:
             clock, past, place = begun - 1, self.episodes - 1, (self.seed, self.row, self.tick)
         words = philox.draw(*place, philox.STREAM_TASK)
-        following = switch.next_task(self.choice, clock, len(self._choices), words)
+        following = switch.next_task(self.choice, clock.clamp_min(1), len(self._choices), words)
         self.choice = torch.where((clock > past) & (clock > 0), following, self.choice)
-        return self._choices.index_select(0, self.choice)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
@@ -276,7 +288,8 @@ class Rows(nn.Module):
         self.tick = torch.zeros_like(self.row)
         self._stock = self._now = None
         if self.tasks_change:
-            self._plan(self._first, self._choices, self._switch, at_episode_end=False)
+            start = self.choice if self._switch is None else torch.zeros_like(self.choice)
+            self._plan(self._choices, start, self._switch, at_episode_end=False)
         self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
         self._begin()
 
@@ -404,7 +417,7 @@ class Rows(nn.Module):
         for field in _PLACES:
             setattr(self, field, getattr(self, field).clone())
         super()._load_from_state_dict(*args, **kwargs)
-        self.tasks_change = self._switch is not None or bool((self.task != self._first).any())
+        self.tasks_change = self._may_change()
         self._make_params()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
@@ -417,7 +430,7 @@ class Rows(nn.Module):
                 return type(part)(*map(moved, part)) if hasattr(part, "_fields") else tuple(map(moved, part))
             return fn(part) if isinstance(part, Tensor) else part
 
-        for name in ("_first", "_choices", "_in_use", "_goals", "_tables"):
+        for name in ("_choices", "_in_use", "_goals", "_tables"):
             setattr(self, name, moved(getattr(self, name)))
         self._take_params()
         return self
@@ -466,8 +479,9 @@ _TABLES: dict[type, tuple[str, ...]] = {
 """What has not one entry for each task."""
 
 _PLACES = ("task", "choice", "episodes")
-"""Where each row is among the tasks: its task's number in the pool, its place among those that it changes between, and
-the episodes that it has begun since the last change of plan; int64."""
+"""Where each row is among the tasks: its task's number in the pool, the place of the task that it is to have next among
+those that it changes between (without a switch, the pool), and the episodes that it has begun since the last change of
+plan; int64."""
 
 MAX_STOCK = 2**14
 MAX_STOCK_TICKS = 256

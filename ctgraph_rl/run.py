@@ -29,14 +29,12 @@ from ctgraph_rl.checks import is_int, require
 
 if TYPE_CHECKING:
     from ctgraph_rl.curriculum import Curriculum
-
-RESULTS = ("run.jsonl", "performance.csv", "metrics.json", "agent.pt")
-"""What a run writes into its directory, beside ``.hydra``; ``metrics.json`` is there when the run is complete."""
+    from ctgraph_rl.experts import Expert
 
 SPECS = ("observation_spec", "action_spec")
 """Arguments of agents that come from the environment."""
 
-NOT_HASHED = ("overwrite",)
+NOT_HASHED = ("overwrite", "experts_dir")
 """Keys of the configuration that do not change results."""
 
 
@@ -107,7 +105,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     cores = os.cpu_count() or 1
     threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
-    require((isinstance(cfg.overwrite, bool), f"overwrite must be true or false, got {cfg.overwrite!r}"))
+    for switch in ("overwrite", "experts"):
+        require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     if not is_finished(cfg, run_dir):
         learn(cfg, run_dir)
     from ctgraph_rl.report import print_summary
@@ -141,35 +140,40 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
 
 
 def learn(cfg: DictConfig, run_dir: Path) -> None:
-    """The run itself: build, learn, measure, write."""
+    """The run itself: build, check, learn, measure, write; the experts before it, where they are asked for."""
     import torch
 
-    from ctgraph_rl import metrics
-    from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
-    from ctgraph_rl.log import RunLog, write_metrics, write_performance
-    from ctgraph_rl.progress import ProgressBar
-    from ctgraph_rl.provenance import provenance
+    from ctgraph_rl.experts import expert_curriculum
+    from ctgraph_rl.train import RESULTS, new_agent, train
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)
-    torch.manual_seed(cfg.seed)
     curriculum = named(with_changes(target(cfg, "curriculum")(), cfg))
-    env = make_env(curriculum, curriculum.tasks, cfg.seed)
-    agent = target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched).to(device)
-    check_rows(curriculum, agent.num_envs)
+    make_agent = target(cfg, "agent")
+    for checked in (curriculum, *(expert_curriculum(curriculum, task) for task in curriculum.tasks if cfg.experts)):
+        new_agent(checked, make_agent, cfg.seed)
     for name in RESULTS:
         (run_dir / name).unlink(missing_ok=True)
     write_configuration(cfg, run_dir / ".hydra")
-    log = RunLog(run_dir / "run.jsonl")
-    log.append("run", **provenance(curriculum), config=plain(cfg))
-    with ProgressBar(len(curriculum.blocks), curriculum.num_frames) as progress:
-        learn_curriculum(curriculum, agent, cfg.seed, log, progress, device)
-    log.close()
-    torch.save(agent.state_dict(), run_dir / "agent.pt")
-    write_performance(run_dir / "performance.csv", log, curriculum.labels)
-    write_metrics(run_dir / "metrics.json", metrics.summary(log.performance(), curriculum.trained))
+    experts = train_experts(cfg, curriculum) if cfg.experts else None
+    train(curriculum, make_agent, run_dir, cfg.seed, device, plain(cfg), experts)
+
+
+def train_experts(cfg: DictConfig, curriculum: Curriculum) -> list[Expert]:
+    """The experts of a curriculum, found or trained with the run's own agent, seed and threads."""
+    from ctgraph_rl.experts import find_or_train
+    from ctgraph_rl.provenance import versions
+    from ctgraph_rl.train import train
+
+    settings = {key: value for key, value in plain(cfg).items() if key in ("agent", "seed", "device", "num_threads")}
+
+    def learn_alone(alone: Curriculum, run_dir: Path) -> None:
+        train(alone, target(cfg, "agent"), run_dir, cfg.seed, checked_device(cfg.device), settings)
+
+    folder = Path(cfg.experts_dir)
+    return find_or_train(curriculum, learn_alone, folder, {**settings, "versions": versions()}, print)
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:

@@ -164,7 +164,7 @@ def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -
     image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
     axes.set_title(title, fontsize=9)
     if len(labels) > MOST_LABELS:
-        axes.set(xlabel="task", ylabel="task")
+        axes.set(xlabel="task, from 0", ylabel="task, from 0")
         return image
     size = max(4, 8 - len(labels) // 8)
     axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)

@@ -16,7 +16,9 @@ import torch
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, RunLog, evaluate
 from ctgraph_rl import run as run_module
-from ctgraph_rl.run import RESULTS, named, run, target
+from ctgraph_rl.metrics import definitions
+from ctgraph_rl.run import named, run, target
+from ctgraph_rl.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -61,7 +63,8 @@ def copy_of(finished, tmp_path) -> Path:
 def test_a_run_writes_its_results_and_nothing_else(finished):
     hydra_files = {".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"}
 
-    assert set(RESULTS) == {"run.jsonl", "performance.csv", "metrics.json", "agent.pt"}
+    tables = {"evaluations.csv", "training.csv", "performance.csv"}
+    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "agent.pt"}
     assert files_in(finished) == {f"out/{name}" for name in {*hydra_files, *RESULTS}}
 
 
@@ -80,6 +83,7 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
         "num_threads",
         "evaluation",
         "protocol",
+        "experts",
     }
     assert first["config"]["curriculum"]["num_frames"] == 1024
     assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}
@@ -95,7 +99,8 @@ def test_the_files_of_a_run_agree_with_its_log(finished):
     assert header == "block,frames,goal1.1,goal1.2,goal2.1,goal2.2"
     assert [row.split(",")[:2] for row in rows] == [[str(i), str(1024 * i)] for i in range(5)]
     assert [[float(value) for value in row.split(",")[2:]] for row in rows] == log.performance().tolist()
-    assert list(metrics) == ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
+    assert list(metrics)[:4] == ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
+    assert set(metrics) == set(definitions())
     assert metrics["average_performance"]["value"] == pytest.approx(log.performance()[-1].mean().item(), abs=1e-12)
     assert {m["episodes"] for m in log.of_kind("evaluation")} == {100}
 

@@ -1,0 +1,258 @@
+"""Metrics of evaluation curves: performance on every task, again and again while the curriculum is learned.
+
+Areas under a curve are means of its evaluations or trapezoids, as a definition says; both need evaluations at equal
+distances. An expert is an agent that learned one task alone, with the frames and evaluations that the task has in the
+curriculum; its curve is an argument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, ratio
+
+CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
+LABS = "Ben-Iwhiwhu et al. 2022, Lifelong RL with modulating masks (arXiv 2212.11110)"
+LABS_CODE = "evaluation code of the CT-graph labs"
+
+NO_HEADROOM = "an evaluation is missing or the expert leaves nothing to gain"
+SMALLEST_HEADROOM = 1e-3
+"""1 - area of an expert below which the labs' code gives no forward transfer."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Evaluations of a run in time order.
+
+    Args:
+        performance: float64 [evaluations, tasks]; NaN where not evaluated.
+        blocks: for each evaluation, the block in or after which it was made; 0 before any training.
+        frames: for each evaluation, the frames learned so far.
+        trained: for each block, the tasks that it trained, counted from 0.
+
+    Raises:
+        ValueError: if these do not fit each other.
+    """
+
+    performance: Tensor
+    blocks: tuple[int, ...]
+    frames: tuple[int, ...]
+    trained: tuple[tuple[int, ...], ...]
+
+    def __post_init__(self) -> None:
+        rows = len(self.performance)
+        if self.performance.ndim != 2 or (len(self.blocks), len(self.frames)) != (rows, rows) or rows == 0:
+            raise ValueError(
+                f"performance must be [evaluations, tasks] with a block and frames each, got {self.performance.shape}, "
+                f"{len(self.blocks)} blocks and {len(self.frames)} frames"
+            )
+        if list(self.blocks) != sorted(self.blocks) or self.blocks[-1] > len(self.trained):
+            raise ValueError(f"blocks must rise from 0 to at most {len(self.trained)}, got {self.blocks}")
+
+    def of_block(self, block: int) -> list[int]:
+        """Positions of the evaluations in and after a block."""
+        return [i for i, other in enumerate(self.blocks) if other == block]
+
+    @property
+    def ends(self) -> Tensor:
+        """The performance matrix: the last evaluation of each block, [blocks + 1, tasks]; NaN for a block without."""
+        rows = [self.of_block(block) for block in range(len(self.trained) + 1)]
+        nothing = torch.full_like(self.performance[0], torch.nan)
+        return torch.stack([self.performance[row[-1]] if row else nothing for row in rows])
+
+    def smoothed(self, window: int) -> Curves:
+        """Every evaluation replaced by the mean of the last ``window`` ones, fewer at the start."""
+        if window < 1:
+            raise ValueError(f"window must be >= 1, got {window}")
+        means = [self.performance[max(0, i + 1 - window) : i + 1].mean(0) for i in range(len(self.performance))]
+        return replace(self, performance=torch.stack(means))
+
+    def own_block(self, task: int) -> int:
+        """The one block that trains a task, counted from 1."""
+        own = [block for block, tasks in enumerate(self.trained, 1) if task in tasks]
+        if len(own) != 1:
+            raise Undefined(f"the definition needs each task trained once, task {task + 1} is in {len(own)} blocks")
+        if len(set(self.trained[own[0] - 1])) > 1:
+            raise Undefined(f"the definition needs tasks trained alone, block {own[0]} trains several")
+        return own[0]
+
+    def own_stage(self, task: int) -> Tensor:
+        """The curve of a task while it was trained: evaluations in and after its block, at equal distances."""
+        rows = self.of_block(self.own_block(task))
+        steps = {after - before for before, after in pairwise(self.frames[i] for i in rows)}
+        if not rows or len(steps) > 1:
+            raise Undefined(f"the definition needs evaluations at equal distances in block {self.own_block(task)}")
+        return self.performance[rows, task]
+
+    def at_end_of(self, block: int, task: int, last: int) -> Tensor:
+        """Mean of a task's last evaluations in a block."""
+        rows = self.of_block(block)
+        if len(rows) < last:
+            raise Undefined(f"the definition needs {last} evaluations in block {block}, it has {len(rows)}")
+        return self.performance[rows[-last:], task].mean()
+
+
+def mean_area(curve: Tensor) -> Tensor:
+    """Area under a curve over its length, as the plain mean of its evaluations (Continual World's code).
+
+    Args:
+        curve: evaluations along the first dimension, such as of a stage.
+    """
+    return curve.mean(0)
+
+
+def trapezoid_area(curve: Tensor) -> Tensor:
+    """Area under a curve over its length by trapezoids, divided by the number of intervals (the CT-graph labs' code).
+
+    NaN for fewer than two evaluations.
+    """
+    return (curve[1:] + curve[:-1]).mean(0) / 2
+
+
+def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
+    """Each task's area under its curve over its own block, [tasks]; NaN where a definition has none.
+
+    Args:
+        curves: the evaluations of a run.
+        trapezoids: `trapezoid_area` instead of `mean_area`.
+    """
+    area = trapezoid_area if trapezoids else mean_area
+    return torch.stack([_area_or_nan(curves, task, area) for task in range(curves.performance.shape[1])])
+
+
+def _area_or_nan(curves: Curves, task: int, area: Callable[[Tensor], Tensor]) -> Tensor:
+    try:
+        return area(curves.own_stage(task))
+    except Undefined:
+        return curves.performance.new_tensor(torch.nan)
+
+
+@defined("wolczyk2021/performance", "1/T sum_j p_j(end)", CONTINUAL_WORLD)
+def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
+    """P: mean performance on all tasks at the end.
+
+    Args:
+        curves: the evaluations of a run.
+        last: evaluations that "at the end" is the mean of: 1 as in the paper, 5 as in its code.
+    """
+    tasks = range(curves.performance.shape[1])
+    return torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
+
+
+@defined("wolczyk2021/forgetting", "1/T sum_j (p_j(end of j's block) - p_j(end))", CONTINUAL_WORLD)
+def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
+    """F: the drop on each task from the end of its own block to the end.
+
+    The mean is over all T tasks, so the last one adds a 0: smaller than -BWT of `backward_transfer` by (T-1)/T.
+    Undefined unless each task is trained once, alone.
+
+    Args:
+        curves: the evaluations of a run.
+        last: evaluations that "at the end" is the mean of: 1 as in the paper, 5 as in its code.
+    """
+    tasks = range(curves.performance.shape[1])
+    own = torch.stack([curves.at_end_of(curves.own_block(task), task, last) for task in tasks])
+    return own - torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
+
+
+@defined("wolczyk2021/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)", CONTINUAL_WORLD, missing=NO_HEADROOM)
+def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Tensor:
+    """FT: what a task's own block gains by what came before, as a share of what was left to gain; at most 1.
+
+    AUC of `stage_areas`, for performance whose best is 1, such as success rates. The source first averages areas over
+    seeds: a ratio of means, not a mean of ratios. An expert with an area of 1 makes it undefined; the source's code
+    divides by zero there.
+
+    Args:
+        areas: float64 [tasks], or [seeds, tasks] to be averaged over seeds.
+        expert_areas: the same of the experts, whose seeds may be others.
+    """
+    own, expert = (_over_seeds(each) for each in (areas, expert_areas))
+    return ratio(own - expert, 1 - expert)
+
+
+@defined(
+    "ct-graph-labs/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j), AUC by trapezoids", LABS_CODE, missing=NO_HEADROOM
+)
+def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor:
+    """FT of the labs that made the CT-graph: as Continual World's, with areas by trapezoids and per seed.
+
+    Undefined where 1 - AUCb < 0.001, as there; their 1e-8 in the denominator is left out.
+
+    Args:
+        areas: float64 [tasks] of ``stage_areas(curves, trapezoids=True)``.
+        expert_areas: the same of the experts.
+    """
+    headroom = 1 - expert_areas
+    return ratio(areas - expert_areas, torch.where(headroom < SMALLEST_HEADROOM, 0.0, headroom))
+
+
+@defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1])
+def instant_cumulative_return(curves: Curves) -> Tensor:
+    """ICR(t) = sum_j p_j(t): the return over all tasks at evaluation t; the value is the last, the terms are all."""
+    return curves.performance.sum(1)
+
+
+@defined("ben-iwhiwhu2022/tpot", "sum_t sum_j p_j(t)", LABS, aggregate=torch.sum)
+def total_performance_over_time(curves: Curves) -> Tensor:
+    """TPOT = sum_t ICR(t) over all evaluations; it grows with their number, so compare equal protocols only."""
+    return curves.performance.sum(1)
+
+
+@defined(
+    "ct-graph-labs/relative-forgetting",
+    "mean_j (max_t p_j(t) - p_j(end)) / max_t p_j(t)",
+    LABS_CODE,
+    partial=True,
+    missing="a task never got above 0",
+)
+def relative_forgetting(curves: Curves) -> Tensor:
+    """The share of the best performance ever on a task that is gone at the end, over all tasks.
+
+    The best is that of the evaluations that there are, as tasks may be evaluated only from their first block on; the
+    last one must be there. A task that never got above 0 has no value and is left out and counted. In [0, 1] for
+    performance that is.
+    """
+    if curves.performance[-1].isnan().any():
+        raise Undefined("the last evaluation of a task is missing")
+    best = curves.performance.nan_to_num(nan=-torch.inf).amax(0)
+    return ratio(best - curves.performance[-1], best.clamp(min=0))
+
+
+@defined("ctgraph_rl/tasks-learned", "number of j with p_j(end of j's block) >= threshold_j", HERE, aggregate=torch.sum)
+def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
+    """How many tasks are mastered right after the last block that trains them, forgotten later or not.
+
+    The labs report this number without a formula. A task that no block trains is none.
+
+    Args:
+        curves: the evaluations of a run.
+        threshold: what counts as mastered: a number, or one per task such as 0.9 times the optimal value.
+    """
+    ends = curves.ends
+    last = {task: block for block, tasks in enumerate(curves.trained, 1) for task in tasks}
+    reached = torch.stack([ends[last[task], task] for task in sorted(last)])
+    needed = torch.as_tensor(threshold, dtype=ends.dtype).expand(ends.shape[1])[sorted(last)]
+    unknown = reached.isnan() | needed.isnan()
+    return torch.where(unknown, torch.nan, (reached >= needed).double())
+
+
+def _over_seeds(areas: Tensor) -> Tensor:
+    return areas.mean(0) if areas.ndim == 2 else areas
+
+
+def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:
+    """Refuse expert curves that were not evaluated as often as the tasks in the block that trains them first.
+
+    Raises:
+        ValueError: names the task and both numbers.
+    """
+    for task, expert in enumerate(experts):
+        count = len(curves.of_block(next(i for i, block in enumerate(curves.trained, 1) if task in block)))
+        if len(expert) != count:
+            raise ValueError(f"the expert of task {task + 1} needs {count} evaluations as its block, got {len(expert)}")

@@ -1,0 +1,227 @@
+"""Metrics of the performance matrix.
+
+``performance[i, j]`` is the performance on task j after block i, float64 [blocks + 1, tasks]; row 0 is before any
+training; NaN is "not evaluated". ``trained`` has the tasks of each block, counted from 0; without it, block i is taken
+to train task i. A NaN that a formula needs makes the metric undefined: nothing is imputed, and no older row steps in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.metrics.record import Undefined, defined, ratio
+
+Trained = Sequence[Sequence[int]]
+
+LOPEZ_PAZ = "Lopez-Paz & Ranzato 2017, Gradient Episodic Memory (arXiv 1706.08840)"
+CHAUDHRY = "Chaudhry et al. 2018, Riemannian Walk (arXiv 1801.10112)"
+DIAZ = "Diaz-Rodriguez et al. 2018, Don't forget, there is more than forgetting (arXiv 1810.13166)"
+CORA = "Powers et al. 2022, CORA (arXiv 2110.10067)"
+
+OUT_OF_ORDER = "the definition needs each task trained once, alone, in the order of the columns"
+ONE_TASK = "the definition needs at least two tasks"
+
+
+@defined("lopez-paz2017/acc", "1/T sum_j R[T,j]", LOPEZ_PAZ)
+def average_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """ACC = 1/T sum_j R[last, j]: mean performance on all tasks after the last block.
+
+    Defined for any curriculum.
+    """
+    return performance[-1]
+
+
+@defined("lopez-paz2017/bwt", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])", LOPEZ_PAZ)
+def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """BWT = 1/(T-1) sum_{j<T} (R[T, j] - R[j, j]).
+
+    The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
+    Undefined for a single task, and unless each task is trained once, alone, in order.
+    """
+    _several_in_order(performance, trained)
+    own = performance[1:].diagonal()
+    return (performance[-1] - own)[:-1]
+
+
+@defined("lopez-paz2017/fwt", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])", LOPEZ_PAZ)
+def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """FWT = 1/(T-1) sum_{j>1} (R[j-1, j] - R[0, j]).
+
+    What training on the tasks before it gave a task before its own block, against the untrained agent (the b_j of the
+    source). Undefined as `backward_transfer`, and without the evaluation before any training.
+    """
+    _several_in_order(performance, trained)
+    _has_initial_evaluation(performance[:, 1:])
+    before_own = performance[:-1].diagonal()
+    return (before_own - performance[0])[1:]
+
+
+@defined("chaudhry2018/f", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])", CHAUDHRY)
+def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """F = 1/(T-1) sum_{j<T} (max_{1<=l<T} R[l, j] - R[T, j]).
+
+    The drop on each earlier task from its best after any earlier block to the end; the untrained agent (row 0) is no
+    candidate for the best. Undefined as `backward_transfer`.
+    """
+    _several_in_order(performance, trained)
+    best = performance[1:-1].amax(dim=0)
+    return (best - performance[-1])[:-1]
+
+
+@defined("diaz-rodriguez2018/a", "2/(T(T+1)) sum_{i>=j} R[i,j]", DIAZ)
+def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """A: mean over all pairs of a block i and a task j that was trained by then.
+
+    Undefined unless each task is trained once, alone, in order. Defined for a single task.
+    """
+    _in_order(performance, trained)
+    return _pairs(performance, lambda block, task: block >= task)
+
+
+@defined("diaz-rodriguez2018/bwt", "2/(T(T-1)) sum_{i>j} (R[i,j] - R[j,j])", DIAZ)
+def backward_transfer_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """BWT after every block: mean change on a task from its own block to each later block.
+
+    Undefined as `backward_transfer`.
+    """
+    return _changes_after_own_block(performance, trained)
+
+
+@defined(
+    "diaz-rodriguez2018/rem", "1 - |min(BWT, 0)|", DIAZ, aggregate=lambda changes: 1 - changes.mean().clamp(max=0).abs()
+)
+def remembering(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """REM = 1 - |min(BWT, 0)| with BWT of `backward_transfer_over_time`; 1 without forgetting.
+
+    In [0, 1] for performance in [0, 1], as the source assumes. The terms are those of BWT.
+    """
+    return _changes_after_own_block(performance, trained)
+
+
+@defined("diaz-rodriguez2018/bwt+", "max(BWT, 0)", DIAZ, aggregate=lambda changes: changes.mean().clamp(min=0))
+def positive_backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """BWT+ = max(BWT, 0) with BWT of `backward_transfer_over_time`. The terms are those of BWT."""
+    return _changes_after_own_block(performance, trained)
+
+
+@defined("diaz-rodriguez2018/fwt", "2/(T(T-1)) sum_{i<j} R[i,j]", DIAZ)
+def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """FWT: mean performance on tasks that are yet to be trained, after each block; row 0 is not part of it.
+
+    Not the same as `forward_transfer`: nothing is subtracted. Undefined as `backward_transfer`.
+    """
+    _several_in_order(performance, trained)
+    return _pairs(performance, lambda block, task: block < task)
+
+
+@defined(
+    "powers2022/isolated-forgetting",
+    "mean over (i, j), j after i's first block and not training i, of (R[j-1,i] - R[j,i]) / scale[i]",
+    CORA,
+    missing="an evaluation is missing or a scale is 0",
+)
+def isolated_forgetting(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
+    """F: what one block of another task takes from a task that was trained before; positive when it is forgotten.
+
+    The source smooths curves over 20 evaluations first: `Curves.smoothed`; its tables show the value times 10. Tasks
+    may be trained again. Undefined where a block trains several tasks, and for a single task.
+
+    Args:
+        performance: the matrix.
+        trained: the tasks of each block.
+        scale: for each task, what changes are divided by; default: max |R[i, task]| of this matrix. The source takes
+            it over all seeds of a model, which makes values of two models no longer comparable: give the known optimum.
+    """
+    return _changes_by_other_blocks(performance, trained, scale, before=False) * -1
+
+
+@defined(
+    "powers2022/zero-shot-transfer",
+    "mean over (i, j), j before i's first block, of (R[j,i] - R[j-1,i]) / scale[i]",
+    CORA,
+    missing="an evaluation is missing or a scale is 0",
+)
+def zero_shot_transfer(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
+    """Z: what one block of another task gives a task that was not yet trained.
+
+    As `isolated_forgetting`; also undefined without the evaluation before any training.
+    """
+    _has_initial_evaluation(performance)
+    return _changes_by_other_blocks(performance, trained, scale, before=True)
+
+
+def _changes_after_own_block(performance: Tensor, trained: Trained | None) -> Tensor:
+    _several_in_order(performance, trained)
+    own = performance[1:].diagonal()
+    return _pairs(torch.cat([performance[:1], performance[1:] - own]), lambda block, task: block > task)
+
+
+def _pairs(matrix: Tensor, chosen: Callable[[int, int], bool]) -> Tensor:
+    """Entries [block, task] of the rows 1.. for which ``chosen(block, task)`` holds."""
+    count = matrix.shape[1]
+    return torch.stack([matrix[i, j - 1] for i in range(1, count + 1) for j in range(1, count + 1) if chosen(i, j)])
+
+
+def _changes_by_other_blocks(
+    performance: Tensor, trained: Trained | None, scale: Tensor | None, before: bool
+) -> Tensor:
+    """(R[j, i] - R[j-1, i]) / scale[i] for blocks j before, or after, the first one that trains i."""
+    tasks = performance.shape[1]
+    alone = _alone(performance, trained)
+    if tasks == 1:
+        raise Undefined(ONE_TASK)
+    scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else torch.as_tensor(scale)
+    changes = ratio(performance.diff(dim=0), scale.to(performance).expand(performance.shape[0] - 1, tasks))
+    first = [alone.index(task) if task in alone else len(alone) for task in range(tasks)]
+    terms = [
+        changes[block, task]
+        for task in range(tasks)
+        for block, other in enumerate(alone)
+        if other != task and (block < first[task]) == before
+    ]
+    return torch.stack(terms) if terms else performance.new_empty(0)
+
+
+def _alone(performance: Tensor, trained: Trained | None) -> list[int]:
+    """The one task of each block."""
+    blocks = _blocks(performance, trained)
+    if any(len(block) != 1 for block in blocks):
+        raise Undefined("the definition needs blocks that train one task each")
+    return [block[0] for block in blocks]
+
+
+def _several_in_order(performance: Tensor, trained: Trained | None) -> None:
+    _in_order(performance, trained)
+    if performance.shape[1] == 1:
+        raise Undefined(ONE_TASK)
+
+
+def _in_order(performance: Tensor, trained: Trained | None) -> None:
+    if _blocks(performance, trained) != [[task] for task in range(performance.shape[1])]:
+        raise Undefined(OUT_OF_ORDER)
+
+
+def _blocks(performance: Tensor, trained: Trained | None) -> list[list[int]]:
+    """The tasks of each block; without ``trained`` a block per task.
+
+    Raises:
+        ValueError: if the matrix has not a row for each block and one before.
+    """
+    blocks, tasks = performance.shape[0] - 1, performance.shape[1]
+    if trained is None and blocks != tasks:
+        raise ValueError(
+            f"without trained, the definition needs one block per task, got {blocks} blocks and {tasks} tasks"
+        )
+    if trained is None:
+        return [[task] for task in range(tasks)]
+    if len(trained) != blocks:
+        raise ValueError(f"performance needs {len(trained) + 1} rows for {len(trained)} blocks, got {blocks + 1}")
+    return [list(block) for block in trained]
+
+
+def _has_initial_evaluation(performance: Tensor) -> None:
+    if performance[0].isnan().any():
+        raise Undefined("the definition needs the evaluation before any training (row 0)")

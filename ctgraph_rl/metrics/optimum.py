@@ -1,0 +1,153 @@
+"""Metrics that need what is known of CT-graphs in closed form: optimal values, P_R and E[kappa].
+
+Training is given as intervals in time order: finished episodes and their mean return or success rate. Where in its
+interval the first reward was is not known; of k successes in n episodes, in any order, the first is on average at
+(n + 1) / (k + 1), which is taken. Intervals of one episode each make the numbers exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.metrics.record import HERE, MASTERED, defined, ratio
+
+PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
+
+STAGES = ("fails", "navigates", "solves")
+"""What an agent has reached on a task: it fails on the way, gets to end states, or gets to the goal."""
+
+
+@defined(
+    "ctgraph_rl/normalised-performance",
+    "1/T sum_j (R[last,j] - zero_j) / (best_j - zero_j)",
+    HERE,
+    missing="an evaluation is missing or the best is the zero",
+)
+def normalised_performance(performance: Tensor, best: Tensor, zero: Tensor | float = 0.0) -> Tensor:
+    """Mean performance after the last block as a share of what is possible: 1 is optimal.
+
+    No range is taken from data, so numbers of two runs are comparable.
+
+    Args:
+        performance: float64 [blocks + 1, tasks], mean undiscounted returns.
+        best: each task's `Task.optimal_value(1.0)`.
+        zero: what counts as nothing, such as the return of a failure.
+    """
+    return ratio(performance[-1] - zero, best - zero)
+
+
+@defined(
+    "ctgraph_rl/regret", "sum over training intervals k of episodes_k * (best_k - return_k)", HERE, aggregate=torch.sum
+)
+def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
+    """Return that was lost while learning, against the optimal policy in every finished episode.
+
+    Episodes that a block's end cut are not counted. Intervals without a finished episode add 0, whatever their mean.
+
+    Args:
+        episodes: finished episodes of each interval, [intervals].
+        returns: their mean return; NaN without episodes.
+        best: optimal value of the interval's task; NaN where tasks with different ones took turns.
+    """
+    return torch.where(episodes == 0, 0.0, episodes * (best - returns))
+
+
+@defined(
+    "ctgraph_rl/first-reward",
+    "1/T sum_j frames_j to the first reward / (E[frames of a random episode] / P_R)",
+    PAPER,
+    missing="a goal was never reached",
+)
+def frames_to_first_reward(
+    frames: Sequence[Tensor],
+    episodes: Sequence[Tensor],
+    success_rates: Sequence[Tensor],
+    random_frames: Sequence[float],
+) -> Tensor:
+    """Frames until a goal was reached first, over those that the random policy needs on average: 1 is no better.
+
+    Undefined if a goal was never reached; the terms show the others.
+
+    Args:
+        frames: for each task, frames since its start at the end of each interval, [intervals].
+        episodes: for each task, finished episodes of each interval.
+        success_rates: for each task, share of each interval's episodes that reached the goal; NaN without episodes.
+        random_frames: for each task, `expected_random_frames`.
+    """
+    return _at_first_success(frames, episodes, success_rates) / torch.tensor(random_frames, dtype=torch.float64)
+
+
+@defined(
+    "ctgraph_rl/search-efficiency",
+    "1/T sum_j E[kappa_j] / episodes_j to the first reward",
+    PAPER,
+    missing="a goal was never reached",
+)
+def search_efficiency(
+    episodes: Sequence[Tensor], success_rates: Sequence[Tensor], expected_episodes: Sequence[float]
+) -> Tensor:
+    """Episodes that a search without repetition needs on average, over those until a goal was reached first.
+
+    1 is as good as trying end states one after the other, each once; the random policy is far below. Undefined if a
+    goal was never reached; the terms show the others.
+
+    Args:
+        episodes: for each task, finished episodes of each interval, [intervals].
+        success_rates: for each task, share of each interval's episodes that reached the goal; NaN without episodes.
+        expected_episodes: for each task E[kappa], `CTGraph.expected_search_episodes`.
+    """
+    played = [each.cumsum(0) for each in episodes]
+    first = _at_first_success(played, episodes, success_rates)
+    return torch.tensor(expected_episodes, dtype=torch.float64) / first
+
+
+@defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE)
+def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MASTERED) -> Tensor:
+    """How far the agent got on each task, by `STAGES`; the terms are the tasks' stages.
+
+    Args:
+        end_rates: share of a task's evaluation episodes that got to an end state, the goal's or another, [tasks].
+        success_rates: share that got to the goal.
+        mastered: share that counts as having reached a stage.
+    """
+    stages = (end_rates >= mastered).double() + (success_rates >= mastered).double()
+    return torch.where(end_rates.isnan() | success_rates.isnan(), torch.nan, stages)
+
+
+def expected_random_frames(branching_factor: int, depth: int, wait_prob: float) -> float:
+    """Mean frames until the uniformly random policy gets the reward: E[episode length] / P_R, by Wald's identity.
+
+    With b + 1 actions, a wait state is left for what follows with probability w = (1 - p) / (b + 1 - p) after
+    (b + 1) / (b + 1 - p) steps on average, and a decision state with b / (b + 1) after one; one step is at home.
+
+    Args:
+        branching_factor: b.
+        depth: d.
+        wait_prob: p.
+    """
+    b, p = branching_factor, wait_prob
+    wait, leaves, decides = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p), b / (b + 1)
+    reached = list(accumulate(range(depth), lambda share, _: share * leaves * decides, initial=1.0))
+    length = 1 + sum(share * wait for share in reached) + sum(share * leaves for share in reached[:-1])
+    return length / (leaves ** (depth + 1) / (b + 1) ** depth)
+
+
+def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:
+    """For each task, the count at the first success, float64 [tasks]; NaN without one."""
+    tasks = zip(counts, episodes, success_rates, strict=True)
+    return torch.tensor([_count_at_first_success(*task) for task in tasks], dtype=torch.float64)
+
+
+def _count_at_first_success(counts: Tensor, episodes: Tensor, success_rates: Tensor) -> float:
+    found = (success_rates > 0).nonzero().flatten().tolist()
+    if not found:
+        return math.nan
+    i, before = found[0], counts[found[0] - 1].item() if found[0] else 0
+    played = episodes[i].item()
+    position = (played + 1) / (round(played * success_rates[i].item()) + 1)
+    return before + (counts[i].item() - before) * position / played

@@ -1,0 +1,123 @@
+"""A metric as a record: the value with what it means, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from typing import ParamSpec
+
+import torch
+from torch import Tensor
+
+HERE = "ctgraph_rl"
+"""Source of what is defined here."""
+
+MASTERED = 0.9
+"""Share of episodes, or of the optimal value, from which on something counts as mastered."""
+
+Arguments = ParamSpec("Arguments")
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What a metric is.
+
+    Args:
+        id: short name of source and metric, such as ``lopez-paz2017/bwt``.
+        formula: the formula; tasks and blocks are counted from 1.
+        source: where it is defined.
+        partial: whether terms without a value are left out of the mean, and counted, as the source does; else one of
+            them makes the metric undefined.
+    """
+
+    id: str
+    formula: str
+    source: str
+    partial: bool = False
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric's value with what it means.
+
+    Args:
+        value: the value, in units of performance; None when undefined.
+        definition: id of the definition.
+        formula: the formula, with R for the performance matrix and tasks counted from 1.
+        source: where it is defined.
+        undefined: why there is no value.
+        n_undefined: number of terms of the formula without a value.
+        terms: the terms, in order; None for those without a value.
+    """
+
+    value: float | None
+    definition: str
+    formula: str
+    source: str
+    undefined: str | None = None
+    n_undefined: int = 0
+    terms: tuple[float | None, ...] = ()
+
+
+class Undefined(Exception):
+    """Raised by a function of terms where its definition says nothing; the message is the reason."""
+
+
+def defined(
+    definition: str,
+    formula: str,
+    source: str,
+    *,
+    partial: bool = False,
+    missing: str = "an evaluation is missing",
+    aggregate: Callable[[Tensor], Tensor] = torch.mean,
+) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
+    """Makes a metric of a function that returns the terms of its formula, NaN for a term without a value.
+
+    Args:
+        definition: id of the definition.
+        formula: the formula.
+        source: where it is defined.
+        partial: see `Definition`.
+        missing: why a term may be without a value.
+        aggregate: makes the value of the terms; the mean of all but a few.
+    """
+    meaning = Definition(definition, formula, source, partial)
+
+    def decorate(terms: Callable[Arguments, Tensor]) -> Callable[Arguments, Metric]:
+        @wraps(terms)
+        def metric(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
+            try:
+                return _metric(meaning, terms(*args, **kwargs).flatten(), missing, aggregate)
+            except Undefined as reason:
+                return undefined(metric, str(reason))
+
+        metric.definition = meaning  # type: ignore[attr-defined]
+        return metric
+
+    return decorate
+
+
+def undefined(metric: Callable[..., Metric], reason: str) -> Metric:
+    """A metric without a value, for a reason that its arguments cannot show."""
+    meaning: Definition = metric.definition  # type: ignore[attr-defined]
+    return Metric(None, meaning.id, meaning.formula, meaning.source, reason)
+
+
+def _metric(meaning: Definition, terms: Tensor, missing: str, aggregate: Callable[[Tensor], Tensor]) -> Metric:
+    has_value = terms.isfinite()
+    count, without = len(terms), int((~has_value).sum())
+    reason = None
+    if count == 0:
+        reason = "the formula has no terms here"
+    elif without == count or (without and not meaning.partial):
+        reason = f"{without} of {count} terms have no value: {missing}"
+    value = None if reason else aggregate(terms[has_value]).item()
+    shown = tuple(term if finite else None for term, finite in zip(terms.tolist(), has_value.tolist(), strict=True))
+    return Metric(value, meaning.id, meaning.formula, meaning.source, reason, without, shown)
+
+
+def ratio(above: Tensor, below: Tensor) -> Tensor:
+    """``above / below``, NaN where ``below`` is 0."""
+    return torch.where(below == 0, torch.nan, above / below)

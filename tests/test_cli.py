@@ -1,0 +1,179 @@
+"""``python -m curricula``, ``ctgraph-rl`` with a command, and the page that lists all curricula."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import curricula
+from ctgraph_rl import cli, run
+from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
+from curricula.__main__ import main as curricula_main
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "curricula.md"
+MARK = "<!-- python -m curricula --format markdown -->\n"
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Calls a command line; gives its exit code, what it printed and its errors."""
+
+    def call_(main, *words: str) -> tuple[int | str, str, str]:
+        monkeypatch.setattr(sys, "argv", ["program", *words])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call_
+
+
+def test_without_a_word_all_curricula_are_listed(call):
+    code, out, err = call(curricula_main)
+
+    su_b1 = curricula.load("su_b1_4tasks")
+    assert (code, err) == (0, "")
+    assert all(name in out for name in curricula.names())
+    assert re.search(rf"su_b1_4tasks +│ +1 │ +4 │ +819,200 │ {su_b1.fingerprint} │ Soltoggio", out)
+
+
+@pytest.mark.parametrize("form", ["text", "markdown", "latex"])
+def test_one_is_described_by_name(call, form):
+    code, out, err = call(curricula_main, "describe", "su_b1_4tasks", "--format", form)
+
+    assert (code, err) == (0, "")
+    for word in (curricula.load("su_b1_4tasks").fingerprint, "651", "45.5 seconds", "goal2.1"):
+        assert word in out
+    assert {"text": "┃ block ", "markdown": "| block |", "latex": r"\toprule"}[form] in out
+
+
+def test_one_is_written_and_described_from_its_file(call, tmp_path):
+    path = tmp_path / "mine.json"
+
+    code, by_name, _ = call(curricula_main, "describe", "su_b1_4tasks", "--json", str(path))
+    assert code == 0
+    assert Curriculum.from_json(path) == curricula.load("su_b1_4tasks")
+    assert call(curricula_main, "describe", str(path)) == (0, by_name, "")
+
+
+def test_figures_are_written(call, tmp_path):
+    files = [tmp_path / "graphs.pdf", tmp_path / "tasks.svg"]
+
+    code, *_ = call(
+        curricula_main, "describe", "su_b1_4tasks", "--figure", str(files[0]), "--similarity", str(files[1])
+    )
+
+    assert code == 0
+    assert files[0].read_bytes().startswith(b"%PDF") and b"<svg" in files[1].read_bytes()
+
+
+def test_the_estimate_of_time_follows_the_rate(call):
+    assert FRAMES_PER_SECOND == 18_000
+    _, out, _ = call(curricula_main, "describe", "su_b1_4tasks", "--frames-per-second", "1000")
+    assert "13.7 minutes at 1,000 frames/s, an estimate" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["describe", "su_b1_4task"], "unknown curriculum 'su_b1_4task'; did you mean 'su_b1_4tasks'?"),
+        (["describe", "none.json"], "none.json must be a JSON file that can be read"),
+        (["describe", "su_b1_4tasks", "--frames-per-second", "0"], "frames_per_second must be a number > 0, got 0.0"),
+        (["describe", "su_b1_4tasks", "--figure", "a.xyz"], "Format 'xyz' is not supported"),
+        (["describe", "su_b1_4tasks", "--json", "."], ". exists: choose another path, nothing is overwritten"),
+        (["--format", "yaml"], "invalid choice: 'yaml'"),
+    ],
+)
+def test_an_error_is_one_message(call, words, message):
+    code, _, err = call(curricula_main, *words)
+
+    assert code == 2
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_a_broken_file_is_named_with_its_key(call, tmp_path):
+    content = curricula.load("su_b1_4tasks").to_json()
+    content["tasks"][1]["graph"]["depth"] = 10**9
+    (tmp_path / "broken.json").write_text(json.dumps(content))
+
+    code, _, err = call(curricula_main, "describe", str(tmp_path / "broken.json"))
+
+    assert code == 2
+    assert "broken.json: tasks[1]: graph: depth=1000000000" in err
+
+
+def test_the_console_script_knows_the_same_command(call):
+    words = ("describe", "su_b1_4tasks", "--format", "markdown")
+
+    assert call(cli.main, "curricula", *words) == call(curricula_main, *words)
+    code, out, _ = call(cli.main, "curricula", "--help")
+    assert (code, out[:32]) == (0, "usage: ctgraph-rl curricula [-h]")
+
+
+@pytest.mark.parametrize("command", ["report", "export"])
+def test_the_console_script_passes_what_follows_a_command(call, command, tmp_path):
+    code, _, err = call(cli.main, command, str(tmp_path), *(["--out", "out"] if command == "export" else []))
+
+    assert code == 2
+    assert f"ctgraph_rl.{command}" in err and str(tmp_path) in err
+
+
+@pytest.mark.parametrize("words", [[], ["seed=1"], ["-m", "seed=1,2"], ["~logger"], ["+new=1"], ["--help"]])
+def test_anything_but_a_plain_word_is_a_run(call, monkeypatch, words):
+    seen = []
+    monkeypatch.setattr(run, "main", lambda: seen.append(sys.argv[1:]))
+
+    assert call(cli.main, *words)[0] == 0
+    assert seen == [words]
+
+
+def test_an_unknown_command_is_refused_with_the_choices(call):
+    code, *_ = call(cli.main, "curiculum")
+
+    assert str(code).startswith(
+        "error: unknown command 'curiculum'; did you mean 'curricula'? Commands: agents, curricula, "
+    )
+
+
+def test_a_folder_that_shadows_ours_is_refused(checkout, tmp_path):
+    (tmp_path / "curricula").mkdir()
+    (tmp_path / "curricula" / "__init__.py").write_text("")
+    code = "import sys; sys.argv = ['x', 'curricula']; from ctgraph_rl.cli import main; main()"
+    env = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{checkout}"}
+
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+
+    assert result.returncode == 1
+    assert "error: package 'curricula' was found in" in result.stderr
+
+
+def test_the_page_lists_what_the_command_prints(checkout):
+    command = [sys.executable, "-m", "curricula", "--format", "markdown"]
+
+    result = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=True)
+
+    _, listed = PAGE.read_text(encoding="utf-8").split(MARK)
+    assert listed == result.stdout
+    assert result.stdout == to_markdown(listing(map(curricula.load, curricula.names())))
+
+
+def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    names = {}
+
+    for code in blocks:
+        exec(compile(code, str(PAGE), "exec"), names)
+
+    assert len(blocks) >= 3
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".npy", ".pdf"}
+    assert names["back"] == names["mine"]

@@ -1,0 +1,348 @@
+"""What is told of a curriculum before any run: closed forms against the environment's chain, words, tables, figures."""
+
+import builtins
+import math
+from dataclasses import replace
+from itertools import product
+
+import pytest
+import torch
+from oracles import act, confounding, one_hot, surjective, uniform
+from rich.console import Console
+from torch import Tensor
+
+import curricula
+from ctgraph_rl import describe as module
+from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.describe import (
+    Sheet,
+    describe,
+    evaluation_in_words,
+    listing,
+    memory,
+    print_sheet,
+    protocol_in_words,
+    random_episode_length,
+    random_frames_to_goal,
+    to_latex,
+    to_markdown,
+)
+from ctgraph_rl.draw import draw_graphs, goals_by_graph
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.graph import StateType
+from ctgraph_rl.params import shared_bank
+from ctgraph_rl.switch import Drift
+from ctgraph_rl.task import Task
+from ctgraph_rl.tree import State, is_done, transition, tree_params
+
+A, B = surjective(goal=(1, 1)), surjective(goal=(1, 2))
+SHAPES = [(2, 1, 0.0), (2, 2, 0.5), (3, 2, 0.25), (2, 1, 0.9), (2, 4, 0.25), (4, 3, 0.0)]
+
+
+def make(*blocks: Block, **parts: object) -> Curriculum:
+    return Curriculum("made", 3, "tests", blocks or (Block(A, 64), Block(B, 128)), **parts)
+
+
+def chains(task: Task) -> tuple[Tensor, Tensor]:
+    """The uniformly random policy as Markov chains between states, from the environment's transition.
+
+    Returns:
+        Probabilities [n, n] that an episode goes on, home first, and that the search for the goal does: it goes on
+        from home when an episode ends elsewhere.
+    """
+    b, p, leaves = task.graph.branching_factor, task.graph.wait_prob, task.graph.num_decision_states
+    tree = tree_params(*map(single, (b, leaves, int(p * 2**63))), single(task.extra_end_step).bool())
+    goal = (StateType.END, leaves + task.goal_leaf)
+    places, moves = {(0, 0): 0}, {}
+    while len(moves) < len(places):
+        start = list(places)[len(moves)]
+        moves[start] = []
+        for action, (stays, prob) in product(range(b + 1), ((False, 1 - p), (True, p))):
+            state = State(single(start[0]).to(torch.uint8), single(start[1]))
+            after = transition(state, single(action), single(stays).bool(), tree)
+            key, ends = (after.state_type.item(), after.node.item()), is_done(after, tree).item()
+            moves[start].append((key, ends, prob / (b + 1)))
+            if not ends:
+                places.setdefault(key, len(places))
+    episode, search = torch.zeros(2, len(places), len(places), dtype=torch.float64)
+    for start, (key, ends, prob) in ((place, move) for place, each in moves.items() for move in each):
+        if not ends:
+            episode[places[start], places[key]] += prob
+        if key != goal:
+            search[places[start], 0 if ends else places[key]] += prob
+    return episode, search
+
+
+def single(value: int) -> Tensor:
+    return torch.tensor([int(value)])
+
+
+def expected_steps(chain: Tensor) -> float:
+    """Mean steps from the first state until the chain stops."""
+    identity = torch.eye(len(chain), dtype=torch.float64)
+    return torch.linalg.solve(identity - chain, torch.ones(len(chain), dtype=torch.float64))[0].item()
+
+
+def test_random_frames_by_hand():
+    # a wait is left with 1/3, a decision with 2/3: 1 + (1 + 2/9) + 1/3 steps, and 1/27 to the goal
+    assert random_episode_length(surjective(d=1)) == 23 / 9
+    assert random_frames_to_goal(surjective(d=1)) == 69.0
+    assert random_frames_to_goal(surjective(d=2)) == 651.0
+
+
+@pytest.mark.parametrize("extra", [False, True])
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_random_frames_are_those_of_the_environment_s_chain(shape, extra):
+    task = replace(surjective(*shape), extra_end_step=extra)
+
+    episode, search = chains(task)
+
+    assert random_episode_length(task) == pytest.approx(expected_steps(episode), rel=1e-12)
+    assert random_frames_to_goal(task) == pytest.approx(expected_steps(search), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "task", [surjective(2, 1, 0.5), replace(surjective(3, 2), extra_end_step=True)], ids=["p", "x"]
+)
+def test_random_episodes_of_the_environment_have_that_length(task):
+    env = CTGraphEnv([task] * 16_384, seed=5, check_actions=False)
+    policy, lengths = uniform(7), torch.zeros(16_384, dtype=torch.float64)
+    data = env.reset()
+    running = torch.ones(16_384, dtype=torch.bool)
+    while running.any():
+        lengths += running
+        data = act(env, policy(env), data)
+        running &= ~data["done"].squeeze(-1)
+
+    standard_error = lengths.std() / 128
+    assert abs(lengths.mean() - random_episode_length(task)) < 4.9 * standard_error  # two-sided 1e-6
+
+
+def test_more_frames_than_a_float_holds_are_infinite():
+    task = surjective(2, 60, 1 - 2**-53)
+
+    assert task.graph.reward_prob_random == 0.0
+    assert random_frames_to_goal(task) == math.inf
+    assert "inf" in describe(make(Block(task, 1)))[2].rows[0]
+
+
+@pytest.mark.parametrize(
+    "tasks",
+    [(A, B), (A, surjective(image_seed=2)), (confounding(read_rotation=3), confounding()), (one_hot(), one_hot(3))],
+)
+def test_memory_is_what_the_environment_holds(tasks):
+    bank, per_row = memory(make(*(Block(task, 1) for task in tasks)))
+
+    held = shared_bank(tasks, 1)
+    assert bank == held.images.numel()
+    assert per_row == 2 * math.prod(held.shape)
+
+
+def test_the_overview_says_what_a_reader_asks_for():
+    overview = dict(describe(make(), frames_per_second=10)[0].rows)
+
+    assert overview["version"] == "3"
+    assert overview["fingerprint"] == make().fingerprint
+    assert overview["frames"] == "192"
+    assert overview["memory"] == "720 bytes of images, and 288 for each row"
+    assert overview["time"] == "19.2 seconds at 10 frames/s, an estimate without evaluations"
+    with pytest.raises(ValueError, match="frames_per_second must be a number > 0, got 0"):
+        describe(make(), frames_per_second=0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "time"), [(192, "1 seconds"), (1, "3.2 minutes"), (0.01, "5.33 hours"), (0.0001, "22.2 days")]
+)
+def test_times_have_a_unit_that_fits(rate, time):
+    assert dict(describe(make(), rate)[0].rows)["time"].startswith(f"{time} at ")
+
+
+def test_the_protocol_is_said_in_words():
+    announced = " A new block ends all episodes, and the learner is told."
+
+    assert protocol_in_words(Protocol(), 4) == "The learner is not told its task." + announced
+    assert protocol_in_words(Protocol("one_hot", "hidden"), 4) == (
+        "Every observation comes with a one-hot task id of length 4. "
+        "A row goes over to the next block when its episode ends, and nobody is told."
+    )
+    assert "where a block begins and where it is evaluated" in protocol_in_words(Protocol("at_boundaries"), 4)
+
+
+def test_the_evaluation_is_said_in_words():
+    often = Evaluation(10, False, 5, before=False, every=2000, tasks="seen", held_out=(A,))
+
+    assert evaluation_in_words(Evaluation()) == (
+        "100 greedy episodes on each of all tasks: before training, at block ends."
+    )
+    assert evaluation_in_words(often) == (
+        "10 sampled episodes, 5 in a row on each of the tasks seen so far and 1 held out: "
+        "every 2,000 frames, at block ends."
+    )
+
+
+def test_blocks_are_rows_with_one_for_each_task():
+    sheet = describe(make(Block(A, 2000), Block((A, B, A), 30)))[1]
+
+    assert list(sheet.columns) == ["block", "task", "b", "d", "p", "goal", "frames"]
+    assert sheet.rows == (
+        ("1", "goal1.1", "2", "2", "0", "1.1", "2,000"),
+        ("2", "goal1.1", "2", "2", "0", "1.1", "30"),
+        ("", "goal1.2", "2", "2", "0", "1.2", ""),
+    )
+
+
+def test_a_switch_has_a_column():
+    sheet = describe(make(Block((A, B), 30, Drift(9)), Block(A, 1)))[1]
+
+    assert [row[-1] for row in sheet.rows] == ["Drift(episodes=9, together=False)", "", ""]
+    assert list(sheet.columns)[-1] == "switch"
+
+
+def test_tasks_have_their_closed_forms_and_ceilings():
+    sheet = describe(make())[2]
+
+    assert sheet.rows == (
+        ("goal1.1", "0.004115", "6", "651", "1", "1"),
+        ("goal1.2", "0.004115", "6", "651", "0", "0.25"),
+    )
+
+
+def test_a_ceiling_that_is_not_known_says_why_once():
+    tasks = (replace(A, step_reward=-0.1), replace(B, step_reward=-0.1))
+
+    sheet = describe(make(*(Block(task, 1) for task in tasks)))[2]
+
+    assert [row[-2:] for row in sheet.rows] == [("-", "-")] * 2
+    reasons = [note for note in sheet.notes if note.startswith("-: ")]
+    assert reasons == [
+        "-: the memoryless ceiling is exact only for step_reward = 0, where a longer episode is worth no more, got -0.1"
+    ]
+
+
+ODD = Sheet("a_b & [c]", {"x_1": "l", "E[rho]": "r"}, (("_a|b*\\\n", "1"), ("50% <#>$~^{}", '"')), ("note_1 |",))
+
+
+def test_markdown_shows_texts_as_they_are():
+    assert to_markdown(ODD).splitlines() == [
+        r"## a_b & \[c\]",
+        "",
+        r"| x_1 | E\[rho\] |",
+        "| :-- | --: |",
+        r"| \_a\|b\*\\ | 1 |",
+        r'| 50% \<#\>$~^{} | " |',
+        "",
+        r"note_1 \|",
+    ]
+
+
+def test_latex_shows_texts_as_they_are():
+    assert to_latex(ODD).splitlines() == [
+        "% a_b & [c]",
+        "% note_1 |",
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"x\_1 & $E[\rho]$ \\",
+        r"\midrule",
+        r"\_a\textbar{}b*\textbackslash{} & 1 \\",
+        r"50\% \textless{}\#\textgreater{}\$\textasciitilde{}\textasciicircum{}\{\} & \textquotedbl{} \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_a_long_column_is_broken_in_latex():
+    sheet = Sheet("t", {"a": "l", "b": "l"}, (("x", "y" * (module.WIDE + 1)),))
+
+    assert r"\begin{tabular}{lp{0.6\linewidth}}" in to_latex(sheet)
+
+
+def test_the_terminal_shows_every_cell_and_note_without_markup():
+    console = Console(record=True, width=80, file=open("/dev/null", "w"))  # noqa: SIM115
+
+    print_sheet(ODD, console)
+
+    text = console.export_text()
+    assert all(word in text for word in ("a_b & [c]", "E[rho]", "50% <#>$~^{}", "note_1 |"))
+
+
+@pytest.mark.parametrize("name", curricula.names())
+def test_every_named_curriculum_can_be_described(name):
+    curriculum = curricula.load(name)
+
+    overview, blocks, tasks = describe(curriculum)
+
+    assert overview.title == name
+    assert len(blocks.rows) == sum(map(len, curriculum.trained))
+    assert len(tasks.rows) == len(curriculum.tasks)
+    assert all(len(row) == len(sheet.columns) for sheet in (overview, blocks, tasks) for row in sheet.rows)
+
+
+def test_the_listing_has_a_row_for_each():
+    assert listing([make()]).rows == (("made", "3", "2", "192", make().fingerprint, "tests"),)
+
+
+def test_goals_are_gathered_by_graph_with_their_blocks():
+    wide, deep = surjective(12, 1, goal=(11,)), surjective(2, 20, goal=(1,) * 20)
+    blocks = (
+        Block(A, 1),
+        Block((A, B, surjective(image_seed=2)), 3),
+        Block(wide, 1),
+        Block(A, 1),
+        Block(deep, 1),
+        *[Block(B, 1)] * 3,
+    )
+
+    goals = goals_by_graph(make(*blocks))
+
+    assert goals == {
+        A.graph: {(1, 1): "11\nblocks 1, 2, 4", (1, 2): "12\n4 blocks"},
+        wide.graph: {(11,): "11\nblock 3"},
+        deep.graph: {(1,) * 20: "1111111...1111111\nblock 5"},
+    }
+
+
+@pytest.mark.parametrize("shapes", [[(2, 2)], [(2, 5), (3, 11), (30, 1), (1000, 2)], [(2, d) for d in range(1, 15)]])
+def test_graphs_of_any_size_are_drawn(tmp_path, shapes):
+    blocks = [Block(surjective(b, d, goal=goal), 1) for b, d in shapes for goal in ((1,) * d, (2,) * d)]
+
+    draw_graphs(make(*blocks), tmp_path / "graphs.png")
+
+    assert (tmp_path / "graphs.png").read_bytes().startswith(b"\x89PNG")
+
+
+def boxes_of_labels(curriculum: Curriculum, monkeypatch: pytest.MonkeyPatch) -> list[list]:
+    """Where the labels of each panel are, in pixels."""
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *rest, **options: drawn.append(figure))
+    draw_graphs(curriculum, "unused.png")
+    (figure,) = drawn
+    figure.canvas.draw()
+    return [[text.get_window_extent() for text in axes.texts] for axes in figure.axes]
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (2, 5), (3, 3), (2, 11)], ids=str)
+def test_labels_of_goals_do_not_overlap(monkeypatch, shape):
+    b, d = shape
+    goals = [tuple(1 + leaf // b**k % b for k in reversed(range(d))) for leaf in range(min(b**d, 40))]
+    curriculum = make(*(Block(surjective(b, d, goal=goal), 1) for goal in goals))
+
+    (boxes,) = boxes_of_labels(curriculum, monkeypatch)
+
+    assert len(boxes) == (8 if b**d > 32 else len(goals))
+    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
+
+
+def test_a_figure_without_matplotlib_names_the_extra(tmp_path, monkeypatch):
+    import_ = builtins.__import__
+
+    def without(name: str, *rest: object) -> object:
+        if name.startswith("matplotlib"):
+            raise ModuleNotFoundError(name)
+        return import_(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+
+    with pytest.raises(ModuleNotFoundError, match=r"figures need matplotlib: pip install 'ctgraph_rl\[plot\]'"):
+        draw_graphs(make(), tmp_path / "graphs.png")

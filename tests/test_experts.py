@@ -1,0 +1,111 @@
+"""Single-task experts: trained once, kept by fingerprint, named in the log, compared with."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from test_lifelong import ONE, TWO
+from test_run import command_line
+
+from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
+from ctgraph_rl.experts import expert_curriculum, find_or_train
+
+SETTINGS = {"agent": {"gamma": 0.9}, "seed": 0}
+
+
+def curriculum(*blocks: Block, **changes) -> Curriculum:
+    return Curriculum("mine", 1, "here", blocks or (Block(ONE, 12), Block(TWO, 24), Block(ONE, 36)), **changes)
+
+
+def write_result(trained: list):
+    """Stands for learning: keeps what is learned and writes a result."""
+
+    def learn(alone, run_dir):
+        trained.append(alone)
+        (run_dir / "metrics.json").write_text("{}")
+
+    return learn
+
+
+def test_an_expert_has_its_task_alone_for_the_frames_of_its_first_block():
+    evaluation = Evaluation(7, every=6, tasks="seen", held_out=())
+    told = Protocol("one_hot", num_task_ids=9, task_ids=(4, 2))
+
+    alone = expert_curriculum(curriculum(evaluation=evaluation, protocol=told), TWO)
+
+    assert alone.blocks == (Block(TWO, 24),)
+    assert alone.evaluation == Evaluation(7, every=6)
+    assert alone.protocol == Protocol("one_hot", num_task_ids=9, task_ids=(2,))
+    assert expert_curriculum(curriculum(), ONE).blocks == (Block(ONE, 12),)
+
+
+def test_hidden_boundaries_mean_nothing_to_a_single_task():
+    hidden = curriculum(protocol=Protocol(boundaries="hidden"))
+
+    assert expert_curriculum(hidden, ONE) == expert_curriculum(curriculum(), ONE)
+
+
+def test_an_expert_of_tasks_that_share_a_block_is_refused():
+    with pytest.raises(ValueError, match="experts need blocks of one task each"):
+        expert_curriculum(curriculum(Block((ONE, TWO), 12)), ONE)
+
+
+def test_no_expert_is_trained_twice(tmp_path):
+    trained, told = [], []
+
+    first = find_or_train(curriculum(), write_result(trained), tmp_path, SETTINGS, told.append)
+    again = find_or_train(curriculum(Block(TWO, 24)), write_result(trained), tmp_path, SETTINGS, told.append)
+
+    assert [alone.tasks for alone in trained] == [(ONE,), (TWO,)]
+    assert again[0].run_dir == first[1].run_dir
+    assert [expert.task for expert in first] == [1, 2]
+    assert ["found in" in line for line in told] == [False, False, True]
+    assert {path.name for path in tmp_path.iterdir()} == {expert.run_dir.name for expert in first}
+
+
+@pytest.mark.parametrize(
+    "change", [{"settings": {**SETTINGS, "seed": 1}}, {"evaluation": Evaluation(3)}, {"num_frames": 48}]
+)
+def test_another_seed_evaluation_or_budget_is_another_expert(tmp_path, change):
+    trained = []
+    find_or_train(curriculum(Block(ONE, 24)), write_result(trained), tmp_path, SETTINGS, print)
+
+    other = curriculum(Block(ONE, change.get("num_frames", 24)), evaluation=change.get("evaluation", Evaluation()))
+    find_or_train(other, write_result(trained), tmp_path, change.get("settings", SETTINGS), print)
+
+    assert len(trained) == 2
+
+
+def test_an_expert_that_fails_leaves_nothing(tmp_path):
+    def fail(alone, run_dir):
+        (run_dir / "run.jsonl").write_text("half")
+        raise FloatingPointError("NaN")
+
+    with pytest.raises(FloatingPointError):
+        find_or_train(curriculum(), fail, tmp_path, SETTINGS, print)
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_trains_its_experts_and_says_which_it_used(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    short = ["curriculum=fo_b1_4tasks", "curriculum.num_frames=512", "agent=ppo", "evaluation.every=256"]
+    small = ["agent.num_envs=16", "agent.num_steps=8", "agent.num_minibatches=2", "evaluation.num_episodes=4"]
+
+    codes = [
+        command_line(monkeypatch, *short, *small, "experts=true", f"hydra.run.dir={name}", *more)
+        for name, more in (("a", []), ("b", ["overwrite=true"]))
+    ]
+
+    said = capsys.readouterr().out
+    logs = [RunLog.read(tmp_path / name / "run.jsonl") for name in "ab"]
+    (used,) = logs[0].of_kind("experts")
+    metrics = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    assert codes == [None, None] or codes == [0, 0]
+    assert said.count("learns into runs/experts/") == said.count("found in runs/experts/") == 4
+    assert [expert["task"] for expert in used["experts"]] == [1, 2, 3, 4]
+    assert all((tmp_path / expert["run"] / "run.jsonl").exists() for expert in used["experts"])
+    assert logs[1].of_kind("experts")[0]["experts"] == used["experts"]
+    transfer = metrics["continual_world_forward_transfer"]
+    assert transfer["undefined"] is None or "the expert leaves nothing" in transfer["undefined"]

@@ -1,0 +1,167 @@
+"""All metrics of a run, from its curriculum and log."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, metrics
+from ctgraph_rl.paper import ct_su_b1
+from ctgraph_rl.scores import optimal_values, scores
+
+TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
+CURRICULUM = Curriculum("two", 1, "here", (Block(TASKS[0], 200), Block(TASKS[1], 200)), Evaluation(every=100))
+
+
+def evaluate(log: RunLog, moment: str, block: int, frames: int, *returns: float, **more: float) -> None:
+    for task, (label, value) in enumerate(zip(CURRICULUM.labels, returns, strict=False), 1):
+        where = {"block": block, "frames": frames, "task": task, "label": label, "held_out": False}
+        log.append("evaluation", moment=moment, **where, return_mean=value, success_rate=value, **more)
+
+
+def train(log: RunLog, block: int, frames: int, episodes: int, successes: int) -> None:
+    rate = successes / episodes if episodes else math.nan
+    log.append("training", block=block, frames=frames, episodes=episodes, return_mean=rate, success_rate=rate)
+
+
+@pytest.fixture
+def log() -> RunLog:
+    log = RunLog()
+    evaluate(log, "before", 0, 0, 0.0, 0.0)
+    train(log, 1, 100, 10, 1)
+    evaluate(log, "during", 1, 100, 0.5, 0.25)
+    train(log, 1, 200, 10, 10)
+    evaluate(log, "after", 1, 200, 1.0, 0.5)
+    train(log, 2, 300, 0, 0)
+    evaluate(log, "during", 2, 300, 0.5, 0.5)
+    train(log, 2, 400, 10, 5)
+    evaluate(log, "after", 2, 400, 0.25, 1.0, end_rate=1.0)
+    return log
+
+
+def expert(*returns: float) -> RunLog:
+    log = RunLog()
+    for i, value in enumerate(returns, 1):
+        train(log, 1, 100 * i, 4, round(4 * value))
+        evaluate(log, "after" if i == len(returns) else "during", 1, 100 * i, value)
+    return log
+
+
+def test_the_scores_hold_every_definition_once_with_the_summary_first(log):
+    found = scores(log, CURRICULUM)
+
+    assert set(found) == set(metrics.definitions())
+    assert list(found)[:4] == list(metrics.summary(log.performance(), CURRICULUM.trained))
+    assert all(
+        metric == found[name] for name, metric in metrics.of_matrix(log.performance(), CURRICULUM.trained).items()
+    )
+
+
+def test_what_is_known_in_closed_form_is_taken_from_the_tasks(log):
+    found = scores(log, CURRICULUM)
+
+    assert optimal_values(TASKS).tolist() == [1.0, 1.0]
+    assert found["normalised_performance"].terms == (0.25, 1.0)
+    assert found["stage_reached"].terms == (1.0, 2.0)
+    assert found["regret"].terms == (9.0, 0.0, 0.0, 5.0)
+    random_frames = metrics.expected_random_frames(2, 2, 0.0)
+    places = 100 * (11 / 2) / 10, 100 + 100 * (11 / 6) / 10
+    assert found["frames_to_first_reward"].terms == pytest.approx(
+        [place / random_frames for place in places], rel=1e-12
+    )
+    assert found["search_efficiency"].terms == pytest.approx([2.5 / (11 / 2), 2.5 / (11 / 6)], rel=1e-12)
+
+
+def test_tasks_are_learned_by_the_share_of_their_own_optimum():
+    doubled = replace(CURRICULUM, blocks=(CURRICULUM.blocks[0], Block(replace(TASKS[1], goal_reward=2.0), 200)))
+    log = RunLog()
+    for block, returns in ((0, (0.0, 0.0)), (1, (0.95, 0.0)), (2, (0.0, 1.5))):
+        if block:
+            train(log, block, 200 * block, 10, 5)
+        evaluate(log, "after", block, 200 * block, *returns)
+
+    assert scores(log, doubled)["tasks_learned"].terms == (1.0, 0.0)
+
+
+def test_without_experts_what_needs_them_is_undefined(log):
+    found = scores(log, CURRICULUM)
+
+    names = {name for name, metric in found.items() if metric.undefined == "no experts were given"}
+    assert names == {
+        *("relative_performance", "sample_efficiency"),
+        *("continual_world_forward_transfer", "forward_transfer_from_experts"),
+    }
+
+
+def test_experts_give_transfer_and_relative_performance(log):
+    found = scores(log, CURRICULUM, [expert(0.5, 0.75), expert(0.0, 0.5)])
+
+    assert found["continual_world_forward_transfer"].terms == pytest.approx(
+        [(0.75 - 0.625) / (1 - 0.625), (0.75 - 0.25) / (1 - 0.25)], abs=1e-12
+    )
+    own, alone = (1 + 10) + (1 + 100), (1 + 50) + (1 + 75)
+    assert found["relative_performance"].terms == pytest.approx([own / alone, (1 + 50) / (1 + 0)], abs=1e-12)
+
+
+def test_the_lifelong_metrics_are_on_the_known_range(log):
+    found = scores(log, CURRICULUM)
+
+    assert found["maintenance_of_evaluation"].terms == (-75.0, None)
+    assert found["forward_transfer_ratio"].value == 51.0
+
+
+def test_experts_that_do_not_fit_are_refused(log):
+    with pytest.raises(ValueError, match="experts must be one log for each of 2 tasks, got 1"):
+        scores(log, CURRICULUM, [expert(0.5, 0.75)])
+    with pytest.raises(ValueError, match="the expert of task 1 needs 2 evaluations as its block, got 1"):
+        scores(log, CURRICULUM, [expert(0.5), expert(0.5, 0.5)])
+
+
+def test_blocks_of_several_tasks_leave_the_lifelong_metrics_undefined(log):
+    together = replace(CURRICULUM, blocks=(Block(TASKS, 200), Block(TASKS[1], 200)))
+
+    found = scores(log, together)
+
+    assert "block 1 trains several" in found["performance_recovery"].undefined
+    assert found["search_efficiency"].undefined == "needs first blocks that train one task each"
+    assert found["regret"].value == 14.0
+
+
+def test_a_regret_against_different_optima_in_one_block_is_unknown(log):
+    together = replace(CURRICULUM, blocks=(Block((TASKS[0], replace(TASKS[1], goal_reward=2.0)), 200),) * 2)
+
+    assert scores(log, together)["regret"].value is None
+
+
+def test_an_optimum_that_is_not_known_is_said(log, monkeypatch):
+    monkeypatch.setattr("ctgraph_rl.values.MAX_ENUMERATED_STATES", 1)
+    from ctgraph_rl import Gradient
+
+    large = replace(TASKS[1], reward_fn=Gradient())
+
+    found = scores(log, replace(CURRICULUM, blocks=(CURRICULUM.blocks[0], Block(large, 200))))
+
+    assert (found["normalised_performance"].value, found["normalised_performance"].n_undefined) == (None, 1)
+    assert found["mean_training_performance"].undefined == "a task's optimal value is not known: its graph is too large"
+
+
+def test_a_run_that_was_hardly_evaluated_has_undefined_scores_and_does_not_fail():
+    log = RunLog()
+    for block in (1, 2):
+        train(log, block, 200 * block, 10, 5)
+    evaluate(log, "during", 1, 100, 0.5)
+
+    found = scores(log, CURRICULUM)
+
+    defined = {name for name, metric in found.items() if metric.value is not None}
+    assert defined == {"regret", "frames_to_first_reward", "search_efficiency"}
+    assert found["performance_recovery"].undefined == "lifelong metrics need an evaluation of every task"
+    assert found["average_performance"].n_undefined == found["normalised_performance"].n_undefined == 2
+
+
+def test_no_score_is_infinite_or_nan(log):
+    values = [metric.value for metric in scores(log, CURRICULUM, [expert(1.0, 1.0), expert(0.0, 0.0)]).values()]
+
+    assert all(value is None or math.isfinite(value) for value in values)
