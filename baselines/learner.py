@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ctgraph_rl.checks import at_least_one, positive, require
 
 LARGEST_WEIGHT = 1e12
 """Beyond this a network has diverged, and its outputs soon overflow."""
+
+OPTIMISERS = ("adam", "rmsprop")
 
 
 class Learner(nn.Module):
@@ -24,6 +28,13 @@ class Learner(nn.Module):
         max_grad_norm: gradients are scaled down to this norm.
     """
 
+    memory: ClassVar[bool] = False
+    """Whether what it did and saw earlier in an episode can change what it does."""
+
+    solves: ClassVar[str]
+    """What it can solve in principle, in a few words."""
+
+    policy: TensorDictModuleBase
     optimiser: torch.optim.Optimizer
 
     def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float) -> None:
@@ -35,7 +46,11 @@ class Learner(nn.Module):
         """No recurrent state."""
         return TensorDict(batch_size=[num_envs])
 
-    def start_task(self) -> None:
+    def policy_for(self, task: int) -> TensorDictModuleBase:
+        """The policy that acts in a task; the same for all."""
+        return self.policy
+
+    def start_task(self, task: int | None = None) -> None:
         """Nothing to do."""
 
     def end_task(self) -> None:
@@ -66,6 +81,26 @@ class Learner(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         self.optimiser.load_state_dict(state["optimiser"])
+
+
+def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
+    """The optimiser of a name in `OPTIMISERS`, otherwise as PyTorch sets it."""
+    if name == "rmsprop":
+        return torch.optim.RMSprop(parameters, lr=learning_rate)
+    return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+
+
+def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is one of the choices."""
+    return [
+        (value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        for name, value in values.items()
+    ]
+
+
+def true_or_false(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is a bool."""
+    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in values.items()]
 
 
 def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:

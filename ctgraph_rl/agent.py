@@ -34,18 +34,22 @@ class Agent(Protocol):
     """
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """What acts in a task, counted from 0, where the protocol tells the task; mostly `policy` itself."""
+        """What acts in the task with an id, where the protocol gives ids at boundaries; mostly `policy` itself."""
         ...
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """The recurrent state of ``num_envs`` rows before their first observation; empty without memory."""
+        """The recurrent state of ``num_envs`` rows before their first observation; empty without memory.
+
+        Every episode starts with it, unless it has a key ``trial``: such a state lasts over episodes, and the policy
+        starts it anew itself.
+        """
         ...
 
     def start_task(self, task: int | None = None) -> None:
         """Called before the first batch of a block whose start is announced.
 
         Args:
-            task: position of the task in the curriculum, from 0, where the protocol tells it; None where it is hidden.
+            task: the task's id, where the curriculum's protocol gives it at boundaries; else None.
         """
         ...
 

@@ -26,6 +26,10 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 InitialState = Callable[[int], TensorDict]
 
 
+TRIAL = "trial"
+"""A recurrent state with this key lasts over episodes: the policy starts it anew itself, where a trial begins."""
+
+
 class Progress(Protocol):
     """What `learn_curriculum` tells while it runs."""
 
@@ -268,6 +272,8 @@ def _act(
     if start.is_empty():
         return step, following
     state = step["next"].select(*start.keys())
+    if TRIAL in start.keys():  # noqa: SIM118, a TensorDict iterates over rows
+        return step, following.update(state)
     return step, following.update(torch.where(following["is_init"].squeeze(-1), start, state))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from inspect import Parameter, signature
 from itertools import takewhile
@@ -50,10 +51,10 @@ class Recorder:
         curriculum: what is learned.
         run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
         seed: of the run; evaluations derive theirs from it, in [0, 2**63).
-        about: what else the first line of the log should tell, such as the learner's name and settings.
+        about: what else the first line of the log should tell, such as the learner's name and settings, as JSON.
 
     Raises:
-        ValueError: for values out of range.
+        ValueError: for values out of range, before anything is written.
         FileExistsError: if the directory holds a log.
     """
 
@@ -67,15 +68,20 @@ class Recorder:
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
+            ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
+            (_is_json(about), f"about must be plain JSON values by name, got {about!r}"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
-        if self.run_dir is not None:
-            self.run_dir.mkdir(parents=True, exist_ok=True)
-        self.log = RunLog(None if self.run_dir is None else self.run_dir / "run.jsonl")
+        path = None if self.run_dir is None else self.run_dir / "run.jsonl"
+        if path is not None:
+            if path.exists():
+                raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self.log = RunLog(path)
         self.log.append("run", **provenance(curriculum), config={"seed": seed, **(about or {})})
         self._examiner = Examiner(curriculum, seed, self.log)
-        self._frames = -1
+        self._frames, self._trained = -1, 0
 
     @property
     def moments(self) -> tuple[int, ...]:
@@ -111,17 +117,35 @@ class Recorder:
         )
         require((frames > self._frames, f"frames must grow: {frames} comes after {self._frames}"))
         acts = self._adapted(policy, policy_for, frames)
-        self._frames = frames
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
         self._examiner.evaluate(acts, frames, where)
+        self._frames = frames
         return {m["label"]: m["return_mean"] for m in _last(self.log.of_kind("evaluation"), frames)}
 
     def training(self, frames: int, **values: Any) -> None:
-        """Log what was measured while training, such as ``return_mean`` and ``episodes``, after ``frames`` frames."""
+        """Log what was measured while training since the last time, or the start of the block.
+
+        Args:
+            frames: frames learned from so far, more than the last time.
+            values: numbers by name: ``return_mean``, ``success_rate`` and ``length_mean`` of the finished ``episodes``,
+                which metrics use, and any others.
+
+        Raises:
+            ValueError: for frames out of order or beyond the curriculum, and values that are no numbers.
+        """
         last = self.curriculum.num_frames
-        require((is_int(frames, 1, last), f"frames must be an integer in 1..{last}, the curriculum's, got {frames!r}"))
+        numbers = {name: _number(value) for name, value in values.items()}
+        no_numbers = [name for name, value in numbers.items() if not isinstance(value, (int, float, type(None)))]
+        taken = sorted({"kind", "block", "seconds"} & set(values))
+        require(
+            (is_int(frames, 1, last), f"frames must be an integer in 1..{last}, the curriculum's, got {frames!r}"),
+            (not no_numbers, f"{', '.join(no_numbers)} must be numbers or None; leave out what is none"),
+            (not taken, f"{', '.join(taken)} are fields of every line of the log: choose other names"),
+        )
+        require((frames > self._trained, f"frames must grow: {frames} comes after {self._trained}"))
+        self._trained = frames
         common = {"episodes": 0, "return_mean": None, "success_rate": None, "length_mean": None}
-        self.log.append("training", block=self.curriculum.block_at(frames), frames=frames, **{**common, **values})
+        self.log.append("training", block=self.curriculum.block_at(frames), frames=frames, **{**common, **numbers})
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -155,6 +179,19 @@ class Recorder:
         unknown = [task for task in self._examiner.examined(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
         return by_slices([adapt(policy_for(ids[task]), greedy) for task in self._examiner.examined(frames)])
+
+
+def _is_json(about: object) -> bool:
+    try:
+        json.dumps(about)
+    except (TypeError, ValueError):
+        return False
+    return about is None or isinstance(about, Mapping)
+
+
+def _number(value: Any) -> Any:
+    """A scalar of NumPy, torch or JAX as a number of Python; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
 
 
 def _last(measurements: list[dict[str, Any]], frames: int) -> Iterable[dict[str, Any]]:

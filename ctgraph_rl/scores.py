@@ -11,8 +11,10 @@ from torch import Tensor
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.describe import random_frames_to_goal
 from ctgraph_rl.log import RunLog
-from ctgraph_rl.metrics import Metric
+from ctgraph_rl.metrics import Curves, Metric
+from ctgraph_rl.metrics.record import Undefined
 from ctgraph_rl.task import Task
 
 NO_EXPERTS = "no experts were given"
@@ -30,14 +32,14 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
         experts: for each of ``curriculum.tasks``, the log of an agent that learned it alone.
 
     Raises:
-        ValueError: for another number of experts, or experts that were not evaluated as often as their tasks.
+        ValueError: for another number of experts.
     """
     count, trained = len(curriculum.tasks), curriculum.trained
     given = experts is None or len(experts) == count
     require((given, f"experts must be one log for each of {count} tasks, got {len(experts or ())}"))
     return {
         **metrics.of_matrix(log.performance(count), trained),
-        **metrics.of_curves(log.curves(trained)),
+        **metrics.of_curves(_curves(log, curriculum)),
         **_against_the_optimum(log, curriculum),
         **_lifelong(log, curriculum, experts),
         **_transfer(log, curriculum, experts),
@@ -56,12 +58,19 @@ def _optimal_value(task: Task) -> float:
         return math.nan
 
 
+def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
+    """The evaluation curves; where nothing was evaluated, one evaluation without values."""
+    if log.of_kind("evaluation"):
+        return log.curves(curriculum.trained)
+    return Curves(torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64), (0,), (0,), curriculum.trained)
+
+
 def _against_the_optimum(log: RunLog, curriculum: Curriculum) -> dict[str, Metric]:
     best = optimal_values(curriculum.tasks)
     zero = torch.tensor([task.fail_reward for task in curriculum.tasks], dtype=torch.float64)
     count = len(curriculum.tasks)
     end_rates, success_rates = log.last("end_rate", count), log.last("success_rate", count)
-    curves = log.curves(curriculum.trained)
+    curves = _curves(log, curriculum)
     return {
         "tasks_learned": metrics.tasks_learned(curves, metrics.MASTERED * best),
         "normalised_performance": metrics.normalised_performance(log.performance(count), best, zero),
@@ -88,10 +97,10 @@ def _first_rewards(log: RunLog, curriculum: Curriculum) -> dict[str, Metric]:
         reason = "needs first blocks that train one task each"
         names = ("frames_to_first_reward", "search_efficiency")
         return {name: metrics.undefined(getattr(metrics, name), reason) for name in names}
-    ends, graphs = log.ends(), [task.graph for task in curriculum.tasks]
-    frames = [log.training("frames", block + 1) - ends[block] for block in first]
+    starts, graphs = (0, *curriculum.ends), [task.graph for task in curriculum.tasks]
+    frames = [log.training("frames", block + 1) - starts[block] for block in first]
     episodes, rates = ([log.training(name, block + 1) for block in first] for name in ("episodes", "success_rate"))
-    random = [metrics.expected_random_frames(g.branching_factor, g.depth, g.wait_prob) for g in graphs]
+    random = [random_frames_to_goal(task) for task in curriculum.tasks]
     return {
         "frames_to_first_reward": metrics.frames_to_first_reward(frames, episodes, rates, random),
         "search_efficiency": metrics.search_efficiency(episodes, rates, [g.expected_search_episodes for g in graphs]),
@@ -108,7 +117,8 @@ def _lifelong(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         return {metric.__name__: metrics.undefined(metric, str(reason)) for metric in functions}
     lowest = [task.fail_reward for task in curriculum.tasks]
     ranges = dict(zip(curriculum.labels, zip(lowest, best.tolist(), strict=True), strict=True))
-    curves = dict(zip(curriculum.labels, [[_returns(expert)] for expert in experts or ()], strict=False))
+    returns = [_returns(expert) for expert in experts or ()]
+    curves = {label: [curve] for label, curve in zip(curriculum.labels, returns, strict=False) if len(curve)}
     found = metrics.of_regimes(*metrics.prepare(regimes, curves, ranges))
     if experts is None:
         found |= {metric.__name__: metrics.undefined(metric, NO_EXPERTS) for metric in metrics.AGAINST_EXPERTS}
@@ -122,17 +132,20 @@ def _returns(expert: RunLog) -> Tensor:
 
 
 def _transfer(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> dict[str, Metric]:
-    """Forward transfer against experts, by both areas."""
-    found = {}
-    for metric, trapezoids in (
-        (metrics.continual_world_forward_transfer, False),
-        (metrics.forward_transfer_from_experts, True),
-    ):
-        if experts is None:
-            found[metric.__name__] = metrics.undefined(metric, NO_EXPERTS)
-        else:
-            own = metrics.stage_areas(log.curves(curriculum.trained), trapezoids)
-            curves = [expert.curves([(0,)]) for expert in experts]
-            metrics.check_experts(log.curves(curriculum.trained), [curve.own_stage(0) for curve in curves])
-            found[metric.__name__] = metric(own, torch.cat([metrics.stage_areas(each, trapezoids) for each in curves]))
-    return found
+    """Forward transfer against experts, by both areas; both definitions are of performance whose best is 1."""
+    functions = {metrics.continual_world_forward_transfer: False, metrics.forward_transfer_from_experts: True}
+    try:
+        require((experts is not None, NO_EXPERTS))
+        ones = torch.ones(len(curriculum.tasks), dtype=torch.float64)
+        best_is_1 = torch.allclose(optimal_values(curriculum.tasks), ones, rtol=0, atol=1e-9)
+        require((best_is_1, "the definition needs tasks whose optimal value is 1"))
+        own, alone = _curves(log, curriculum), [expert.curves([(0,)]) for expert in experts or ()]
+        metrics.check_experts(own, [curve.own_stage(0) for curve in alone])
+    except (ValueError, Undefined) as reason:
+        return {metric.__name__: metrics.undefined(metric, str(reason)) for metric in functions}
+    return {
+        metric.__name__: metric(
+            metrics.stage_areas(own, trapezoids), torch.cat([metrics.stage_areas(each, trapezoids) for each in alone])
+        )
+        for metric, trapezoids in functions.items()
+    }

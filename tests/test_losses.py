@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from test_agents import ONE_HOT_TASK, batches, learnt_from
 from torch import nn
@@ -20,23 +21,17 @@ def test_images_reach_the_network_between_zero_and_one():
     torch.testing.assert_close(features, torch.full((1, 3), 1.6))
 
 
-def test_the_entropy_of_lstm_ppo_is_rewarded_and_the_critics_error_is_weighed(small_agent):
-    agent = small_agent("lstm_ppo", [ct_su_b1()], "agent.entropy_coeff=0.25", "agent.critic_coeff=2.0")
+@pytest.mark.parametrize("name", ["a2c", "lstm_ppo", "ppo", "ppo_count", "rl2"])
+def test_entropy_is_rewarded_and_the_critics_error_is_weighed(small_agent, name):
+    agent = small_agent(name, [ct_su_b1()], "agent.entropy_coeff=0.25", "agent.critic_coeff=2.0")
     minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[0]
 
     losses = agent.loss(minibatch)
 
-    values = agent.critic(minibatch.select("memory") if "memory" in minibatch else _remembered(agent, minibatch))
+    values = agent.critic(minibatch.select(agent.features))
     error = (values["state_value"] - minibatch["value_target"]).square().mean()
     torch.testing.assert_close(losses["loss_entropy"], -0.25 * losses["entropy"])
     torch.testing.assert_close(losses["loss_critic"], 2.0 * error)
-
-
-def _remembered(agent, minibatch):
-    from torchrl.modules import set_recurrent_mode
-
-    with set_recurrent_mode(True):
-        return agent.trunk(minibatch.select(*agent.trunk.in_keys))
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm(small_agent):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 import curricula
@@ -330,6 +332,9 @@ def test_what_is_missing_is_listed_with_reasons_and_not_loaded():
     assert all(entry.name and entry.what and entry.why for entry in MISSING)
     assert {entry.name for entry in MISSING}.isdisjoint(curricula.names())
     assert curricula.MISSING is MISSING
+    page = (Path(__file__).resolve().parents[1] / "docs" / "curricula.md").read_text(encoding="utf-8")
+    rows = "".join(f"| **{entry.name}**: {entry.what} | {entry.why} |\n" for entry in MISSING)
+    assert rows in page
 
 
 @pytest.mark.parametrize("name", [name for name in curricula.names() if "ct28" in name])

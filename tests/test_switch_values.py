@@ -407,7 +407,7 @@ class Fixed:
     def initial_state(self, num_envs):
         return TensorDict(batch_size=[num_envs])
 
-    def start_task(self):
+    def start_task(self, task=None):
         pass
 
     def learn(self, batch):

@@ -1,0 +1,130 @@
+"""PPO with a bonus for rarely seen observations, so that it explores where rewards are far.
+
+Counts of hashed observations, "#Exploration", Tang et al. 2017 (arXiv 1611.04717): a step that leads to an observation
+is paid coeff / sqrt(times that its hash was seen), in addition to the environment's reward.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+
+from baselines.policy_gradient import loss_weight
+from baselines.ppo import PPO
+from ctgraph_rl.checks import is_int, require
+
+
+class SimHashCounts(nn.Module):
+    """How often observations with the same signs under random projections were seen.
+
+    Args:
+        num_inputs: numbers in an observation.
+        high: largest value of an observation.
+        num_bits: projections; observations share a count where all signs agree.
+    """
+
+    projection: Tensor
+    counts: Tensor
+
+    def __init__(self, num_inputs: int, high: float, num_bits: int) -> None:
+        super().__init__()
+        self.num_inputs, self.scale = num_inputs, 2 / high
+        self.register_buffer("projection", torch.randn(num_inputs, num_bits))
+        self.register_buffer("counts", torch.zeros(2**num_bits, dtype=torch.int64))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Count a batch of uint8 observations; returns how often each was seen by now, int64 [n]."""
+        flat = observation.reshape(-1, self.num_inputs).float() * self.scale - 1
+        signs = (flat @ self.projection > 0).long()
+        codes = (signs << torch.arange(signs.shape[1], device=signs.device)).sum(dim=1)
+        self.counts += codes.bincount(minlength=len(self.counts))
+        return self.counts[codes]
+
+
+class PPOCount(PPO):
+    """PPO with a count-based exploration bonus.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_envs: rows that it learns from.
+        num_steps: steps of each row in a batch.
+        hidden_size: width of all layers.
+        num_layers: layers before the heads.
+        optimiser: ``adam`` or ``rmsprop``.
+        learning_rate: of the optimiser.
+        gamma: discount factor.
+        gae_lambda: lambda of the generalised advantage estimate.
+        normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
+        clip_epsilon: how far the probability ratio may move.
+        entropy_coeff: weight of the entropy bonus.
+        critic_coeff: weight of the critic's loss, a mean squared error.
+        num_epochs: passes over a batch.
+        num_minibatches: minibatches a pass; they split the frames.
+        max_grad_norm: gradients are scaled down to this norm.
+        bonus_coeff: bonus for an observation that was never seen before.
+        num_hash_bits: bits of the hash, at most 24; more bits tell more observations apart.
+    """
+
+    solves = "fully observable tasks (CT-FO) whose goal random actions hardly ever reach"
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        num_envs: int,
+        num_steps: int,
+        hidden_size: int,
+        num_layers: int,
+        optimiser: str,
+        learning_rate: float,
+        gamma: float,
+        gae_lambda: float,
+        normalize_advantage: bool,
+        clip_epsilon: float,
+        entropy_coeff: float,
+        critic_coeff: float,
+        num_epochs: int,
+        num_minibatches: int,
+        max_grad_norm: float,
+        bonus_coeff: float,
+        num_hash_bits: int,
+    ) -> None:
+        bits = (is_int(num_hash_bits, 1, 24), f"num_hash_bits must be an integer in 1..24, got {num_hash_bits!r}")
+        require(bits, *loss_weight(bonus_coeff=bonus_coeff))
+        super().__init__(
+            observation_spec,
+            action_spec,
+            num_envs,
+            num_steps,
+            hidden_size,
+            num_layers,
+            optimiser,
+            learning_rate,
+            gamma,
+            gae_lambda,
+            normalize_advantage,
+            clip_epsilon,
+            entropy_coeff,
+            critic_coeff,
+            num_epochs,
+            num_minibatches,
+            max_grad_norm,
+        )
+        spec = observation_spec["observation"]
+        self.bonus_coeff = bonus_coeff
+        self.seen = SimHashCounts(spec.shape.numel(), spec.space.high.max().item(), num_hash_bits)
+
+    def start_task(self, task: int | None = None) -> None:
+        """Everything is new again."""
+        self.seen.counts.zero_()
+
+    def reward(self, batch: TensorDictBase) -> Tensor:
+        """The environment's reward plus the bonus for what each step led to; counts the batch."""
+        return super().reward(batch) + self.bonus(batch["next", "observation"]).view(*batch.shape, 1)
+
+    def bonus(self, observation: Tensor) -> Tensor:
+        """Count observations and return the bonus for each, float32 [n]."""
+        return self.bonus_coeff * self.seen(observation).float().rsqrt()

@@ -1,0 +1,149 @@
+"""What agents that learn action values share: epsilon-greedy exploration, replay, a target network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
+from torchrl.data.postprocs import MultiStep
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.modules import EGreedyModule
+from torchrl.objectives import HardUpdate
+from torchrl.objectives.common import LossModule
+
+from baselines.learner import Learner, make_optimiser, mean_measurements, one_of
+from baselines.prioritized import PrioritySampler
+from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
+
+
+class QLearner(Learner):
+    """Learns action values from replayed experience; explores by random actions, less and less within a task.
+
+    A class that derives from it calls `act_with` with its networks, says what to store by `experience`, and gives the
+    loss.
+
+    Args:
+        num_envs: rows that it learns from.
+        num_steps: steps of each row between two rounds of updates.
+        gamma: discount factor.
+        n_steps: steps of a multi-step target (uncorrected).
+        num_items: items that the replay buffer keeps.
+        batch_size: items that a gradient step learns from.
+        num_updates: gradient steps after each batch of data.
+        target_update_interval: gradient steps between two copies to the target network.
+        eps_init: exploration at the start of a task.
+        eps_end: exploration after ``annealing_num_steps``.
+        annealing_num_steps: frames of a task over which exploration falls linearly.
+        max_grad_norm: gradients are scaled down to this norm.
+        replay_on_task_change: ``clear`` or ``keep`` the replay buffer where a task change is announced.
+        priority_alpha: how much more often surprising items are replayed; 0 is uniform (Schaul et al. 2016, arXiv
+            1511.05952).
+        priority_beta: how much of that the loss corrects, in [0, 1].
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        num_steps: int,
+        gamma: float,
+        n_steps: int,
+        num_items: int,
+        batch_size: int,
+        num_updates: int,
+        target_update_interval: int,
+        eps_init: float,
+        eps_end: float,
+        annealing_num_steps: int,
+        max_grad_norm: float,
+        replay_on_task_change: str,
+        priority_alpha: float = 0.0,
+        priority_beta: float = 0.0,
+    ) -> None:
+        super().__init__(num_envs, num_steps, max_grad_norm)
+        counts = {"n_steps": n_steps, "batch_size": batch_size, "num_updates": num_updates}
+        require(
+            *at_least_one(**counts, target_update_interval=target_update_interval),
+            *at_least_one(annealing_num_steps=annealing_num_steps),
+            *positive(gamma=gamma),
+            *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end, priority_beta=priority_beta),
+            *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),
+            (is_real(priority_alpha, 0), f"priority_alpha must be a number >= 0, got {priority_alpha!r}"),
+        )
+        require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
+        self.num_updates, self.replay_on_task_change = num_updates, replay_on_task_change
+        self.eps_range = float(eps_init), float(eps_end)
+        self.annealing_batches = max(1, annealing_num_steps // (num_envs * num_steps))
+        self.target_update_interval = target_update_interval
+        self.multi_step = MultiStep(gamma, n_steps)
+        self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
+        self.prioritized = priority_alpha != 0
+        self.replay = make_replay(num_items, batch_size, priority_alpha, priority_beta)
+
+    def act_with(
+        self,
+        greedy: TensorDictModuleBase,
+        objective: LossModule,
+        action_spec: TensorSpec,
+        learning_rate: float,
+        *state: Any,
+    ) -> None:
+        """Act with a network's best action, explored from, and learn its parameters.
+
+        Args:
+            greedy: writes the best ``action``.
+            objective: has the network and its target network.
+            action_spec: what exploration draws from.
+            learning_rate: of Adam.
+            state: keys of the network's recurrent state, as it writes them.
+        """
+        self.exploration = EGreedyModule(action_spec, *self.eps_range, self.annealing_batches)
+        self.policy = TensorDictSequential(greedy, self.exploration, selected_out_keys=["action", *state])
+        self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
+        self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
+
+    def start_task(self, task: int | None = None) -> None:
+        """Explore anew; forget the old task's experience if so configured."""
+        self.exploration.eps.copy_(self.exploration.eps_init)
+        if self.replay_on_task_change == "clear":
+            self.replay.empty()
+
+    def experience(self, batch: TensorDictBase) -> TensorDictBase:
+        """What the replay buffer stores of a batch with multi-step rewards, [items]."""
+        raise NotImplementedError
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Store a batch, take gradient steps on replayed items, explore less; returns mean measurements."""
+        self.replay.extend(self.experience(self.multi_step(batch)))
+        steps = [self._update() for _ in range(self.num_updates)]
+        self.exploration.step()
+        return {**mean_measurements(steps), "exploration": self.exploration.eps.item()}
+
+    def _update(self) -> dict[str, Tensor]:
+        sample = self.replay.sample()
+        items = sample.to(next(self.parameters()).device)  # the buffer stays on the CPU
+        measured = self.gradient_step(items)
+        if self.prioritized:
+            squared = items["td_error"].flatten().cpu()
+            self.replay.update_priority(sample["index"], squared.sqrt())
+        self.target_update.step()
+        return measured
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The optimiser's state, the replay buffer and the gradient steps since the last copy to the target network."""
+        own = {"replay": self.replay.state_dict(), "target_age": self.target_update.counter}
+        return {**super().get_extra_state(), **own}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` gave."""
+        super().set_extra_state(state)
+        self.replay.load_state_dict(state["replay"])
+        self.target_update.counter = state["target_age"]
+
+
+def make_replay(num_items: int, batch_size: int, alpha: float, beta: float) -> TensorDictReplayBuffer:
+    """A replay buffer, prioritized where ``alpha`` is not 0."""
+    sampler = PrioritySampler(num_items, alpha, beta) if alpha else RandomSampler()
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(num_items), sampler=sampler, batch_size=batch_size)

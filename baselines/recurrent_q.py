@@ -1,0 +1,175 @@
+"""What recurrent Q-learners share: an LSTM, replayed sequences with the state they began with, and double targets.
+
+Sequences are the rows of the batches as they were collected, with the stored state of the LSTM at their first step
+(Kapturowski et al. 2019, R2D2); the state starts anew where ``is_init`` is set. One more step is kept after the last
+one, to bootstrap from.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase, pad
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+from torchrl.modules import QValueActor, set_recurrent_mode
+from torchrl.objectives.common import LossModule
+
+from baselines.networks import STATE_KEYS, recurrent, zero_state
+from baselines.q_learning import QLearner
+from ctgraph_rl.checks import at_least_one, is_int, positive, require
+
+
+class Quantiles(nn.Module):
+    """A linear layer to K numbers per action, whose mean is the action's value.
+
+    Args:
+        num_features: width of the input.
+        num_actions: A.
+        num_quantiles: K.
+    """
+
+    def __init__(self, num_features: int, num_actions: int, num_quantiles: int) -> None:
+        super().__init__()
+        self.shape = (num_actions, num_quantiles)
+        self.linear = nn.Linear(num_features, num_actions * num_quantiles)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Float32 [..., num_features] to values [..., A] and quantiles [..., A, K]."""
+        quantiles = self.linear(features).unflatten(-1, self.shape)
+        return quantiles.mean(dim=-1), quantiles
+
+
+class RecurrentTargets(LossModule):
+    """Predicted quantiles of the actions taken, and what they should be.
+
+    Args:
+        network: reads sequences, writes ``quantiles`` [B, L, A, K].
+    """
+
+    value_network: TensorDictSequential
+    value_network_params: TensorDictBase
+    target_value_network_params: TensorDictBase
+
+    def __init__(self, network: TensorDictSequential) -> None:
+        super().__init__()
+        self.convert_to_functional(network, "value_network", create_target_params=True)
+
+    def forward(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Both [B, L, K]; where ``learnt`` is False, they mean nothing.
+
+        The target is the multi-step reward plus the target network's quantiles of the action that the online network
+        finds best at the step where the rewards end.
+        """
+        online = self._quantiles(self.value_network_params, batch)
+        with torch.no_grad():
+            later = self._quantiles(self.target_value_network_params, batch)
+        best = of_action(later, online.mean(dim=-1).argmax(dim=-1))
+        positions = torch.arange(batch.shape[1], device=best.device) + batch["steps_to_next_obs"]
+        positions = positions.clamp(max=batch.shape[1] - 1).unsqueeze(-1).expand_as(best)
+        bootstrap = batch["gamma"].unsqueeze(-1) * best.gather(1, positions)
+        target = batch["next", "reward"] + torch.where(batch["next", "terminated"], 0.0, bootstrap)
+        return of_action(online, batch["action"]), target
+
+    def _quantiles(self, params: TensorDictBase, batch: TensorDictBase) -> Tensor:
+        with params.to_module(self.value_network, preserve_module_state=False), set_recurrent_mode(True):
+            return self.value_network(batch.select(*self.value_network.in_keys))["quantiles"]
+
+
+def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
+    """The quantiles [B, L, K] of one action at every step, of [B, L, A, K] and [B, L]."""
+    index = action[..., None, None].expand(*action.shape, 1, quantiles.shape[-1])
+    return quantiles.gather(-2, index).squeeze(-2)
+
+
+class RecurrentQ(QLearner):
+    """Q-learning with an LSTM; classes that derive from it say how far a prediction is from its target.
+
+    The arguments are those of `baselines.drqn.DRQN`, and ``num_quantiles``.
+    """
+
+    memory = True
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        num_envs: int,
+        num_steps: int,
+        hidden_size: int,
+        num_quantiles: int,
+        learning_rate: float,
+        gamma: float,
+        n_steps: int,
+        buffer_size: int,
+        batch_size: int,
+        num_updates: int,
+        target_update_interval: int,
+        eps_init: float,
+        eps_end: float,
+        annealing_num_steps: int,
+        max_grad_norm: float,
+        replay_on_task_change: str,
+    ) -> None:
+        holds_one = is_int(buffer_size) and (not is_int(num_steps, 1) or buffer_size >= num_steps)
+        require(
+            *at_least_one(hidden_size=hidden_size, num_quantiles=num_quantiles, num_steps=num_steps),
+            *positive(learning_rate=learning_rate),
+            (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
+        )
+        super().__init__(
+            num_envs,
+            num_steps,
+            gamma,
+            n_steps,
+            buffer_size // num_steps,
+            batch_size,
+            num_updates,
+            target_update_interval,
+            eps_init,
+            eps_end,
+            annealing_num_steps,
+            max_grad_norm,
+            replay_on_task_change,
+        )
+        self.trunk = recurrent(observation_spec, hidden_size, 1)
+        head = Quantiles(hidden_size, action_spec.space.n, num_quantiles)
+        values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
+        self.greedy = QValueActor(
+            TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
+        )
+        self.targets = RecurrentTargets(self.greedy)
+        state = (("next", key) for key in STATE_KEYS)
+        self.act_with(self.greedy, self.targets, action_spec, learning_rate, *state)
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Zeros for the LSTM's state."""
+        return zero_state(self.trunk, num_envs)
+
+    def experience(self, batch: TensorDictBase) -> TensorDictBase:
+        """A sequence of ``num_steps + 1`` steps per row; ``learnt`` is False where there is nothing to learn.
+
+        That is at the step added for bootstrapping, at what fills up a shortened batch, and where an episode was
+        truncated, for what followed is not in the sequence.
+        """
+        after = batch["next"]
+        steps = batch.select("action", "gamma", "steps_to_next_obs", ("next", "reward"), ("next", "terminated"))
+        steps["learnt"] = (~after["done"] | after["terminated"]).squeeze(-1)
+        missing = self.num_steps - batch.shape[1]
+        return pad(self._seen(batch), [0, 0, 0, missing]).update(pad(steps, [0, 0, 0, missing + 1]))
+
+    def _seen(self, batch: TensorDictBase) -> TensorDictBase:
+        """What the network reads at all steps and after the last one."""
+        keys = self.trunk.in_keys
+        last = batch["next"][:, -1:].select(*keys)
+        return torch.cat([batch.select(*keys), last], dim=1)
+
+    def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """The loss of every step, [B, L], of quantiles [B, L, K]."""
+        raise NotImplementedError
+
+    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+        """The mean loss of the steps of sequences."""
+        distance = self.distance(*self.targets(batch))
+        learnt = batch["learnt"]
+        return TensorDict({"loss_value": (distance * learnt).sum() / learnt.sum().clamp(min=1)})

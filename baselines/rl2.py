@@ -1,0 +1,185 @@
+"""RL^2: an LSTM that reads its last action and reward and remembers over the episodes of a trial.
+
+Duan et al. 2016 (arXiv 1611.02779) and Wang et al. 2016 (arXiv 1611.05763), trained by PPO. A trial is a number of
+episodes with one goal, such as a task with ``goal_change=(4, 4)`` and trials of 4; what is maximised is the return of
+the whole trial, so an early episode may be spent on search.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+from torchrl.data import Composite, TensorSpec
+
+from baselines.networks import STATE_KEYS, recurrent, zero_state
+from baselines.ppo import PPO
+from ctgraph_rl.checks import at_least_one, require
+
+GOAL = 3
+"""The ``outcome`` of an episode that reached the goal."""
+
+OWN_KEYS = ("trial", "previous_action", "reward")
+"""Beside the LSTM's state: episodes of the trial so far, and what was done and paid in the step before."""
+
+
+class TrialTrunk(TensorDictModuleBase):
+    """A recurrent trunk whose state starts anew with a trial, and which reads the last action and reward.
+
+    Args:
+        trunk: a `recurrent` trunk that also reads ``previous``, [num_actions + 1].
+        num_actions: actions of the task.
+        trial_episodes: episodes of a trial.
+    """
+
+    def __init__(self, trunk: TensorDictSequential, num_actions: int, trial_episodes: int) -> None:
+        super().__init__()
+        self.trunk, self.num_actions, self.trial_episodes = trunk, num_actions, trial_episodes
+        self.in_keys = [*(key for key in trunk.in_keys if key != "previous"), *OWN_KEYS]
+        self.out_keys = ["memory", ("next", "trial"), *(("next", key) for key in STATE_KEYS)]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``memory``, the LSTM's next state and the number of the episode in its trial, from 1."""
+        episode = tensordict["trial"] + tensordict["is_init"]
+        fresh = tensordict["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
+        keys = [key for key in self.trunk.in_keys if key != "previous"]
+        given = tensordict.select(*keys)
+        for key in STATE_KEYS:
+            given[key] = torch.where(fresh.unsqueeze(-1), 0.0, given[key])
+        action = one_hot(tensordict["previous_action"], self.num_actions)
+        previous = torch.cat([action, tensordict["reward"]], dim=-1)
+        remembered = self.trunk(given.set("is_init", fresh).set("previous", torch.where(fresh, 0.0, previous)))
+        written = remembered.select(*self.out_keys, strict=False)
+        return tensordict.update(written.set(("next", "trial"), torch.where(fresh, 1, episode)))
+
+
+class RL2(PPO):
+    """PPO over trials of several episodes, through which the memory lasts.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_envs: rows that it learns from.
+        num_steps: steps of each row in a batch, the length of the sequences.
+        hidden_size: width of features and LSTM.
+        num_layers: layers before the LSTM.
+        optimiser: ``adam`` or ``rmsprop``.
+        learning_rate: of the optimiser.
+        gamma: discount factor.
+        gae_lambda: lambda of the generalised advantage estimate.
+        normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
+        clip_epsilon: how far the probability ratio may move.
+        entropy_coeff: weight of the entropy bonus.
+        critic_coeff: weight of the critic's loss, a mean squared error.
+        num_epochs: passes over a batch.
+        num_minibatches: minibatches a pass; they split the rows.
+        max_grad_norm: gradients are scaled down to this norm.
+        trial_episodes: episodes of a trial.
+    """
+
+    memory = True
+    solves = "tasks whose goal changes after a number of episodes: it searches, then returns"
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        num_envs: int,
+        num_steps: int,
+        hidden_size: int,
+        num_layers: int,
+        optimiser: str,
+        learning_rate: float,
+        gamma: float,
+        gae_lambda: float,
+        normalize_advantage: bool,
+        clip_epsilon: float,
+        entropy_coeff: float,
+        critic_coeff: float,
+        num_epochs: int,
+        num_minibatches: int,
+        max_grad_norm: float,
+        trial_episodes: int,
+    ) -> None:
+        require(*at_least_one(trial_episodes=trial_episodes))
+        self.trial_episodes = trial_episodes
+        super().__init__(
+            observation_spec,
+            action_spec,
+            num_envs,
+            num_steps,
+            hidden_size,
+            num_layers,
+            optimiser,
+            learning_rate,
+            gamma,
+            gae_lambda,
+            normalize_advantage,
+            clip_epsilon,
+            entropy_coeff,
+            critic_coeff,
+            num_epochs,
+            num_minibatches,
+            max_grad_norm,
+        )
+        keys = [*self.policy.out_keys, ("next", "trial"), ("next", "previous_action")]
+        copied = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", "previous_action")])
+        self.policy = TensorDictSequential(self.trunk, self.actor, self.critic, copied, selected_out_keys=keys)
+
+    def make_trunk(
+        self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
+    ) -> TrialTrunk:
+        """A recurrent trunk that also reads the last action and reward."""
+        num_actions = action_spec.space.n
+        trunk = recurrent(observation_spec, hidden_size, num_layers, previous=num_actions + 1)
+        return TrialTrunk(trunk, num_actions, self.trial_episodes)
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """No episode yet, nothing remembered.
+
+        The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step: when
+        it starts anew is decided here.
+        """
+        state = zero_state(self.trunk.trunk, num_envs)
+        device = state[STATE_KEYS[0]].device
+        state["trial"] = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
+        state["previous_action"] = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        return state.set("reward", torch.zeros(num_envs, 1, device=device))
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Some epochs over a batch; returns mean losses and the success rate of the trials' first and last episodes.
+
+        The last step of a batch only tells the value of what followed, so one step alone teaches nothing.
+        """
+        losses = super().learn(batch) if batch.shape[1] > 1 else {}
+        ends = batch["next"][batch["next", "done"].squeeze(-1)]
+        found = (ends["outcome"] == GOAL).float()
+        for name, number in (("first", 1), ("last", self.trial_episodes)):
+            episodes = found[ends["trial"] == number]
+            if len(episodes):
+                losses[f"success_of_{name}_episodes"] = episodes.mean().item()
+        return losses
+
+    @torch.no_grad()
+    def _with_advantage(self, batch: TensorDictBase) -> TensorDictBase:
+        """All steps but the last; only the end of a trial ends the return."""
+        after = batch["next"]
+        ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]
+        return self._estimated(batch[:, :-1], batch["state_value"][:, 1:], ends, ends)
+
+
+def episodes_to_goal(ends: TensorDictBase, trial_episodes: int) -> Tensor:
+    """The number of the episode that first reached the goal in each trial, to compare with E[kappa] of the graph.
+
+    Args:
+        ends: what `ctgraph_rl.evaluate` returns with ``episodes_per_row=trial_episodes``.
+        trial_episodes: episodes of a trial.
+
+    Returns:
+        float64 [tasks, trials]; NaN where a trial did not reach it.
+    """
+    found = (ends["outcome"].squeeze(-1) == GOAL).unflatten(-1, (-1, trial_episodes))
+    first = 1 + found.int().argmax(dim=-1).double()
+    return torch.where(found.any(dim=-1), first, torch.nan)

@@ -1,0 +1,103 @@
+"""Hyperparameters out of range are refused by name; those that must be known are listed here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+from test_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS
+
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.run import conf_dir
+from curricula.paper import ct_su_b1
+
+ENV = CTGraphEnv([ct_su_b1()])
+
+EVERY = [
+    ("num_envs=0", "num_envs must be an integer >= 1, got 0"),
+    ("num_steps=1.5", "num_steps must be an integer >= 1, got 1.5"),
+    ("hidden_size=0", "hidden_size must be an integer >= 1, got 0"),
+    ("learning_rate=0", "learning_rate must be a number > 0, got 0"),
+    ("learning_rate=fast", "learning_rate must be a number > 0, got 'fast'"),
+    ("gamma=1.5", r"gamma must be in \[0, 1\], got 1.5"),
+    ("gamma=0", "gamma must be a number > 0, got 0"),
+    ("max_grad_norm=-1", "max_grad_norm must be a number > 0, got -1"),
+]
+OF_POLICY_GRADIENTS = [
+    ("num_layers=0", "num_layers must be an integer >= 1, got 0"),
+    ("optimiser=sgd", "optimiser must be one of adam, rmsprop, got 'sgd'"),
+    ("normalize_advantage=1", "normalize_advantage must be true or false, got 1"),
+]
+OF_ACTOR_CRITICS = [
+    ("gae_lambda=-0.1", r"gae_lambda must be in \[0, 1\], got -0.1"),
+    ("entropy_coeff=-1", "entropy_coeff must be a number >= 0, got -1"),
+    ("critic_coeff=null", "critic_coeff must be a number >= 0, got None"),
+]
+OF_PPO = [
+    ("clip_epsilon=0", "clip_epsilon must be a number > 0, got 0"),
+    ("num_epochs=0", "num_epochs must be an integer >= 1, got 0"),
+    ("num_minibatches=0", "num_minibatches must be an integer >= 1, got 0"),
+]
+OF_Q_LEARNERS = [
+    ("n_steps=0", "n_steps must be an integer >= 1, got 0"),
+    ("batch_size=0", "batch_size must be an integer >= 1, got 0"),
+    ("num_updates=0", "num_updates must be an integer >= 1, got 0"),
+    ("target_update_interval=0", "target_update_interval must be an integer >= 1, got 0"),
+    ("annealing_num_steps=0", "annealing_num_steps must be an integer >= 1, got 0"),
+    ("eps_init=2", r"eps_init must be in \[0, 1\], got 2"),
+    ("eps_init=0.01", "eps_end must be <= eps_init=0.01, got 0.05"),
+    ("replay_on_task_change=drop", "replay_on_task_change must be one of clear, keep, got 'drop'"),
+]
+OF_ONE = {
+    "dqn": [
+        ("buffer_size=0", "buffer_size must be an integer >= 1, got 0"),
+        ("double=2", "double must be true or false, got 2"),
+        ("priority_alpha=-1", "priority_alpha must be a number >= 0, got -1"),
+        ("priority_beta=2", r"priority_beta must be in \[0, 1\], got 2"),
+    ],
+    "drqn": [("buffer_size=15", "buffer_size must be an integer >= num_steps=16, got 15")],
+    "qrdqn_lstm": [
+        ("buffer_size=15", "buffer_size must be an integer >= num_steps=16, got 15"),
+        ("num_quantiles=0", "num_quantiles must be an integer >= 1, got 0"),
+    ],
+    "lstm_ppo": [("num_minibatches=3", "num_envs=256 must be a multiple of num_minibatches=3")],
+    "rl2": [("trial_episodes=0", "trial_episodes must be an integer >= 1, got 0")],
+    "ppo": [("num_minibatches=3", r"num_envs \* num_steps = 8192 must be a multiple of num_minibatches=3")],
+    "ppo_count": [
+        ("bonus_coeff=-1", "bonus_coeff must be a number >= 0, got -1"),
+        ("num_hash_bits=25", r"num_hash_bits must be an integer in 1\.\.24, got 25"),
+    ],
+}
+
+
+def bad_values(name: str) -> list[tuple[str, str]]:
+    """Overrides that an agent refuses, with the messages."""
+    groups = [
+        (EVERY, True),
+        (OF_POLICY_GRADIENTS, name in POLICY_GRADIENTS),
+        (OF_ACTOR_CRITICS, name in POLICY_GRADIENTS and name != "reinforce"),
+        (OF_PPO, name in POLICY_GRADIENTS and name not in ("reinforce", "a2c")),
+        (OF_Q_LEARNERS, name in Q_LEARNERS),
+        (OF_ONE.get(name, []), True),
+    ]
+    return [bad for group, applies in groups if applies for bad in group]
+
+
+@pytest.mark.parametrize(("name", "override", "message"), [(name, *bad) for name in AGENTS for bad in bad_values(name)])
+def test_a_hyperparameter_out_of_range_is_refused_by_name(name, override, message):
+    given = OmegaConf.load(Path(conf_dir(), "agent", f"{name}.yaml"))
+    given.merge_with_dotlist([override])
+    kind = hydra.utils.get_object(given.pop("_target_"))
+
+    with pytest.raises(ValueError, match=message):
+        kind(ENV.observation_spec_unbatched, ENV.action_spec_unbatched, **given)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_hyperparameter_has_a_rule(name):
+    given = {str(key) for key in OmegaConf.load(Path(conf_dir(), "agent", f"{name}.yaml"))} - {"_target_"}
+    ruled = {override.split("=")[0] for override, _ in bad_values(name)} | {"eps_end"}
+
+    assert given <= ruled
