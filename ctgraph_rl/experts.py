@@ -24,6 +24,10 @@ Learn = Callable[[Curriculum, Path], None]
 """Runs the learning of a curriculum into an empty directory."""
 
 
+EXPERT = "single-task expert"
+"""What their curricula are called."""
+
+
 class Expert(NamedTuple):
     """Who learned a task alone."""
 
@@ -58,7 +62,7 @@ def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
     else:
         told = Protocol()
     evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
-    return Curriculum("single-task expert", 1, "-", (Block((task,), block.num_frames),), evaluation, told)
+    return Curriculum(EXPERT, 1, "-", (Block((task,), block.num_frames),), evaluation, told)
 
 
 def find_or_train(

@@ -1,5 +1,7 @@
 """A run in another program's format.
 
+``--format parquet`` writes the tidy tables of a run as Parquet and CSV, see `ctgraph_rl.tables`.
+
 ``python -m ctgraph_rl.export RUN --format l2logger --out DIR`` writes what l2metrics reads: log format 1.1 of l2logger.
 A training interval, and an evaluation of a task, is one experience with its mean return as ``reward``. Time stamps
 count experiences, so that equal runs give equal files; a runtime that is taken from them means nothing.
@@ -17,6 +19,7 @@ from pathlib import Path
 from ctgraph_rl.checks import require
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.metrics import Regime
+from ctgraph_rl.tables import write_tables
 
 COLUMNS = (
     "block_num",
@@ -32,7 +35,7 @@ COLUMNS = (
 )
 WORKER = "worker0"
 START = datetime(2000, 1, 1)
-FORMATS = ("l2logger",)
+FORMATS = ("l2logger", "parquet")
 
 
 def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
@@ -94,11 +97,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.export", description=__doc__)
     parser.add_argument("run", type=Path, help="a run directory")
     parser.add_argument("--format", choices=FORMATS, default=FORMATS[0], help="the format to write")
-    parser.add_argument("--out", type=Path, required=True, help="the folder to write, new or empty")
+    parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
     arguments = parser.parse_args()
     try:
-        write_l2logger(RunLog.read(arguments.run / "run.jsonl").regimes(), arguments.out)
-    except (OSError, ValueError) as error:
+        log = RunLog.read(arguments.run / "run.jsonl")
+        if arguments.format == "parquet":
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            write_tables(log, arguments.out, parquet=True)
+        else:
+            write_l2logger(log.regimes(), arguments.out)
+    except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(str(error))
     print(f"{arguments.format}: {arguments.out}")
 

@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any, Protocol
 
 import torch
@@ -76,11 +76,13 @@ def learn_curriculum(
     for blocks in curriculum.stretches:
         agent.start_task(_given_id(curriculum, blocks[0]))
         for batch in _collect_blocks(env, agent, blocks, partial(examiner.examine, agent), frames):
-            frames += batch.numel()
-            block = curriculum.block_at(frames)
-            measurements = _learn(agent, batch, block, frames)
-            episodes = episode_means(batch["next"][batch["next", "done"].squeeze(-1)])
-            log.append("training", block=block, frames=frames, **episodes, **measurements)
+            after = frames + batch.numel()
+            measurements = _learn(agent, batch, curriculum.block_at(after), after)
+            for part in _of_one_block(batch, frames, curriculum.ends):
+                frames += part.numel()
+                block = curriculum.block_at(frames)
+                episodes = episode_means(part["next"][part["next", "done"].squeeze(-1)])
+                log.append("training", block=block, frames=frames, **episodes, **measurements)
             if progress is not None:
                 progress.update(block, frames, episodes["return_mean"])
         agent.end_task()
@@ -119,6 +121,13 @@ def _collect_blocks(
 
     num_frames = sum(block.num_frames for block in blocks)
     return collect(env, agent.policy, num_frames, agent.num_steps, agent.initial_state, between_steps)
+
+
+def _of_one_block(batch: TensorDictBase, start: int, ends: Iterable[int]) -> Iterator[TensorDictBase]:
+    """A batch that begins after ``start`` frames, cut where blocks end within it."""
+    rows, steps = batch.shape
+    cuts = [0, *((end - start) // rows for end in ends if start < end < start + batch.numel()), steps]
+    return (batch[:, first:last] for first, last in pairwise(cuts))
 
 
 def _enter(env: CTGraphEnv, block: Block, at_episode_end: bool = False) -> None:

@@ -5,7 +5,9 @@ Every line is one JSON object with a ``kind``. Schema 1:
 - ``run``: the first line: ``schema``, curriculum, configuration, seed, versions; ``trained``, the task numbers of each
   block, such as ``[[1], [2]]``.
 - ``training``: one interval of a block: ``block`` from 1, ``frames`` of the run so far, finished ``episodes`` and their
-  ``return_mean``, ``success_rate`` and ``length_mean``; what the agent reports.
+  ``return_mean``, ``success_rate``, ``end_rate`` (the share that reached an end state) and ``length_mean``; what the
+  agent reports of the batch. A batch that goes over a hidden boundary is a line for each block, and an episode counts
+  where it ends, though its task may be that of the block before.
 - ``evaluation``: means over the evaluation episodes of one task. ``moment`` says when: ``before`` any training (block
   0), ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1; held-out tasks, marked
   ``held_out``, count on from there.
@@ -236,6 +238,9 @@ def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> N
 
 
 def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
-    """Write metrics as JSON: for each name the value, its definition, formula and source, or why it is undefined."""
-    content = {name: vars(metric) for name, metric in metrics.items()}
+    """Write metrics as JSON: for each name the value, its definition, formula and source, or why it is undefined.
+
+    One run is one seed, and has no interval; `ctgraph_rl.results` has those of several.
+    """
+    content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
     Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -26,6 +28,15 @@ def versions() -> dict[str, str]:
     }
 
 
+def named(curriculum: Curriculum) -> Curriculum:
+    """The curriculum, with ``(modified)`` behind its name if it is not what is published under that name."""
+    published = import_module("curricula")
+    known = curriculum.name in published.names()
+    if not known or published.load(curriculum.name).fingerprint == curriculum.fingerprint:
+        return curriculum
+    return replace(curriculum, name=f"{curriculum.name} (modified)")
+
+
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
     """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
     import torch
@@ -34,7 +45,7 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
 
     return {
         "schema": SCHEMA,
-        "curriculum": curriculum.name,
+        "curriculum": named(curriculum).name,
         "version": curriculum.version,
         "fingerprint": curriculum.fingerprint,
         "source": curriculum.source,

@@ -174,8 +174,10 @@ class Recorder:
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
         greedy = self.curriculum.evaluation.greedy
         if policy_for is None:
-            return adapt(policy, greedy)
-        ids = self.curriculum.task_ids
+            return adapt(policy, greedy, self.curriculum.protocol.task_id == "one_hot")
+        ids, told = self.curriculum.task_ids, self.curriculum.protocol.task_id
+        given = f"policy_for is for task ids given at_boundaries, but they are {told} in this protocol: give policy"
+        require((told == "at_boundaries", given))
         unknown = [task for task in self._examiner.examined(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
         return by_slices([adapt(policy_for(ids[task]), greedy) for task in self._examiner.examined(frames)])
@@ -199,7 +201,7 @@ def _last(measurements: list[dict[str, Any]], frames: int) -> Iterable[dict[str,
     return reversed(list(takewhile(lambda m: m["frames"] == frames, reversed(measurements))))
 
 
-def adapt(policy: Any, greedy: bool) -> Policy:
+def adapt(policy: Any, greedy: bool, shows_ids: bool = False) -> Policy:
     """Any policy as a function of TensorDicts; see `Recorder`.
 
     Raises:
@@ -208,7 +210,10 @@ def adapt(policy: Any, greedy: bool) -> Policy:
     if isinstance(policy, TensorDictModuleBase | type):
         return policy
     if hasattr(policy, "predict"):
-        predict = policy.predict
+        predict, space = policy.predict, getattr(policy, "observation_space", None)
+        blind = shows_ids and space is not None and "task_id" not in getattr(space, "spaces", {})
+        fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
+        require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))
         return _NumpyPolicy(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))
     require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
     positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)

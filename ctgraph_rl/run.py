@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from importlib import import_module
 from importlib.util import find_spec
 from inspect import Parameter, signature
 from pathlib import Path
@@ -33,6 +32,9 @@ if TYPE_CHECKING:
 
 SPECS = ("observation_spec", "action_spec")
 """Arguments of agents that come from the environment."""
+
+KEYS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
+"""An example of each group that changes a curriculum."""
 
 NOT_HASHED = ("overwrite", "experts_dir")
 """Keys of the configuration that do not change results."""
@@ -105,6 +107,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     cores = os.cpu_count() or 1
     threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
+    folder = cfg.experts_dir
+    require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("overwrite", "experts"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     if not is_finished(cfg, run_dir):
@@ -150,7 +154,9 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     device = checked_device(cfg.device)
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)
-    curriculum = named(with_changes(target(cfg, "curriculum")(), cfg))
+    curriculum = with_changes(target(cfg, "curriculum")(), cfg)
+    if cfg.experts and not curriculum.evaluation.every:
+        print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
     make_agent = target(cfg, "agent")
     for checked in (curriculum, *(expert_curriculum(curriculum, task) for task in curriculum.tasks if cfg.experts)):
         new_agent(checked, make_agent, cfg.seed)
@@ -217,23 +223,20 @@ def checked_device(name: str) -> Any:
     return torch.device(name)
 
 
-def named(curriculum: Curriculum) -> Curriculum:
-    """The curriculum, with ``(modified)`` behind its name if it is not what is published under that name."""
-    published = import_module("curricula")
-    known = curriculum.name in published.names()
-    if not known or published.load(curriculum.name).fingerprint == curriculum.fingerprint:
-        return curriculum
-    return replace(curriculum, name=f"{curriculum.name} (modified)")
-
-
 def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     """The curriculum with what ``evaluation`` and ``protocol`` of the configuration change; null leaves a value.
 
     Raises:
         ValueError: for values out of range.
     """
-    from ctgraph_rl.curriculum import Protocol
+    from ctgraph_rl.curriculum import Curriculum, Protocol
 
+    made = type(curriculum).__name__
+    require((isinstance(curriculum, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {made}"))
+    for part in ("evaluation", "protocol"):
+        require(
+            (isinstance(cfg[part], DictConfig), f"{part} must have keys, such as {part}.{KEYS[part]}, got {cfg[part]}")
+        )
     evaluation, protocol = (
         {str(key): value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
         for part in ("evaluation", "protocol")

@@ -10,6 +10,7 @@ import torch
 from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.experts import Expert
 from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
@@ -21,6 +22,19 @@ from ctgraph_rl.tables import write_tables
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent for an environment's unbatched observation and action specs."""
+
+MEMBERS = (
+    "num_envs",
+    "num_steps",
+    "policy",
+    "initial_state",
+    "start_task",
+    "end_task",
+    "learn",
+    "to",
+    "state_dict",
+)
+"""What a run needs of an agent."""
 
 RESULTS = ("run.jsonl", "evaluations.csv", "training.csv", "performance.csv", "metrics.json", "agent.pt")
 """What a run writes into its directory; ``metrics.json`` is there when the run is complete."""
@@ -34,7 +48,12 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     """
     torch.manual_seed(seed)
     env = make_env(curriculum, curriculum.tasks, seed)
-    agent: Agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched).to(device)
+    agent: Agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
+    missing = [name for name in MEMBERS if not hasattr(agent, name)]
+    require(
+        (not missing, f"{type(agent).__name__} is no agent, it lacks {', '.join(missing)}: see ctgraph_rl.agent.Agent")
+    )
+    agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
     return agent
 

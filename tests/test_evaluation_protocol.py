@@ -202,15 +202,20 @@ def test_evaluations_fall_on_their_frames_even_within_batches(boundaries):
     expected = sorted([(0, 0, "before"), *((*where, "during") for where in during), (20, 1, "after"), (48, 2, "after")])
     assert at(log) == expected
     order = [(m["kind"][0], m["frames"]) for m in log.measurements if m["kind"] == "training" or m["task"] == 1]
-    ends = {"announced": (12, 20, 32, 44, 48), "hidden": (12, 24, 36, 48)}[boundaries]
-    assert order == sorted(
-        [("t", end) for end in ends] + [("e", frames) for frames, *_ in expected], key=training_first
+    assert (
+        " ".join(f"{kind}{frames}" for kind, frames in order)
+        == {
+            "announced": "e0 e8 t12 e16 t20 e20 e24 t32 e32 e40 t44 t48 e48",
+            "hidden": "e0 e8 t12 e16 e20 t20 t24 e24 e32 t36 e40 t48 e48",
+        }[boundaries]
     )
 
 
-def training_first(moment: tuple[str, int]) -> tuple[int, bool]:
-    """A batch that ends where an evaluation is due is learned before."""
-    return moment[1], moment[0] == "e"
+def test_a_batch_over_a_hidden_boundary_is_a_line_for_each_block():
+    log = learn_curriculum(sequence(evaluation=Evaluation(2), protocol=Protocol(boundaries="hidden")), Told())
+
+    lines = [(m["block"], m["frames"], m["episodes"], m["return_mean"]) for m in log.of_kind("training")]
+    assert lines == [(1, 12, 0, None), (1, 20, 4, 1.0), (2, 24, 0, None), (2, 36, 4, 1.0), (2, 48, 4, 0.0)]
 
 
 def test_evaluations_within_a_batch_see_the_agent_as_it_acts():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from test_lifelong import ONE, TWO
@@ -10,6 +11,8 @@ from test_run import command_line
 
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
 from ctgraph_rl.experts import expert_curriculum, find_or_train
+from ctgraph_rl.provenance import versions
+from ctgraph_rl.run import run, train_experts
 
 SETTINGS = {"agent": {"gamma": 0.9}, "seed": 0}
 
@@ -29,7 +32,7 @@ def write_result(trained: list):
 
 
 def test_an_expert_has_its_task_alone_for_the_frames_of_its_first_block():
-    evaluation = Evaluation(7, every=6, tasks="seen", held_out=())
+    evaluation = Evaluation(7, every=6, tasks="seen", held_out=(replace(ONE, goal_reward=2.0),))
     told = Protocol("one_hot", num_task_ids=9, task_ids=(4, 2))
 
     alone = expert_curriculum(curriculum(evaluation=evaluation, protocol=told), TWO)
@@ -109,3 +112,37 @@ def test_a_run_trains_its_experts_and_says_which_it_used(monkeypatch, capsys, tm
     assert logs[1].of_kind("experts")[0]["experts"] == used["experts"]
     transfer = metrics["continual_world_forward_transfer"]
     assert transfer["undefined"] is None or "the expert leaves nothing" in transfer["undefined"]
+
+
+def test_another_process_that_was_faster_is_left_alone(tmp_path):
+    def learn_second(alone, run_dir):
+        first = tmp_path / run_dir.name[1:].rpartition("-")[0]
+        first.mkdir()
+        (first / "metrics.json").write_text("first")
+        (run_dir / "metrics.json").write_text("second")
+
+    (expert,) = find_or_train(curriculum(Block(ONE, 12)), learn_second, tmp_path, SETTINGS, print)
+
+    assert (expert.run_dir / "metrics.json").read_text() == "first"
+    assert list(tmp_path.iterdir()) == [expert.run_dir]
+
+
+def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch):
+    asked = []
+    monkeypatch.setattr("ctgraph_rl.experts.find_or_train", lambda *arguments: asked.append(arguments[3]))
+
+    cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3")
+    train_experts(cfg, curriculum())
+
+    agent = {**asked[0].pop("agent")}
+    assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)
+    assert asked == [{"seed": 3, "device": "cpu", "num_threads": 1, "versions": versions()}]
+
+
+def test_experts_that_cannot_be_are_refused_before_anything_is_written(compose, tmp_path):
+    drift = ["curriculum=axes", "curriculum.switch=drift", "agent=ppo"]
+
+    with pytest.raises(ValueError, match="experts need blocks of one task each"):
+        run(compose(*drift, "experts=true", f"experts_dir={tmp_path / 'experts'}"), tmp_path)
+
+    assert list(tmp_path.iterdir()) == []

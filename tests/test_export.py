@@ -137,3 +137,17 @@ def test_a_run_that_cannot_be_exported_is_one_message(tmp_path, monkeypatch, cap
 
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_exports_tables(tmp_path, monkeypatch):
+    log = RunLog(tmp_path / "run.jsonl")
+    log.append("run", trained=[[1]])
+    log.append("training", block=1, frames=8, episodes=1, return_mean=0.5)
+    log.close()
+
+    command_line(monkeypatch, tmp_path, "--format", "parquet", "--out", tmp_path / "tables")
+
+    names = ("evaluations", "training")
+    assert {path.name for path in (tmp_path / "tables").iterdir()} == {
+        f"{n}.{e}" for n in names for e in ("csv", "parquet")
+    }

@@ -142,7 +142,7 @@ def test_metrics_are_written_with_value_and_definition(tmp_path):
         "backward_transfer": -0.25,
         "forgetting": 0.25,
     }
-    fields = ("value", "definition", "formula", "source", "undefined", "n_undefined", "terms")
+    fields = ("value", "definition", "formula", "source", "undefined", "n_undefined", "terms", "n_seeds", "interval")
     assert {tuple(metric) for metric in content.values()} == {fields}
     assert content["backward_transfer"]["terms"] == [-0.25]
 

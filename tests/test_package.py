@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import ctgraph_rl
+from ctgraph_rl.train import RESULTS
 
 TINY = ["curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8"]
 
@@ -73,5 +74,5 @@ def test_the_wheel_runs_from_an_empty_directory_and_writes_only_under_runs(wheel
     (run_dir,) = (tmp_path / "empty" / "runs" / "su_b1_4tasks").iterdir()
     assert run_dir.name.startswith("lstm_ppo-seed0-")
     written = {path.name for path in run_dir.iterdir()}
-    assert written == {".hydra", "run.jsonl", "performance.csv", "metrics.json", "agent.pt"}
+    assert written == {".hydra", *RESULTS}
     assert [path.name for path in (tmp_path / "empty").iterdir()] == ["runs"]

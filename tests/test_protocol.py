@@ -377,7 +377,7 @@ def test_batches_go_over_a_hidden_boundary_and_the_agent_is_told_nothing():
     log = learn_curriculum(sequence(protocol=HIDDEN, evaluation=Evaluation(2)), agent)
 
     assert agent.events == [("start", None), *[("learn", 4, 3)] * 4, "end"]
-    assert [(m["frames"], m["block"]) for m in log.of_kind("training")] == [(12, 1), (24, 2), (36, 2), (48, 2)]
+    assert [(m["frames"], m["block"]) for m in log.of_kind("training")] == [(12, 1), (20, 1), (24, 2), (36, 2), (48, 2)]
     whole = torch.cat(agent.batches, dim=1)
     assert ends_of(whole) == [(3, 0, OUTCOME_GOAL), (7, 0, OUTCOME_GOAL), (11, 1, OUTCOME_OTHER_END)]
     assert whole["task_id"].argmax(-1).tolist() == [[0] * 8 + [1] * 4] * 4

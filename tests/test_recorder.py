@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,7 @@ def test_it_writes_the_files_of_a_run(tmp_path):
     log = RunLog.read(tmp_path / "mine" / "run.jsonl")
     run, metrics = log.of_kind("run")[0], json.loads((tmp_path / "mine" / "metrics.json").read_text())
     assert (run["fingerprint"], run["config"]) == (TASKS.fingerprint, {"seed": 0, "learner": "a table"})
+    assert (run["tasks"], run["trained"]) == (["goal1", "goal2"], [[1], [2]])
     assert {path.name for path in (tmp_path / "mine").iterdir()} == set(RESULTS) - {"agent.pt"}
     assert [(m["block"], m["return_mean"], m["episodes"]) for m in log.of_kind("training")] == [
         (1, 0.5, 3),
@@ -158,12 +160,115 @@ def test_frames_must_grow_and_a_log_is_not_overwritten(tmp_path):
         Recorder(TASKS, tmp_path)
 
 
+def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path):
+    for about, message in (
+        ({"x": object()}, "about must be plain JSON values by name"),
+        (["x"], "about must be plain JSON values by name"),
+        ({"seed": 9}, "about must leave out the seed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Recorder(TASKS, tmp_path / "mine", about=about)
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_takes_scalars_of_any_make_in_order_of_frames():
+    recorder = Recorder(TASKS)
+
+    recorder.training(6, loss=np.float32(0.5), entropy=torch.tensor(2.0), return_mean=None)
+
+    (line,) = recorder.log.of_kind("training")
+    assert [(type(line[name]), line[name]) for name in ("loss", "entropy")] == [(float, 0.5), (float, 2.0)]
+    for frames, values, message in (
+        (6, {}, "frames must grow: 6 comes after 6"),
+        (12, {"loss": "low"}, "loss must be numbers or None"),
+        (12, {"loss": np.zeros(2)}, "loss must be numbers or None"),
+        (12, {"block": 2}, "block are fields of every line"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            recorder.training(frames, **values)
+    assert len(recorder.log.of_kind("training")) == 1
+
+
+def test_an_evaluation_that_failed_can_be_made_again():
+    recorder = Recorder(TASKS)
+    with pytest.raises(ValueError, match="integer actions"):
+        recorder.evaluate(lambda observation: np.zeros(len(observation)), 0)
+
+    assert recorder.evaluate(table(1), 0) == {"goal1": 1.0, "goal2": 0.0}
+
+
+@pytest.mark.parametrize("learned", [None, 12])
+def test_a_recorder_that_is_closed_early_writes_its_files(tmp_path, learned):
+    with Recorder(TASKS, tmp_path) as recorder:
+        if learned:
+            recorder.training(learned, episodes=2, return_mean=0.5, success_rate=0.5)
+
+    written = json.loads((tmp_path / "metrics.json").read_text())
+    assert written["average_performance"]["value"] is None
+    assert written["regret"]["value"] == (1.0 if learned else None)
+
+
+def test_a_policy_for_each_task_id_needs_a_protocol_that_gives_it_and_tasks_that_have_one():
+    held_out = Curriculum("held", 1, "here", (Block(ONE, 12),), Evaluation(held_out=(TWO,)), Protocol("at_boundaries"))
+
+    for told, message in (
+        (TASKS, "they are hidden in this protocol"),
+        (held_out, "held-out tasks, which have no task id"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Recorder(told).evaluate(policy_for=table)
+
+
+def test_changing_goals_that_are_only_held_out_need_rows_of_several_episodes():
+    changing = replace(TWO, goal_change=(1, 2))
+
+    with pytest.raises(ValueError, match="episodes_per_row > 1"):
+        Recorder(replace(TASKS, evaluation=Evaluation(held_out=(changing,))))
+
+
+def test_arguments_with_a_default_are_left_to_the_policy():
+    def act(observation, decision=2, scale=1):
+        return table(decision * scale)(observation)
+
+    assert Recorder(TASKS).evaluate(act, 0) == {"goal1": 0.0, "goal2": 1.0}
+
+
+@pytest.mark.parametrize("greedy", [True, False])
+def test_a_model_is_greedy_where_the_protocol_says_so(greedy):
+    asked = []
+
+    class Model:
+        def predict(self, observation, state, episode_start, deterministic):
+            asked.append(deterministic)
+            return table(1)(observation), state
+
+    Recorder(replace(TASKS, evaluation=Evaluation(5, greedy=greedy))).evaluate(Model(), 0)
+
+    assert set(asked) == {greedy}
+
+
+def test_an_error_in_the_users_loop_leaves_an_unfinished_run(tmp_path):
+    with pytest.raises(RuntimeError), Recorder(TASKS, tmp_path):
+        raise RuntimeError("the user's own")
+
+    assert [path.name for path in tmp_path.iterdir()] == ["run.jsonl"]
+
+
 def test_a_reference_policy_is_given_as_its_class():
     one = Curriculum("one", 1, "here", (Block(surjective(), 8),), Evaluation(50))
 
     found = Recorder(one).evaluate(NavigationPolicy, 0)
 
     assert 0.0 < next(iter(found.values())) < 1.0
+
+
+def test_a_model_without_a_place_for_task_ids_is_refused_with_the_fix():
+    told = Curriculum("told", 1, "here", TASKS.blocks, Evaluation(5), Protocol("one_hot"))
+    model = PPO("MlpPolicy", SB3VecEnv(2, ONE), n_steps=8, batch_size=16)
+
+    with pytest.raises(ValueError, match=r"shows a task_id that PPO has no place for: .*protocol=Protocol\(\)"):
+        Recorder(told).evaluate(model, 0)
 
 
 def test_stable_baselines3_is_measured_by_the_protocol(tmp_path):

@@ -14,10 +14,11 @@ import pytest
 import torch
 
 import curricula
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, RunLog, evaluate
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
 from ctgraph_rl import run as run_module
 from ctgraph_rl.metrics import definitions
-from ctgraph_rl.run import named, run, target
+from ctgraph_rl.provenance import named
+from ctgraph_rl.run import run, target, with_changes
 from ctgraph_rl.train import RESULTS
 from curricula.paper import ct_su_b1
 
@@ -128,6 +129,16 @@ def test_the_same_seed_gives_the_same_log_and_another_seed_another(finished, com
     assert [m for m in first if m["kind"] == "training"] != [m for m in other if m["kind"] == "training"]
 
 
+def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, tmp_path):
+    seeds = []
+    learn = "ctgraph_rl.train.learn_curriculum"
+    monkeypatch.setattr(learn, lambda curriculum, agent, seed, log, *_: seeds.append(seed))
+
+    run(compose("seed=7"), tmp_path)
+
+    assert seeds == [7]
+
+
 def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, monkeypatch):
     monkeypatch.setattr(run_module, "learn", lambda *args: pytest.fail("ran again"))
     before = {name: (copy_of / name).read_bytes() for name in RESULTS}
@@ -181,6 +192,14 @@ def test_a_refused_run_that_may_overwrite_leaves_the_old_results(copy_of, compos
     assert set(RESULTS) <= files_in(copy_of)
 
 
+def test_hiding_the_task_id_takes_its_ids_along_and_leaves_boundaries(compose):
+    told = Protocol("one_hot", "hidden", num_task_ids=9, task_ids=(4,))
+    shown = Curriculum("shown", 1, "here", (Block(ct_su_b1((1, 1)), 256),), protocol=told)
+
+    assert with_changes(shown, compose("protocol.task_id=hidden")).protocol == Protocol(boundaries="hidden")
+    assert with_changes(shown, compose()) == shown
+
+
 def test_only_a_changed_curriculum_is_named_modified(compose):
     published = target(compose(), "curriculum")()
     changed = target(compose("curriculum.image_seed=2"), "curriculum")()
@@ -212,6 +231,10 @@ REFUSED = [
     (["curriculum.num_frames=0"], ["num_frames must be an integer >= 1, got 0"]),
     (["curriculum.image_seed=abc"], ["seed", "'abc'"]),
     (["agent.gamma=2"], ["gamma must be in [0, 1], got 2"]),
+    (["agent._target_=torch.nn.Module"], ["agent has no"]),
+    (["experts_dir=null"], ["experts_dir must be the path of a folder, got None"]),
+    (["evaluation=null"], ["evaluation must have keys, such as evaluation.every=5120, got None"]),
+    (["protocol.task_id=shown"], ["task_id must be one of hidden, one_hot, at_boundaries, got 'shown'"]),
     (["agent.hidden_size=wide"], ["hidden_size must be an integer >= 1, got 'wide'"]),
     (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
 ]
