@@ -9,7 +9,10 @@ import argparse
 import csv
 import json
 import math
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -25,7 +28,13 @@ MOST_COLUMNS = 6
 """Tasks that the performance matrix is printed for; more do not fit on a terminal."""
 
 MOST_NUMBERS = 10
-"""Tasks that the figure has names and numbers for; more do not fit."""
+"""Tasks that the figure has names, numbers and curves for; more do not fit."""
+
+MARKERS = "os^vDPX*<>"
+"""One for each of `MOST_NUMBERS` curves."""
+
+Curve = list[tuple[int, float]]
+"""Returns after numbers of frames."""
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
@@ -51,7 +60,10 @@ def performance_table(run_dir: Path | str) -> Table:
 
 
 def _task_table(name: str, labels: list[str], values: list[list[float]]) -> Table:
-    """A line for each task: its return before training, the best one after a block, and the last one."""
+    """A line for each task: its return before training, the best one after a block, and the last one.
+
+    The block of a best that is not above 0 is left out: that is of no block.
+    """
     table = Table(
         title=f"{name}: mean return on each task; performance.csv has it after each of {len(values) - 1} blocks"
     )
@@ -61,7 +73,8 @@ def _task_table(name: str, labels: list[str], values: list[list[float]]) -> Tabl
         column = [row[task] for row in values]
         known = [(value, -block) for block, value in enumerate(column) if block and not math.isnan(value)]
         best, block = max(known, default=(math.nan, 0))
-        table.add_row(label, _shown(column[0]), _shown(best), str(-block) if known else "-", _shown(column[-1]))
+        after = str(-block) if best > 0 else "-"
+        table.add_row(label, _shown(column[0]), _shown(best), after, _shown(column[-1]))
     return table
 
 
@@ -85,6 +98,9 @@ def metrics_table(run_dir: Path | str) -> Table:
 def draw_figure(run_dir: Path | str, path: Path | str) -> None:
     """Draw learning curves over frames with block boundaries, and the performance matrix beside them.
 
+    The curves are the returns while training; with evaluations during blocks, or without training, those of the
+    evaluations. A run that has neither is drawn as the matrix alone.
+
     Args:
         run_dir: a finished run.
         path: the picture to write; its ending decides the format.
@@ -97,24 +113,39 @@ def draw_figure(run_dir: Path | str, path: Path | str) -> None:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
     log = RunLog.read(Path(run_dir) / "run.jsonl")
-    performance = log.performance()
-    labels = list({m["task"]: m["label"] for m in log.of_kind("evaluation") if not m["held_out"]}.values())
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    curve, matrix = figure.subplots(1, 2, width_ratios=(3, 2))
-    _draw_curve(curve, log)
-    known = performance[~performance.isnan()]
-    low, high = min(0.0, known.min().item()), max(1.0, known.max().item())
-    image = matrix.imshow(performance, cmap="viridis", vmin=low, vmax=high, aspect="auto")
-    matrix.set_ylabel("after block")
-    matrix.set_title("Mean return on each task", fontsize=9)
-    if len(labels) > MOST_NUMBERS:
-        matrix.set_xlabel("task, counted from 0")
+    training, evaluations = _training_curves(log), _evaluation_curves(log)
+    if not (training or evaluations):
+        figure = Figure(figsize=(4.5, 3.2), layout="constrained")
+        matrix = figure.subplots()
     else:
-        matrix.set_xticks(range(len(labels)), labels, rotation=30, ha="right", fontsize=7)
-        matrix.set_yticks(range(len(performance)))
-        _write_numbers(matrix, performance.tolist(), low + 0.6 * (high - low))
-    figure.colorbar(image, ax=matrix)
+        figure = Figure(figsize=(9, 3.8 if evaluations else 3.2), layout="constrained")
+        curves, matrix = figure.subplots(1, 2, width_ratios=(3, 2))
+        _draw_curves(curves, training, evaluations, log.ends()[1:])
+    figure.colorbar(_draw_matrix(matrix, log), ax=matrix)
     figure.savefig(path, dpi=160)
+
+
+def _labels(log: RunLog) -> dict[int, str]:
+    """Names of the curriculum's tasks by number, as far as they were evaluated."""
+    return {m["task"]: m["label"] for m in log.of_kind("evaluation") if not m["held_out"]}
+
+
+def _draw_matrix(axes: Any, log: RunLog) -> Any:
+    """The performance matrix as an image, which is returned; few tasks have names and numbers."""
+    performance, labels = log.performance(), _labels(log)
+    known = performance[~performance.isnan()].tolist()
+    low, high = min([0.0, *known]), max([1.0, *known])
+    axes.set_ylabel("after block")
+    axes.set_title("Mean return on each task", fontsize=9)
+    num_rows, num_tasks = performance.shape
+    if num_tasks > MOST_NUMBERS:
+        axes.set_xlabel("task, counted from 0")
+    else:
+        names = [labels.get(task, f"task {task}") for task in range(1, num_tasks + 1)]
+        axes.set_xticks(range(num_tasks), names, rotation=30, ha="right", fontsize=7)
+        axes.set_yticks(range(num_rows))
+        _write_numbers(axes, performance.tolist(), low + 0.6 * (high - low))
+    return axes.imshow(performance.numpy(), cmap="viridis", vmin=low, vmax=high, aspect="auto")
 
 
 def _write_numbers(axes: Any, rows: list[list[float]], bright: float) -> None:
@@ -124,19 +155,57 @@ def _write_numbers(axes: Any, rows: list[list[float]], bright: float) -> None:
             axes.text(j, i, _shown(value), ha="center", va="center", color="white" if value < bright else "black")
 
 
-def _draw_curve(axes: Any, log: RunLog) -> None:
-    """Return while training over frames; dashed lines where the task changes."""
+def _training_curves(log: RunLog) -> list[Curve]:
+    """Return while training, a curve for each block with a finished episode."""
     training = [m for m in log.of_kind("training") if m["return_mean"] is not None]
-    for block in dict.fromkeys(m["block"] for m in training):
-        curve = [(m["frames"], m["return_mean"]) for m in training if m["block"] == block]
-        axes.plot(*zip(*curve, strict=True), color="black", linewidth=1)
-        axes.axvline(curve[-1][0], color="grey", linestyle="--", linewidth=0.8)
-    axes.set(xlabel="frames", ylabel="return while training")
+    blocks = dict.fromkeys(m["block"] for m in training)
+    return [[(m["frames"], m["return_mean"]) for m in training if m["block"] == block] for block in blocks]
+
+
+def _evaluation_curves(log: RunLog) -> dict[str, Curve]:
+    """Evaluations where they tell more than the training: a curve by the name of each task; of many, their mean."""
+    evaluations = [m for m in log.of_kind("evaluation") if not m["held_out"] and m["return_mean"] is not None]
+    if _training_curves(log) and all(m["moment"] != "during" for m in evaluations):
+        return {}
+    labels, by_task, by_frames = _labels(log), defaultdict(list), defaultdict(list)
+    for m in evaluations:
+        by_task[m["label"]].append((m["frames"], m["return_mean"]))
+        by_frames[m["frames"]].append(m["return_mean"])
+    if len(labels) <= MOST_NUMBERS:
+        return dict(by_task)
+    mean = [(frames, fmean(returns)) for frames, returns in by_frames.items() if len(returns) == len(labels)]
+    return {f"mean of {len(labels)} tasks": mean} if mean else {}
+
+
+def _draw_curves(axes: Any, training: list[Curve], evaluations: dict[str, Curve], ends: Sequence[int]) -> None:
+    """Return over frames; dashed lines where a block ends."""
+    style: dict[str, Any] = {"color": "0.6", "linewidth": 0.7} if evaluations else {"color": "black", "linewidth": 1}
+    _draw_evaluations(axes, evaluations)
+    for i, curve in enumerate(training):
+        name = None if i else "while training"
+        axes.plot(*zip(*curve, strict=True), marker="." if len(curve) == 1 else None, label=name, zorder=1, **style)
+    if evaluations:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=5, fontsize=7, frameon=False)
+    for end in ends:
+        axes.axvline(end, color="grey", linestyle="--", linewidth=0.8, zorder=0)
+    axes.set(xlabel="frames", ylabel="mean return" if evaluations else "return while training")
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -0.03), max(high, 1.03))
+    axes.locator_params(axis="x", integer=True, nbins=6)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.tick_params(axis="x", labelsize=7)
-    axes.set_title("Learning, task after task", fontsize=9)
+    axes.set_title("Evaluations, task after task" if evaluations else "Learning, task after task", fontsize=9)
+
+
+def _draw_evaluations(axes: Any, evaluations: dict[str, Curve]) -> None:
+    """A curve each, the lighter above the darker and with smaller marks: a grey print keeps them apart, too."""
+    from matplotlib import colormaps
+
+    for i, (name, curve) in enumerate(evaluations.items()):
+        place = i / max(1, len(evaluations) - 1)
+        line = {"color": colormaps["viridis"](0.9 * place), "linestyle": ("-", "--", ":")[i % 3], "linewidth": 1.2}
+        mark = {"marker": MARKERS[i], "markersize": 7 - 4 * place, "markevery": 1 + len(curve) // 20}
+        axes.plot(*zip(*curve, strict=True), label=name, **line, **mark)
 
 
 def main() -> None:

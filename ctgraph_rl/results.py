@@ -1,9 +1,10 @@
 """Many runs as one table: each agent on each curriculum, with intervals over seeds.
 
-``python -m ctgraph_rl.results runs/multirun [--csv FILE] [--compare average_performance [--difference 0.1]]``
+``python -m ctgraph_rl.results runs/multirun [--all | --metrics forgetting,regret] [--format latex] [--csv FILE]``
 
-Runs of one configuration but for the seed belong together. Every seed that any agent has on a curriculum is expected
-of all: one without a run, with an unfinished run or with an undefined metric is counted, as in n = 9/10.
+Runs of one configuration but for the seed belong together; one that names no agent stands alone, under its directory.
+Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
+undefined metric is counted, as in n = 9/10.
 """
 
 from __future__ import annotations
@@ -11,21 +12,42 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.table import Table
-
-from ctgraph_rl.checks import require
+from ctgraph_rl import metrics
+from ctgraph_rl.checks import positive, require
+from ctgraph_rl.experts import EXPERT
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.statistics import Comparison, Estimate, compare, interquartile_mean, mean, seeds_needed, solved_rate
 
 SOLVED = 0.9
 """Success rate from which on a task counts as solved."""
+
+MODIFIED = " (modified)"
+"""What the name of a curriculum ends with that is not what is published under the name."""
+
+OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
+"""Settings that a curriculum's fingerprint covers."""
+
+AGAINST_EXPERTS = (
+    *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
+    *("continual_world_forward_transfer", "forward_transfer_from_experts"),
+)
+"""Metrics that are shown where some run of a curriculum has a value."""
+
+SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "mean_final_return", "solved_rate")
+"""Measures that are always shown."""
+
+NO_RUN_FINISHED = "every_metric"
+"""The measure of the only row of an agent none of whose runs finished."""
+
+LEGEND = "mean [Student's 95 % interval], share of solved seeds [exact one]"
 
 HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
 
@@ -37,20 +59,31 @@ class Run:
     Args:
         path: the directory.
         curriculum: name and fingerprint.
-        settings: the configuration without the seed, by dotted keys.
+        agent: class or name of who learned; None if the configuration does not say.
+        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
+            with them if there is no agent.
         seed: the seed.
         metrics: `Metric` fields by name; empty for an unfinished run.
         success: success rate on each task by its label, at the end; empty for an unfinished run.
         returns: mean return on each task in the same way.
+        tasks: labels of the tasks that are not held out.
     """
 
     path: Path
     curriculum: tuple[str, str]
+    agent: str | None
     settings: Mapping[str, Any]
     seed: int
     metrics: Mapping[str, Mapping[str, Any]]
     success: Mapping[str, float]
     returns: Mapping[str, float]
+    tasks: Sequence[str]
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """The curriculum by its published name and its fingerprint."""
+        name, fingerprint = self.curriculum
+        return name.removesuffix(MODIFIED), fingerprint
 
 
 @dataclass(frozen=True)
@@ -59,8 +92,8 @@ class Row:
 
     Args:
         curriculum: its name.
-        agent: the agent's class, and the settings in which it differs from others of the class.
-        measure: a metric, or ``solved`` and a task.
+        agent: the agent's class or name, and the settings in which it differs from others of that; or a directory.
+        measure: a metric, a measure of how tasks ended, or ``solved`` and a task.
         estimate: over seeds.
         definition: id of the metric's definition.
         note: why seeds have no value.
@@ -78,19 +111,21 @@ BySeed = Mapping[int, Run | None]
 
 
 def find_runs(paths: Iterable[Path | str]) -> list[Run]:
-    """Every run in or below the directories.
+    """Every run in or below the directories; single-task experts are left out where there are other runs.
 
     Raises:
         ValueError: for a directory without a run, and for one run that is there twice.
     """
-    runs: dict[tuple[Any, ...], Run] = {}
+    found: list[Run] = []
     for path in paths:
         logs = sorted(Path(path).rglob("run.jsonl"))
         require((bool(logs), f"{path} holds no run: no run.jsonl in or below it"))
-        for run in map(read_run, (log.parent for log in logs)):
-            twin = runs.setdefault((*_group(run), run.seed), run)
-            same = twin.path.resolve() == run.path.resolve()
-            require((same, f"{twin.path} and {run.path} are one run twice; leave one out"))
+        found += [read_run(log.parent) for log in logs]
+    runs: dict[tuple[Any, ...], Run] = {}
+    for run in [run for run in found if run.group[0] != EXPERT] or found:
+        twin = runs.setdefault((*_group(run), run.seed), run)
+        same = twin.path.resolve() == run.path.resolve()
+        require((same, f"{twin.path} and {run.path} are one run twice; leave one out"))
     return list(runs.values())
 
 
@@ -103,14 +138,17 @@ def read_run(path: Path) -> Run:
     log = RunLog.read(path / "run.jsonl")
     about = log.of_kind("run")
     require((bool(about), f"{path / 'run.jsonl'} does not say what was run: its first line is missing"))
-    config = dict(about[0]["config"])
-    seed = config.pop("seed")
+    config = {key: value for key, value in about[0]["config"].items() if key not in OF_THE_CURRICULUM}
+    require(("seed" in config, f"{path / 'run.jsonl'} has no seed in its config; add it to the first line"))
+    seed, agent = config.pop("seed"), _agent(config)
+    settings = {**dict(_flat(config)), **({"directory": str(path.resolve())} if agent is None else {})}
     finished = (path / "metrics.json").exists()
-    metrics = json.loads((path / "metrics.json").read_text(encoding="utf-8")) if finished else {}
+    scores = json.loads((path / "metrics.json").read_text(encoding="utf-8")) if finished else {}
     ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if finished else []
     success, returns = ({m["label"]: m[name] for m in ends} for name in ("success_rate", "return_mean"))  # the last
+    tasks = list(dict.fromkeys(m["label"] for m in ends if not m.get("held_out")))
     curriculum = (about[0]["curriculum"], about[0]["fingerprint"])
-    return Run(path, curriculum, dict(_flat(config)), seed, metrics, success, returns)
+    return Run(path, curriculum, agent, settings, seed, scores, success, returns, tasks)
 
 
 def table(runs: Sequence[Run]) -> list[Row]:
@@ -147,10 +185,35 @@ def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]
     one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
     found: dict[tuple[str, str], dict[int, Run | None]] = {}
     for one, by_seed in zip(one_each, groups.values(), strict=True):
-        seeds = sorted({run.seed for run in runs if run.curriculum == one.curriculum})
-        name = _curriculum_name(one, one_each), _agent_name(one, one_each)
+        expected = {run.seed for run in runs if run.group == one.group and run.agent is not None}
+        seeds = sorted(by_seed if one.agent is None else expected)
+        name = _curriculum_name(one, runs), _agent_name(one, one_each)
         found[name] = {seed: by_seed.get(seed) for seed in seeds}
     return found
+
+
+def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Row]:
+    """The rows of some measures; agents none of whose runs finished stay.
+
+    Args:
+        rows: the whole table.
+        names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `AGAINST_EXPERTS` where a run
+            of the curriculum has a value.
+
+    Raises:
+        ValueError: for a name that no row has; lists those that there are.
+    """
+    choices = list(dict.fromkeys(row.measure.split(" ")[0] for row in rows if row.measure != NO_RUN_FINISHED))
+    unknown = [name for name in names or () if name not in choices]
+    message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
+    require((not choices or not unknown, message))
+    with_value = {(row.curriculum, row.measure) for row in rows if row.measure in AGAINST_EXPERTS and row.estimate.n}
+    always = (*(SHOWN if names is None else names), NO_RUN_FINISHED)
+    return [
+        row
+        for row in rows
+        if row.measure.split(" ")[0] in always or (names is None and (row.curriculum, row.measure) in with_value)
+    ]
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
@@ -164,19 +227,110 @@ def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
             writer.writerow([row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note])
 
 
-def rich_table(rows: Sequence[Row]) -> Table:
-    """The table for a terminal."""
-    shown = Table(title="mean [Student's 95 % interval], share of solved seeds [exact one]".replace("[", r"\["))
-    for name in ("curriculum", "agent", "measure", "over seeds", "note"):
-        shown.add_column(name)
-    for row in rows:
-        shown.add_row(row.curriculum, row.agent, row.measure.replace("_", " "), _plain(row.estimate), row.note)
-    return shown
+def text(rows: Sequence[Row]) -> str:
+    """The table for a terminal: under each curriculum and agent a line for each measure."""
+    return "\n\n".join([LEGEND, *map(_text, _pages(rows))])
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A table in Markdown for each curriculum."""
+    return "\n\n".join(map(_markdown, _pages(rows)))
+
+
+def latex(rows: Sequence[Row]) -> str:
+    """A table in LaTeX for each curriculum, for the package ``booktabs``."""
+    return "\n\n".join(map(_latex, _pages(rows)))
+
+
+FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
+
+
+class _Line(NamedTuple):
+    """A row as it is shown."""
+
+    agent: str
+    measure: str
+    value: str
+    n: str
+    mark: str  # number of its note, or nothing
+
+
+class _Page(NamedTuple):
+    """The lines of a curriculum, and their notes in the order of their numbers."""
+
+    curriculum: str
+    lines: list[_Line]
+    notes: list[str]
+
+
+def _pages(rows: Sequence[Row]) -> Iterator[_Page]:
+    for curriculum in dict.fromkeys(row.curriculum for row in rows):
+        its = [row for row in rows if row.curriculum == curriculum]
+        notes = list(dict.fromkeys(row.note for row in its if row.note))
+        yield _Page(curriculum, [_line(row, notes) for row in its], notes)
+
+
+def _line(row: Row, notes: list[str]) -> _Line:
+    value, _, n = str(row.estimate).partition(" n = ")
+    mark = str(notes.index(row.note) + 1) if row.note else ""
+    return _Line(row.agent, row.measure.replace("_", " "), value, n, mark)
+
+
+def _text(page: _Page) -> str:
+    measures, values, counts = (max(len(line[i]) for line in page.lines) for i in (1, 2, 3))
+    shown, agent = [page.curriculum], None
+    for line in page.lines:
+        if line.agent != agent:
+            agent = line.agent
+            shown.append(f"  {agent}")
+        note = f"({line.mark})" if line.mark else ""
+        shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
+    notes = (f"({number}) {note}" for number, note in enumerate(page.notes, 1))
+    shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
+    return "\n".join(shown)
+
+
+def _markdown(page: _Page) -> str:
+    head = [
+        f"### {page.curriculum}",
+        "",
+        LEGEND,
+        "",
+        "| agent | measure | over seeds | n | note |",
+        "|---|---|---|---|---|",
+    ]
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in page.lines]
+    notes = [f"{number}. {note}" for number, note in enumerate(page.notes, 1)]
+    return "\n".join([*head, *lines, *([""] if notes else []), *notes])
+
+
+def _latex(page: _Page) -> str:
+    caption = rf"\caption{{{_escaped(page.curriculum)}: {_escaped(LEGEND)}}}"
+    columns = r"agent & measure & over seeds & $n$ \\"
+    head = [r"\begin{table}", caption, r"\begin{tabular}{llll}", r"\toprule", columns, r"\midrule"]
+    notes = [rf"\par\footnotesize $^{{{number}}}$ {_escaped(note)}" for number, note in enumerate(page.notes, 1)]
+    lines = map(_latex_line, page.lines)
+    return "\n".join([*head, *lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])
+
+
+def _latex_line(line: _Line) -> str:
+    value = "--" if line.value == "-" else line.value.replace("-", "$-$")
+    mark = rf"$^{{{line.mark}}}$" if line.mark else ""
+    return rf"{_escaped(line.agent)} & {_escaped(line.measure)} & {value}{mark} & {line.n} \\"
+
+
+def _escaped(plain: str) -> str:
+    """Text without meaning to LaTeX; a bracket after a line's end would be an argument."""
+    commands = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "[": "{[}"}
+    return "".join(rf"\{each}" if each in "&%$#_{}" else commands.get(each, each) for each in plain)
 
 
 def _metrics(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
-    """A line for each metric."""
+    """A line for each metric; one for all if no run finished."""
     present = [run for run in by_seed.values() if run is not None]
+    if not any(run.metrics for run in present):
+        estimate = mean([None] * len(by_seed))
+        yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
     for metric in dict.fromkeys(metric for run in present for metric in run.metrics):
         definition = next(run.metrics[metric]["definition"] for run in present if metric in run.metrics)
         estimate = mean([_value(run, metric) for run in by_seed.values()])
@@ -184,43 +338,73 @@ def _metrics(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
 
 
 def _at_the_end(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
-    """The interquartile mean of the last returns, and each task's share of solved seeds."""
+    """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
+    if any(run is not None and run.tasks for run in by_seed.values()):
+        yield from _over_tasks(by_seed)
     tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
     if tasks:
         returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
         estimate = interquartile_mean(returns)
         yield "interquartile_return", estimate, "agarwal2021/iqm", _note(by_seed, None, estimate)
     for task in tasks:
-        rates = [None if run is None else run.success.get(task) for run in by_seed.values()]
-        estimate = solved_rate([None if rate is None else rate >= SOLVED for rate in rates])
+        estimate = solved_rate([_solved(run, task) for run in by_seed.values()])
         yield f"solved {task}", estimate, f"ctgraph_rl/solved-at-end>={SOLVED}", _note(by_seed, None, estimate)
 
 
-def _plain(estimate: Estimate) -> str:
-    return str(estimate).replace("[", r"\[")
+def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+    """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
+    returns = mean(
+        [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in by_seed.values()]
+    )
+    yield "mean_final_return", returns, "ctgraph_rl/mean-return-at-end", _note(by_seed, None, returns)
+    solved = mean(
+        [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in by_seed.values()]
+    )
+    yield "solved_rate", solved, f"ctgraph_rl/share-solved-at-end>={SOLVED}", _note(by_seed, None, solved)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = list(values)
+    numbers = [value for value in known if value is not None]
+    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(known) else None
+
+
+def _solved(run: Run | None, task: str) -> bool | None:
+    rate = None if run is None else run.success.get(task)
+    return None if rate is None else rate >= SOLVED
 
 
 def _group(run: Run) -> tuple[tuple[str, str], str]:
-    return run.curriculum, json.dumps(run.settings, sort_keys=True)
+    return run.group, json.dumps(run.settings, sort_keys=True)
 
 
 def _curriculum_name(run: Run, runs: Sequence[Run]) -> str:
-    """The curriculum's name, with its fingerprint where another one has the same name."""
-    name, fingerprint = run.curriculum
-    fingerprints = {other.curriculum[1] for other in runs if other.curriculum[0] == name}
-    return name if len(fingerprints) == 1 else f"{name} {fingerprint}"
+    """The curriculum's shortest name, with its fingerprint where another one has the same name."""
+    named: dict[tuple[str, str], str] = {}
+    for other in runs:
+        named[other.group] = min(named.get(other.group, other.curriculum[0]), other.curriculum[0], key=len)
+    name = named[run.group]
+    return name if list(named.values()).count(name) == 1 else f"{name} {run.curriculum[1]}"
 
 
 def _agent_name(run: Run, runs: Sequence[Run]) -> str:
-    """The agent's class, with the settings in which it differs from others of the class on the curriculum."""
-    alike = [other for other in runs if other.curriculum == run.curriculum and _agent(other) == _agent(run)]
+    """The agent, with the settings in which it differs from others of the name on the curriculum."""
+    alike = [other for other in runs if other.group == run.group and _name(other) == _name(run)]
     keys = sorted({key for other in alike for key in other.settings})
     differing = [key for key in keys if len({json.dumps(other.settings.get(key)) for other in alike}) > 1]
-    return " ".join([_agent(run), *(f"{key.removeprefix('agent.')}={run.settings.get(key)}" for key in differing)])
+    return " ".join([_name(run), *(f"{key.removeprefix('agent.')}={run.settings.get(key)}" for key in differing)])
 
 
-def _agent(run: Run) -> str:
-    return str(run.settings.get("agent._target_", "agent")).rpartition(".")[2]
+def _name(run: Run) -> str:
+    return run.path.resolve().name if run.agent is None else run.agent
+
+
+def _agent(config: Mapping[str, Any]) -> str | None:
+    """The class of the agent that was built, or the name that whoever recorded the run gave."""
+    agent = config.get("agent")
+    if isinstance(agent, Mapping) and "_target_" in agent:
+        return str(agent["_target_"]).rpartition(".")[2]
+    return next((name for name in (agent, config.get("learner")) if isinstance(name, str) and name), None)
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -250,7 +434,7 @@ def _missing(run: Run | None, metric: str | None) -> str | None:
     if run is None:
         return "no run"
     if not run.metrics:
-        return "unfinished or failed"
+        return "unfinished"
     if metric is None or _value(run, metric) is not None:
         return None
     return run.metrics[metric]["undefined"] if metric in run.metrics else "another version, without this metric"
@@ -258,30 +442,43 @@ def _missing(run: Run | None, metric: str | None) -> str | None:
 
 def main() -> None:
     """Print the table of many runs, and write it where asked."""
-    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.results", description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
-    parser.add_argument("--csv", type=Path, help="also write the table into this file")
-    parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
-    parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
+    parser = _parser()
     arguments = parser.parse_args()
-    console = Console()
+    if arguments.difference is not None and arguments.compare is None:
+        parser.error("--difference is of the metric that --compare names; give both")
     try:
+        require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
         runs = find_runs(arguments.runs)
         rows = table(runs)
-        console.print(rich_table(rows))
+        names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
+        print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names)))
         if arguments.csv is not None:
             write_csv(arguments.csv, rows)
         if arguments.compare is not None:
-            for names, found in comparisons(runs, arguments.compare).items():
-                console.print(_sentence(*names, found, arguments.difference))
+            for pair, found in comparisons(runs, arguments.compare).items():
+                comment = "% " if arguments.format == "latex" else ""
+                print(f"\n{comment}{_sentence(*pair, found, arguments.difference)}")
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(str(error))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.results", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
+    which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
+    parser.add_argument("--format", choices=FORMATS, default="text", help="of what is printed (default: text)")
+    parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
+    parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
+    parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
+    return parser
 
 
 def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:
     record = f"better in {found.wins}, equal in {found.ties}, worse in {found.losses}"
     p_value = "" if found.p_value is None else f"; sign-flip p = {found.p_value:.3g}"
-    sentence = f"{curriculum}: {first} - {second}: {_plain(found.difference)}; {record}{p_value}"
+    sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}{p_value}"
     if difference is None or not found.std:
         return sentence
     seeds = seeds_needed(difference, found.std, paired=True)

@@ -23,8 +23,8 @@ NO_EXPERTS = "no experts were given"
 def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None = None) -> dict[str, Metric]:
     """Every metric by name, those of `metrics.summary` first; undefined with the reason where it has no value.
 
-    The lifelong metrics are on the scale of l2metrics, with each task's known range: from its ``fail_reward`` to its
-    optimal value.
+    The lifelong metrics are on the scale of l2metrics, 1..101, with each task's known range: 1 is its ``fail_reward``,
+    101 its optimal value.
 
     Args:
         log: a whole run.
@@ -32,8 +32,9 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
         experts: for each of ``curriculum.tasks``, the log of an agent that learned it alone.
 
     Raises:
-        ValueError: for another number of experts.
+        ValueError: for the log of another curriculum, by its fingerprint, and another number of experts.
     """
+    _check_same(log, curriculum)
     count, trained = len(curriculum.tasks), curriculum.trained
     given = experts is None or len(experts) == count
     require((given, f"experts must be one log for each of {count} tasks, got {len(experts or ())}"))
@@ -44,6 +45,15 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
         **_lifelong(log, curriculum, experts),
         **_transfer(log, curriculum, experts),
     }
+
+
+def _check_same(log: RunLog, curriculum: Curriculum) -> None:
+    """The curriculum must be what was learned, as far as the log's first line says."""
+    given = curriculum.fingerprint
+    for run in log.of_kind("run"):
+        learned = run.get("fingerprint", given)
+        other = f"the log is of {run.get('curriculum')} (fingerprint {learned}), not of {curriculum.name} ({given})"
+        require((learned == given, f"{other}: give the curriculum that the run learned, with all its changes"))
 
 
 def optimal_values(tasks: Sequence[Task]) -> Tensor:
@@ -93,8 +103,12 @@ def _first_rewards(log: RunLog, curriculum: Curriculum) -> dict[str, Metric]:
     """Of each task in the block that trains it first, which must train it alone."""
     tasks = range(len(curriculum.tasks))
     first = [min(i for i, block in enumerate(curriculum.trained) if task in block) for task in tasks]
+    reason = None
     if any(len(curriculum.trained[block]) > 1 for block in first):
         reason = "needs first blocks that train one task each"
+    elif curriculum.protocol.boundaries == "hidden":
+        reason = "needs announced boundaries: an episode of one task may end in the block of the next"
+    if reason is not None:
         names = ("frames_to_first_reward", "search_efficiency")
         return {name: metrics.undefined(getattr(metrics, name), reason) for name in names}
     starts, graphs = (0, *curriculum.ends), [task.graph for task in curriculum.tasks]

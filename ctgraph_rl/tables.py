@@ -1,7 +1,8 @@
 """A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
 
 CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
-tables of many runs can be put below each other. What is undefined is an empty cell, or null. A reader in three lines::
+tables of many runs can be put below each other. What is undefined or was not measured is an empty cell, or null. A
+reader in three lines::
 
     import csv
     with open("evaluations.csv", newline="", encoding="utf-8") as file:
@@ -28,6 +29,7 @@ EPISODES = {
     "episodes": ("int64", "finished episodes"),
     "return_mean": ("double", "their mean return"),
     "success_rate": ("double", "share that reached the goal"),
+    "end_rate": ("double", "share that reached an end state"),
     "length_mean": ("double", "their mean steps"),
 }
 SECONDS = {"seconds": ("double", "since the start of the run; the only column that differs between equal runs")}

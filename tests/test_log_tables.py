@@ -39,7 +39,7 @@ def test_there_is_a_row_per_evaluation_of_a_task(log, tmp_path):
     (row,) = read(tmp_path / "evaluations.csv")
     assert list(row) == list(EVALUATIONS)
     assert list(row.values()) == [
-        *("two, tasks", "00ff", "3", "0", "before", "0", "1", "goal1.1", "False", "4", "0.25", "0.25", "5.5", "1.5")
+        *("two, tasks", "00ff", "3", "0", "before", "0", "1", "goal1.1", "False", "4", "0.25", "0.25", "", "5.5", "1.5")
     ]
 
 
@@ -48,7 +48,7 @@ def test_there_is_a_row_per_training_interval_with_what_the_agent_reports(log, t
 
     first, second = read(tmp_path / "training.csv")
     assert list(first) == [*TRAINING, "loss", "entropy"]
-    assert list(first.values())[3:] == ["1", "64", "0", "", "", "", "1.5", "0.5", ""]
+    assert list(first.values())[3:] == ["1", "64", "0", "", "", "", "", "1.5", "0.5", ""]
     assert (second["return_mean"], second["loss"], second["entropy"]) == ("0.25", "0.25", "1.0")
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import sys
 
 import pytest
 import torch
-from rich.console import Console
 
 from ctgraph_rl import RunLog, metrics, results
+from ctgraph_rl.experts import EXPERT
 from ctgraph_rl.log import write_metrics
-from ctgraph_rl.results import comparisons, find_runs, table
+from ctgraph_rl.results import comparisons, find_runs, selected, table
 
 pytest.importorskip("scipy")
 
@@ -53,7 +52,8 @@ def test_runs_of_one_configuration_become_one_line_a_metric(tmp_path):
     assert (row.curriculum, row.definition, row.note) == ("two", "lopez-paz2017/bwt", "")
     assert (row.estimate.value, row.estimate.n) == (-0.5, 3)
     assert row.estimate.low == pytest.approx(-0.5 - 0.95 * (2 / (1 - 0.95**2)) ** 0.5 * 0.25 / 3**0.5, abs=1e-12)
-    assert [row.measure for row in rows][4:] == ["interquartile_return", "solved goal1", "solved goal2"]
+    at_the_end = ["mean_final_return", "solved_rate", "interquartile_return", "solved goal1", "solved goal2"]
+    assert [row.measure for row in rows][4:] == at_the_end
 
 
 def test_solved_tasks_are_counted_at_the_end(tmp_path):
@@ -64,6 +64,8 @@ def test_solved_tasks_are_counted_at_the_end(tmp_path):
 
     assert line(rows, "solved goal1").estimate.value == 2 / 3
     assert line(rows, "solved goal2").estimate.value == 1.0
+    assert line(rows, "solved_rate").estimate.value == 2.5 / 3
+    assert line(rows, "mean_final_return").estimate.value == pytest.approx((0.625 + 0.95 + 1.0) / 3, abs=1e-15)
     assert line(rows, "interquartile_return").note == "needs 10 seeds of each task, got 3"
 
 
@@ -76,7 +78,7 @@ def test_an_unfinished_run_and_a_missing_one_are_shown(tmp_path):
     row = line(table(find_runs([tmp_path])), "average_performance", "PPO gamma=0.5")
 
     assert str(row.estimate) == "0.75 n = 1/3"
-    assert row.note == "seed 1: unfinished or failed; seed 2: no run; one seed has no interval"
+    assert row.note == "seed 1: unfinished; seed 2: no run; one seed has no interval"
 
 
 def test_an_undefined_metric_is_counted_with_its_reason(tmp_path):
@@ -159,14 +161,20 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
     for seed in range(2):
         make_run(tmp_path / "runs", seed, (0.5 + seed / 4, 1.0))
         make_run(tmp_path / "runs", seed, (0.0, 1.0), gamma=0.5)
-    monkeypatch.setenv("COLUMNS", "200")
-    arguments = [str(tmp_path / "runs"), "--csv", str(tmp_path / "table.csv"), "--compare", "average_performance"]
+    arguments = [
+        str(tmp_path / "runs"),
+        "--all",
+        "--csv",
+        str(tmp_path / "table.csv"),
+        "--compare",
+        "average_performance",
+    ]
     monkeypatch.setattr(sys, "argv", ["results", *arguments, "--difference", "0.25"])
 
     results.main()
 
     shown = capsys.readouterr().out
-    assert "average performance" in shown and "0.81 [0.02, 1.61] n = 2" in shown
+    assert "    average performance   0.81 [0.02, 1.61]    n = 2\n" in shown
     assert "mean [Student's 95 % interval], share of solved seeds [exact one]" in shown
     sentence = "better in 2, equal in 0, worse in 0; sign-flip p = 0.5; 4 seeds find a difference of 0.25"
     assert sentence in " ".join(shown.split())
@@ -176,16 +184,6 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
     assert rows[1]["low"] == "" and rows[1]["note"] == "all seeds are equal: no spread to estimate"
 
 
-def test_brackets_of_intervals_are_no_markup(tmp_path):
-    for seed in range(2):
-        make_run(tmp_path, seed, (seed / 2, 1.0))
-    console = Console(file=io.StringIO(), width=200)
-
-    console.print(results.rich_table(table(find_runs([tmp_path]))))
-
-    assert "[-2.43, 3.93]" in console.file.getvalue()
-
-
 def test_a_users_error_is_one_message(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["results", str(tmp_path)])
 
@@ -193,3 +191,164 @@ def test_a_users_error_is_one_message(tmp_path, monkeypatch, capsys):
         results.main()
 
     assert "holds no run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [EXPERT, f"{EXPERT} (modified)"])
+def test_single_task_experts_are_no_rows_beside_other_runs(tmp_path, name):
+    make_run(tmp_path, 0)
+    (tmp_path / "runs" / "experts").mkdir(parents=True)
+    for _ in range(2):  # of two versions of a package: one configuration, twice
+        expert = make_run(tmp_path / "runs" / "experts", 0, curriculum=name)
+
+    assert [run.curriculum[0] for run in find_runs([tmp_path])] == ["two"]
+    assert [run.curriculum[0] for run in find_runs([expert])] == [name]
+
+
+def record(path, **config):
+    """A finished run whose configuration is given."""
+    made = make_run(path.parent, 0)
+    first, *others = (made / "run.jsonl").read_text().splitlines()
+    (made / "run.jsonl").write_text("\n".join([json.dumps({**json.loads(first), "config": config}), *others]) + "\n")
+    path.parent.mkdir(exist_ok=True)
+    made.rename(path)
+
+
+@pytest.mark.parametrize("seeds", [(0, 1), (0, 0)])
+def test_runs_that_name_no_agent_are_one_row_each_under_their_directory(tmp_path, seeds):
+    make_run(tmp_path, 2)
+    for name, seed in zip(("mine", "yours"), seeds, strict=True):
+        record(tmp_path / name, seed=seed)
+
+    rows = [row for row in table(find_runs([tmp_path])) if row.measure == "average_performance"]
+
+    assert {row.agent: (row.estimate.n, row.estimate.n_undefined) for row in rows} == {
+        "PPO": (1, 0),
+        "mine": (1, 0),
+        "yours": (1, 0),
+    }
+
+
+def test_directories_of_one_name_are_told_apart(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        record(tmp_path / folder / "run", seed=0)
+
+    agents = {row.agent for row in table(find_runs([tmp_path]))}
+
+    assert agents == {f"run directory={(tmp_path / folder / 'run').resolve()}" for folder in ("a", "b")}
+
+
+@pytest.mark.parametrize("key", ["agent", "learner"])
+def test_a_plain_name_of_the_agent_is_the_name_of_its_runs(tmp_path, key):
+    for seed in range(3):
+        record(tmp_path / f"run{seed}", seed=seed, **{key: "sac"})
+
+    row = line(table(find_runs([tmp_path])), "average_performance", "sac")
+
+    assert str(row.estimate) == "0.75 n = 3"
+
+
+def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
+    make_run(tmp_path, 0, finished=False)
+
+    rows = table(find_runs([tmp_path]))
+
+    assert [(row.measure, str(row.estimate), row.note) for row in rows] == [
+        ("every_metric", "- n = 0/1", "seed 0: unfinished; no seed has a value")
+    ]
+    assert selected(rows) == selected(rows, ["regret"]) == rows
+    assert results.text(rows).splitlines()[2:] == [
+        *("two", "  PPO", "    every metric  -  n = 0/1  (1)", "  (1) seed 0: unfinished; no seed has a value")
+    ]
+
+
+def test_a_log_of_one_line_is_an_unfinished_run_beside_a_finished_one(tmp_path):
+    make_run(tmp_path, 0, gamma=0.9)
+    crashed = make_run(tmp_path, 0, gamma=0.5, finished=False) / "run.jsonl"
+    crashed.write_text(crashed.read_text().splitlines()[0] + "\n")
+
+    rows = selected(table(find_runs([tmp_path])), ["forgetting"])
+
+    assert [(row.agent, row.measure, str(row.estimate)) for row in rows] == [
+        ("PPO gamma=0.9", "forgetting", "0.00 n = 1"),
+        ("PPO gamma=0.5", "every_metric", "- n = 0/1"),
+    ]
+
+
+def test_one_fingerprint_is_one_curriculum_though_one_name_says_modified(tmp_path):
+    make_run(tmp_path, 0)
+    make_run(tmp_path, 1, curriculum="two (modified)")
+
+    row = line(table(find_runs([tmp_path])), "average_performance")
+
+    assert (row.curriculum, row.estimate.n) == ("two", 2)
+
+
+def test_six_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_path):
+    path = make_run(tmp_path, 0)
+    always = ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
+    at_the_end = ["mean_final_return", "solved_rate"]
+    first = [row.measure for row in selected(table(find_runs([path])))]
+    scores = json.loads((path / "metrics.json").read_text())
+    for name, value in (("relative_performance", 1.5), ("sample_efficiency", None), ("regret", 2.0)):
+        scores[name] = {"value": value, "definition": name, "undefined": None if value else "no experts were given"}
+    (path / "metrics.json").write_text(json.dumps(scores))
+
+    make_run(tmp_path, 0, curriculum="other")
+
+    rows = table(find_runs([path]))
+    both = selected(table(find_runs([tmp_path])))
+
+    assert first == [*always, *at_the_end]
+    assert [row.measure for row in selected(rows)] == [*always, "relative_performance", *at_the_end]
+    assert [row.measure for row in both if row.curriculum == "other"] == [*always, *at_the_end]
+    assert [row.measure for row in selected(rows, ["solved", "regret"])] == ["regret", "solved goal1", "solved goal2"]
+
+
+def test_an_unknown_measure_lists_those_that_there_are(tmp_path):
+    make_run(tmp_path, 0)
+
+    with pytest.raises(
+        ValueError, match=r"no run has a measure 'accuracy'; there are: average_performance, .*, solved$"
+    ):
+        selected(table(find_runs([tmp_path])), ["accuracy", "forgetting"])
+
+
+def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
+    for seed in range(2):
+        make_run(tmp_path, seed, (seed / 2, 1.0), curriculum="a_b", name="ppo|x")
+    rows = selected(table(find_runs([tmp_path])), ["backward_transfer", "forward_transfer"])
+
+    page = results.markdown(rows).splitlines()
+    paper = results.latex(rows).splitlines()
+
+    assert page[0] == "### a_b" and page[4] == "| agent | measure | over seeds | n | note |"
+    assert page[6:] == [
+        "| PPO | forward transfer | 0.00 | 2 | 1 |",
+        "| PPO | backward transfer | -0.75 [-3.93, 2.43] | 2 |  |",
+        *("", "1. all seeds are equal: no spread to estimate"),
+    ]
+    assert paper[1].startswith(r"\caption{a\_b: mean {[}Student's 95 \% interval]")
+    assert paper[6:8] == [
+        r"PPO & forward transfer & 0.00$^{1}$ & 2 \\",
+        r"PPO & backward transfer & $-$0.75 [$-$3.93, 2.43] & 2 \\",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--difference", "0.1"], "give both"),
+        (["--compare", "regret", "--difference", "0"], "difference must be a number > 0"),
+    ],
+)
+def test_a_difference_that_means_nothing_is_refused_before_the_table(tmp_path, monkeypatch, capsys, arguments, message):
+    make_run(tmp_path, 0)
+    monkeypatch.setattr(sys, "argv", ["results", str(tmp_path), *arguments])
+
+    with pytest.raises(SystemExit):
+        results.main()
+
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.out == ""

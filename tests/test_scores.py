@@ -115,8 +115,80 @@ def test_the_lifelong_metrics_are_on_the_known_range(log):
 def test_experts_that_do_not_fit_are_refused(log):
     with pytest.raises(ValueError, match="experts must be one log for each of 2 tasks, got 1"):
         scores(log, CURRICULUM, [expert(0.5, 0.75)])
-    with pytest.raises(ValueError, match="the expert of task 1 needs 2 evaluations as its block, got 1"):
-        scores(log, CURRICULUM, [expert(0.5), expert(0.5, 0.5)])
+
+
+def test_the_log_of_another_curriculum_is_refused_by_its_fingerprint(log):
+    shorter = replace(CURRICULUM, name="short", blocks=(CURRICULUM.blocks[0], Block(TASKS[1], 100)))
+    log.measurements.insert(0, {"kind": "run", "curriculum": "two", "fingerprint": CURRICULUM.fingerprint})
+    log.measurements[0]["trained"] = [[1], [2]]
+
+    assert scores(log, CURRICULUM)["average_performance"].value == 0.625
+    with pytest.raises(ValueError, match="give the curriculum that the run learned, with all its changes") as error:
+        scores(log, shorter)
+    both = f"of two (fingerprint {CURRICULUM.fingerprint}), not of short ({shorter.fingerprint})"
+    assert both in str(error.value)
+
+
+TRANSFER = ("continual_world_forward_transfer", "forward_transfer_from_experts")
+
+
+def test_experts_with_other_evaluations_leave_transfer_undefined_after_a_whole_run(log):
+    fewer, none, uneven = expert(0.5), expert(), RunLog()
+    evaluate(none, "before", 0, 0, 0.5)
+    for frames in (50, 150, 200):
+        evaluate(uneven, "during", 1, frames, 0.5)
+
+    for other, reason in (
+        (fewer, "the expert of task 1 needs 2 evaluations as its block, got 1"),
+        (none, "the definition needs evaluations at equal distances in block 1"),
+        (uneven, "the definition needs evaluations at equal distances in block 1"),
+    ):
+        found = scores(log, CURRICULUM, [other, expert(0.5, 0.5)])
+        assert [found[name].undefined for name in TRANSFER] == [reason] * 2
+        assert found["average_performance"].value == 0.625
+
+
+def test_an_expert_without_a_finished_episode_is_none(log):
+    idle = expert(0.5, 0.5)
+    idle.measurements = [m for m in idle.measurements if m["kind"] != "training"]
+
+    assert scores(log, CURRICULUM, [idle, expert(0.0, 0.5)])["relative_performance"].terms == (None, 51.0)
+
+
+def test_transfer_by_areas_below_1_is_undefined_where_the_optimum_is_another(log):
+    doubled = replace(CURRICULUM, blocks=(CURRICULUM.blocks[0], Block(replace(TASKS[1], goal_reward=2.0), 200)))
+
+    found = scores(log, doubled, [expert(0.5, 0.75), expert(0.0, 0.5)])
+
+    assert {found[name].undefined for name in TRANSFER} == {"the definition needs tasks whose optimal value is 1"}
+
+
+def test_an_end_step_more_is_in_the_frames_of_the_random_policy(log):
+    slower = [replace(task, extra_end_step=True) for task in TASKS]
+    reference = replace(CURRICULUM, blocks=tuple(Block(task, 200) for task in slower))
+
+    assert scores(log, reference)["frames_to_first_reward"].terms == pytest.approx([55 / 654, (100 + 110 / 6) / 654])
+
+
+def test_a_log_that_stops_early_or_has_no_evaluation_has_scores():
+    log = RunLog()
+    log.append("run", trained=[[1], [2]])
+    train(log, 1, 200, 10, 5)
+
+    found = scores(log, CURRICULUM)
+
+    assert found["frames_to_first_reward"].terms[1] is None
+    assert found["frames_to_first_reward"].terms[0] > 0
+    assert all(metric.value is None for name, metric in found.items() if name != "regret")
+
+
+def test_frames_count_from_where_the_curriculum_says_that_a_block_starts(log):
+    log.measurements = [m for m in log.measurements if m.get("frames") != 200]
+    log.measurements[1]["success_rate"] = 0.0
+
+    frames = scores(log, CURRICULUM)["frames_to_first_reward"].terms[1]
+
+    assert frames * metrics.expected_random_frames(2, 2, 0.0) == pytest.approx(100 + 110 / 6)
 
 
 def test_blocks_of_several_tasks_leave_the_lifelong_metrics_undefined(log):
@@ -165,3 +237,30 @@ def test_no_score_is_infinite_or_nan(log):
     values = [metric.value for metric in scores(log, CURRICULUM, [expert(1.0, 1.0), expert(0.0, 0.0)]).values()]
 
     assert all(value is None or math.isfinite(value) for value in values)
+
+
+def test_what_is_lost_and_what_is_nothing_are_of_the_task_of_each_block(log):
+    worse = replace(TASKS[0], fail_reward=-1.0), replace(TASKS[1], goal_reward=2.0)
+    others = replace(CURRICULUM, blocks=tuple(Block(task, 200) for task in worse))
+
+    found = scores(log, others)
+
+    assert found["regret"].terms == (9.0, 0.0, 0.0, 15.0)
+    assert found["normalised_performance"].terms == (1.25 / 2, 0.5)
+    assert found["mean_training_performance"].terms == pytest.approx([1 + 50 * (1.1 + 2.0) / 2, 1 + 50 * 0.5])
+
+
+def test_first_rewards_are_of_the_first_block_of_a_task(log):
+    again = replace(CURRICULUM, blocks=(*CURRICULUM.blocks, Block(TASKS[0], 200)))
+    train(log, 3, 500, 1, 1)
+
+    assert scores(log, again)["search_efficiency"].terms[0] == pytest.approx(2.5 / (11 / 2))
+
+
+def test_each_transfer_has_its_own_area():
+    alone = replace(CURRICULUM, blocks=(Block(TASKS[0], 300),))
+    uneven, flat = expert(0.0, 0.0, 0.75), expert(0.0, 0.0, 0.0)
+
+    found = scores(uneven, alone, [flat])
+
+    assert [found[name].value for name in TRANSFER] == [0.25, 0.1875]
