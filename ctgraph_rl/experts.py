@@ -98,8 +98,10 @@ def _train(curriculum: Curriculum, learn: Learn, run_dir: Path) -> None:
     partial.mkdir(parents=True)
     try:
         learn(curriculum, partial)
+        partial.rename(run_dir)
+    except OSError:
         if not run_dir.exists():  # else another process was faster, with the same result
-            partial.rename(run_dir)
+            raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
