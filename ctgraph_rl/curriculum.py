@@ -320,7 +320,8 @@ class Curriculum:
     @property
     def trained(self) -> tuple[tuple[int, ...], ...]:
         """For each block, the positions in ``tasks`` of the tasks that it trains."""
-        return tuple(tuple(self.tasks.index(task) for task in dict.fromkeys(block.tasks)) for block in self.blocks)
+        position = {task: number for number, task in enumerate(self.tasks)}
+        return tuple(tuple(position[task] for task in dict.fromkeys(block.tasks)) for block in self.blocks)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> dict[str, Any]:
         """This curriculum as JSON with every field written out; see `ctgraph_rl.exchange`.

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.exchange import bank_bytes
+from ctgraph_rl.params import bank_bytes
 from ctgraph_rl.task import Task
 
 FRAMES_PER_SECOND = 18_000

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from difflib import get_close_matches
@@ -24,7 +24,7 @@ from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.images import GroupedImages, ImageFile, OneHot, PaperImages
 from ctgraph_rl.observations import Observations
-from ctgraph_rl.params import _bank_key
+from ctgraph_rl.params import bank_bytes
 from ctgraph_rl.reference import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.rewards import Gradient, Needle, ReferenceLinear
 from ctgraph_rl.switch import AtRandom, ByEpisode, Drift
@@ -48,13 +48,6 @@ SWITCHES = (ByEpisode, AtRandom, Drift)
 
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
-
-
-def bank_bytes(tasks: Iterable[Task]) -> int:
-    """Bytes of the images that an environment holds for tasks: each different set once, one-hot vectors padded."""
-    sets = {_bank_key(task): math.prod(task.images.shape) for task in tasks}
-    shown = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
-    return shown * max(sets.values())
 
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:

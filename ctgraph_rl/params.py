@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -155,13 +155,18 @@ def _bank_key(task: Task) -> tuple[ImageSet, int]:
     return task.images, 0 if _turns_late(task) else task.observations.read_rotation
 
 
+def bank_bytes(tasks: Iterable[Task]) -> int:
+    """Bytes of the images that an environment holds for tasks: each different set once, one-hot vectors padded."""
+    sets = {_bank_key(task): math.prod(task.images.shape) for task in tasks}
+    shown = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    return shown * max(sets.values())
+
+
 def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
     """Refuse image sets and observations that cannot be held, before anything is allocated; POSIX systems only."""
     if not hasattr(os, "sysconf"):
         return
-    sets = dict.fromkeys(map(_bank_key, pool))
-    images_held = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
-    needed = bytes_each * (images_held + 2 * num_rows)  # a step holds two observations of every row
+    needed = bank_bytes(pool) + 2 * num_rows * bytes_each  # a step holds two observations of every row
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     message = f"images and observations need {needed:,} bytes, this machine has {memory:,}; use fewer images or rows"
     require((needed < memory, message))

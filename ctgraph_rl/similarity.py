@@ -25,9 +25,9 @@ from torch import Tensor
 from ctgraph_rl.checks import fraction, require, require_all
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.draw import new_figure
-from ctgraph_rl.exchange import bank_bytes
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import ImageSet
+from ctgraph_rl.params import bank_bytes
 from ctgraph_rl.task import Task
 from ctgraph_rl.values import MAX_ENUMERATED_STATES, _is_needle, _Optimal, _tree
 

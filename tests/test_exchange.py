@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from oracles import confounding, one_hot, surjective
 
 import curricula
-from ctgraph_rl import exchange, images, reference, rewards, switch
+from ctgraph_rl import exchange, images, params, reference, rewards, switch
 from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
 from ctgraph_rl.graph import CTGraph
 from ctgraph_rl.images import GroupedImages, ImageFile, OneHot
@@ -255,9 +255,9 @@ def test_a_file_that_is_too_large_or_missing_is_refused_with_its_name(tmp_path, 
 def test_a_bank_holds_each_set_once_and_pads_vectors():
     rotated = replace(A, observations=replace(A.observations, read_rotation=2))
 
-    assert exchange.bank_bytes([A, B, replace(A, images=ReferenceImages(7))]) == (5 + 7) * 144
-    assert exchange.bank_bytes([A, rotated]) == (5 + 5 * 3) * 144
-    assert exchange.bank_bytes([one_hot(), one_hot(images=OneHot(9))]) == (5 + 9) * 9
+    assert params.bank_bytes([A, B, replace(A, images=ReferenceImages(7))]) == (5 + 7) * 144
+    assert params.bank_bytes([A, rotated]) == (5 + 5 * 3) * 144
+    assert params.bank_bytes([one_hot(), one_hot(images=OneHot(9))]) == (5 + 9) * 9
 
 
 TASKS = st.sampled_from(
