@@ -5,6 +5,8 @@ Mnih et al. 2016 (arXiv 1602.01783), in its synchronous form, on TorchRL's `A2CL
 
 from __future__ import annotations
 
+from typing import Any
+
 from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import A2CLoss
 
@@ -18,18 +20,10 @@ class A2C(PolicyGradient):
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows that it learns from.
-        num_steps: steps of each row in a batch, which is one gradient step.
-        hidden_size: width of all layers.
-        num_layers: layers before the heads.
-        optimiser: ``adam`` or ``rmsprop``.
-        learning_rate: of the optimiser.
-        gamma: discount factor.
-        gae_lambda: lambda of the generalised advantage estimate; 1 gives the paper's returns of up to num_steps steps.
-        normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
         entropy_coeff: weight of the entropy bonus.
         critic_coeff: weight of the critic's loss, a mean squared error.
-        max_grad_norm: gradients are scaled down to this norm.
+        settings: the arguments of `PolicyGradient`; a batch is one gradient step, and ``gae_lambda`` 1 gives the
+            paper's returns of up to ``num_steps`` steps.
     """
 
     solves = "what one observation tells: fully observable tasks (CT-FO)"
@@ -38,36 +32,12 @@ class A2C(PolicyGradient):
         self,
         observation_spec: Composite,
         action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
-        hidden_size: int,
-        num_layers: int,
-        optimiser: str,
-        learning_rate: float,
-        gamma: float,
-        gae_lambda: float,
-        normalize_advantage: bool,
         entropy_coeff: float,
         critic_coeff: float,
-        max_grad_norm: float,
+        **settings: Any,
     ) -> None:
         require(*loss_weight(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
-        super().__init__(
-            observation_spec,
-            action_spec,
-            num_envs,
-            num_steps,
-            hidden_size,
-            num_layers,
-            optimiser,
-            learning_rate,
-            gamma,
-            gae_lambda,
-            normalize_advantage,
-            1,
-            1,
-            max_grad_norm,
-        )
+        super().__init__(observation_spec, action_spec, **settings)
         self.objective = A2CLoss(
             self.actor,
             self.critic,

@@ -14,7 +14,7 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from baselines.learner import OPTIMISERS, Learner, make_optimiser, mean_measurements, one_of, true_or_false
 from baselines.networks import STATE_KEYS, actor, critic, encoder, recurrent, zero_state
-from ctgraph_rl.checks import at_least_one, fraction, is_int, is_real, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
 
 ACTED_KEYS = ("action", "action_log_prob", "state_value")
 
@@ -22,7 +22,8 @@ ACTED_KEYS = ("action", "action_log_prob", "state_value")
 class PolicyGradient(Learner):
     """An actor and a critic on one trunk, which ends in an LSTM if the class has ``memory``.
 
-    A class that derives from it sets ``objective``, a TorchRL loss of the two heads. With memory,
+    A class that derives from it sets ``objective``, a TorchRL loss of the two heads, and hands all arguments here that
+    are not its own. With memory,
     whole rows of a batch are the minibatches, so the trunk sees sequences in order, and its state starts anew wherever
     ``is_init`` is set; without, the frames of all rows are shuffled.
 
@@ -36,15 +37,15 @@ class PolicyGradient(Learner):
         optimiser: ``adam`` or ``rmsprop``.
         learning_rate: of the optimiser.
         gamma: discount factor.
-        gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016, arXiv 1506.02438).
         normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
-        num_epochs: passes over a batch.
-        num_minibatches: minibatches a pass.
         max_grad_norm: gradients are scaled down to this norm.
+        gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016, arXiv 1506.02438); 1: returns
+            of up to ``num_steps`` steps.
     """
 
     loss_keys: ClassVar[tuple[str, ...]] = ("loss_objective", "loss_critic", "loss_entropy", "entropy")
     objective: nn.Module
+    num_epochs = num_minibatches = 1
 
     def __init__(
         self,
@@ -57,24 +58,19 @@ class PolicyGradient(Learner):
         optimiser: str,
         learning_rate: float,
         gamma: float,
-        gae_lambda: float,
         normalize_advantage: bool,
-        num_epochs: int,
-        num_minibatches: int,
         max_grad_norm: float,
+        gae_lambda: float = 1.0,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
-        counts = {"hidden_size": hidden_size, "num_layers": num_layers, "num_epochs": num_epochs}
         require(
-            *at_least_one(**counts, num_minibatches=num_minibatches),
+            *at_least_one(hidden_size=hidden_size, num_layers=num_layers),
             *one_of(OPTIMISERS, optimiser=optimiser),
             *positive(learning_rate=learning_rate, gamma=gamma, gae_lambda=gae_lambda),
             *fraction(gamma=gamma, gae_lambda=gae_lambda),
             *true_or_false(normalize_advantage=normalize_advantage),
-            self._split_rule(num_minibatches),
         )
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
-        self.num_epochs, self.num_minibatches = num_epochs, num_minibatches
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
         self.features = "memory" if self.memory else "features"
         self.actor = actor(self.features, hidden_size, action_spec)
@@ -82,13 +78,6 @@ class PolicyGradient(Learner):
         state = [("next", key) for key in STATE_KEYS if self.memory]
         self.policy = TensorDictSequential(self.trunk, self.actor, self.critic, selected_out_keys=[*ACTED_KEYS, *state])
         self.optimiser = make_optimiser(optimiser, self.parameters(), learning_rate)
-
-    def _split_rule(self, num_minibatches: int) -> tuple[bool, str]:
-        """Whether minibatches split the rows, or the frames, evenly."""
-        items = self.num_envs if self.memory else self.num_envs * self.num_steps
-        what = f"num_envs={self.num_envs}" if self.memory else f"num_envs * num_steps = {items}"
-        splits = is_int(num_minibatches, 1) and items % num_minibatches == 0
-        return splits, f"{what} must be a multiple of num_minibatches={num_minibatches}"
 
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int

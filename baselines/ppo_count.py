@@ -6,6 +6,8 @@ is paid coeff / sqrt(times that its hash was seen), in addition to the environme
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -49,23 +51,9 @@ class PPOCount(PPO):
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows that it learns from.
-        num_steps: steps of each row in a batch.
-        hidden_size: width of all layers.
-        num_layers: layers before the heads.
-        optimiser: ``adam`` or ``rmsprop``.
-        learning_rate: of the optimiser.
-        gamma: discount factor.
-        gae_lambda: lambda of the generalised advantage estimate.
-        normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
-        clip_epsilon: how far the probability ratio may move.
-        entropy_coeff: weight of the entropy bonus.
-        critic_coeff: weight of the critic's loss, a mean squared error.
-        num_epochs: passes over a batch.
-        num_minibatches: minibatches a pass; they split the frames.
-        max_grad_norm: gradients are scaled down to this norm.
         bonus_coeff: bonus for an observation that was never seen before.
         num_hash_bits: bits of the hash, at most 24; more bits tell more observations apart.
+        settings: the arguments of `PPO`.
     """
 
     solves = "fully observable tasks (CT-FO) whose goal random actions hardly ever reach"
@@ -74,45 +62,13 @@ class PPOCount(PPO):
         self,
         observation_spec: Composite,
         action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
-        hidden_size: int,
-        num_layers: int,
-        optimiser: str,
-        learning_rate: float,
-        gamma: float,
-        gae_lambda: float,
-        normalize_advantage: bool,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        critic_coeff: float,
-        num_epochs: int,
-        num_minibatches: int,
-        max_grad_norm: float,
         bonus_coeff: float,
         num_hash_bits: int,
+        **settings: Any,
     ) -> None:
         bits = (is_int(num_hash_bits, 1, 24), f"num_hash_bits must be an integer in 1..24, got {num_hash_bits!r}")
         require(bits, *loss_weight(bonus_coeff=bonus_coeff))
-        super().__init__(
-            observation_spec,
-            action_spec,
-            num_envs,
-            num_steps,
-            hidden_size,
-            num_layers,
-            optimiser,
-            learning_rate,
-            gamma,
-            gae_lambda,
-            normalize_advantage,
-            clip_epsilon,
-            entropy_coeff,
-            critic_coeff,
-            num_epochs,
-            num_minibatches,
-            max_grad_norm,
-        )
+        super().__init__(observation_spec, action_spec, **settings)
         spec = observation_spec["observation"]
         self.bonus_coeff = bonus_coeff
         self.seen = SimHashCounts(spec.shape.numel(), spec.space.high.max().item(), num_hash_bits)

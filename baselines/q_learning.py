@@ -16,7 +16,7 @@ from torchrl.objectives.common import LossModule
 
 from baselines.learner import Learner, make_optimiser, mean_measurements, one_of
 from baselines.prioritized import PrioritySampler
-from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, positive, require
 
 
 class QLearner(Learner):
@@ -30,7 +30,7 @@ class QLearner(Learner):
         num_steps: steps of each row between two rounds of updates.
         gamma: discount factor.
         n_steps: steps of a multi-step target (uncorrected).
-        num_items: items that the replay buffer keeps.
+        buffer_size: steps that the replay buffer keeps.
         batch_size: items that a gradient step learns from.
         num_updates: gradient steps after each batch of data.
         target_update_interval: gradient steps between two copies to the target network.
@@ -39,10 +39,10 @@ class QLearner(Learner):
         annealing_num_steps: frames of a task over which exploration falls linearly.
         max_grad_norm: gradients are scaled down to this norm.
         replay_on_task_change: ``clear`` or ``keep`` the replay buffer where a task change is announced.
-        priority_alpha: how much more often surprising items are replayed; 0 is uniform (Schaul et al. 2016, arXiv
-            1511.05952).
-        priority_beta: how much of that the loss corrects, in [0, 1].
     """
+
+    priority_alpha = priority_beta = 0.0
+    """How much more often surprising items are replayed, and how much of that the loss corrects."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class QLearner(Learner):
         num_steps: int,
         gamma: float,
         n_steps: int,
-        num_items: int,
+        buffer_size: int,
         batch_size: int,
         num_updates: int,
         target_update_interval: int,
@@ -59,18 +59,15 @@ class QLearner(Learner):
         annealing_num_steps: int,
         max_grad_norm: float,
         replay_on_task_change: str,
-        priority_alpha: float = 0.0,
-        priority_beta: float = 0.0,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
-        counts = {"n_steps": n_steps, "batch_size": batch_size, "num_updates": num_updates}
+        counts = {"n_steps": n_steps, "batch_size": batch_size, "num_updates": num_updates, "buffer_size": buffer_size}
         require(
             *at_least_one(**counts, target_update_interval=target_update_interval),
             *at_least_one(annealing_num_steps=annealing_num_steps),
             *positive(gamma=gamma),
-            *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end, priority_beta=priority_beta),
+            *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end),
             *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),
-            (is_real(priority_alpha, 0), f"priority_alpha must be a number >= 0, got {priority_alpha!r}"),
         )
         require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
         self.num_updates, self.replay_on_task_change = num_updates, replay_on_task_change
@@ -79,8 +76,12 @@ class QLearner(Learner):
         self.target_update_interval = target_update_interval
         self.multi_step = MultiStep(gamma, n_steps)
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
-        self.prioritized = priority_alpha != 0
-        self.replay = make_replay(num_items, batch_size, priority_alpha, priority_beta)
+        self.prioritized = self.priority_alpha != 0
+        self.replay = make_replay(self.items_of(buffer_size), batch_size, self.priority_alpha, self.priority_beta)
+
+    def items_of(self, num_steps: int) -> int:
+        """How many items of the replay buffer hold so many steps."""
+        return num_steps
 
     def act_with(
         self,

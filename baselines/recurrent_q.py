@@ -7,6 +7,8 @@ one, to bootstrap from.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase, pad
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -85,55 +87,35 @@ def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
 class RecurrentQ(QLearner):
     """Q-learning with an LSTM; classes that derive from it say how far a prediction is from its target.
 
-    The arguments are those of `baselines.drqn.DRQN`, and ``num_quantiles``.
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        hidden_size: width of features and LSTM.
+        learning_rate: of Adam.
+        settings: the arguments of `QLearner`; batches are sequences of ``num_steps`` steps.
     """
 
     memory = True
+    num_quantiles = 1
 
     def __init__(
         self,
         observation_spec: Composite,
         action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
         hidden_size: int,
-        num_quantiles: int,
         learning_rate: float,
-        gamma: float,
-        n_steps: int,
-        buffer_size: int,
-        batch_size: int,
-        num_updates: int,
-        target_update_interval: int,
-        eps_init: float,
-        eps_end: float,
-        annealing_num_steps: int,
-        max_grad_norm: float,
-        replay_on_task_change: str,
+        **settings: Any,
     ) -> None:
+        num_steps, buffer_size = settings["num_steps"], settings["buffer_size"]
         holds_one = is_int(buffer_size) and (not is_int(num_steps, 1) or buffer_size >= num_steps)
         require(
-            *at_least_one(hidden_size=hidden_size, num_quantiles=num_quantiles, num_steps=num_steps),
+            *at_least_one(hidden_size=hidden_size, num_quantiles=self.num_quantiles, num_steps=num_steps),
             *positive(learning_rate=learning_rate),
             (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
         )
-        super().__init__(
-            num_envs,
-            num_steps,
-            gamma,
-            n_steps,
-            buffer_size // num_steps,
-            batch_size,
-            num_updates,
-            target_update_interval,
-            eps_init,
-            eps_end,
-            annealing_num_steps,
-            max_grad_norm,
-            replay_on_task_change,
-        )
+        super().__init__(**settings)
         self.trunk = recurrent(observation_spec, hidden_size, 1)
-        head = Quantiles(hidden_size, action_spec.space.n, num_quantiles)
+        head = Quantiles(hidden_size, action_spec.space.n, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         self.greedy = QValueActor(
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
@@ -141,6 +123,10 @@ class RecurrentQ(QLearner):
         self.targets = RecurrentTargets(self.greedy)
         state = (("next", key) for key in STATE_KEYS)
         self.act_with(self.greedy, self.targets, action_spec, learning_rate, *state)
+
+    def items_of(self, num_steps: int) -> int:
+        """A sequence is an item."""
+        return num_steps // self.num_steps
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Zeros for the LSTM's state."""

@@ -7,6 +7,8 @@ the whole trial, so an early episode may be spent on search.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -61,69 +63,19 @@ class RL2(PPO):
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows that it learns from.
-        num_steps: steps of each row in a batch, the length of the sequences.
-        hidden_size: width of features and LSTM.
-        num_layers: layers before the LSTM.
-        optimiser: ``adam`` or ``rmsprop``.
-        learning_rate: of the optimiser.
-        gamma: discount factor.
-        gae_lambda: lambda of the generalised advantage estimate.
-        normalize_advantage: give the advantages of a batch mean 0 and standard deviation 1.
-        clip_epsilon: how far the probability ratio may move.
-        entropy_coeff: weight of the entropy bonus.
-        critic_coeff: weight of the critic's loss, a mean squared error.
-        num_epochs: passes over a batch.
-        num_minibatches: minibatches a pass; they split the rows.
-        max_grad_norm: gradients are scaled down to this norm.
         trial_episodes: episodes of a trial.
+        settings: the arguments of `PPO`.
     """
 
     memory = True
     solves = "tasks whose goal changes after a number of episodes: it searches, then returns"
 
     def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        num_envs: int,
-        num_steps: int,
-        hidden_size: int,
-        num_layers: int,
-        optimiser: str,
-        learning_rate: float,
-        gamma: float,
-        gae_lambda: float,
-        normalize_advantage: bool,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        critic_coeff: float,
-        num_epochs: int,
-        num_minibatches: int,
-        max_grad_norm: float,
-        trial_episodes: int,
+        self, observation_spec: Composite, action_spec: TensorSpec, trial_episodes: int, **settings: Any
     ) -> None:
         require(*at_least_one(trial_episodes=trial_episodes))
         self.trial_episodes = trial_episodes
-        super().__init__(
-            observation_spec,
-            action_spec,
-            num_envs,
-            num_steps,
-            hidden_size,
-            num_layers,
-            optimiser,
-            learning_rate,
-            gamma,
-            gae_lambda,
-            normalize_advantage,
-            clip_epsilon,
-            entropy_coeff,
-            critic_coeff,
-            num_epochs,
-            num_minibatches,
-            max_grad_norm,
-        )
+        super().__init__(observation_spec, action_spec, **settings)
         keys = [*self.policy.out_keys, ("next", "trial"), ("next", "previous_action")]
         copied = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", "previous_action")])
         self.policy = TensorDictSequential(self.trunk, self.actor, self.critic, copied, selected_out_keys=keys)

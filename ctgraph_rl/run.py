@@ -198,7 +198,7 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
         ValueError: for an argument that the target does not take; lists the choices.
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
-    parameters = signature(hydra.utils.get_object(cfg[group]["_target_"])).parameters
+    parameters = parameters_of(hydra.utils.get_object(cfg[group]["_target_"]))
     choices = [name for name in parameters if name not in SPECS]
     unknown = [name for name in given if name not in choices]
     missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
@@ -207,6 +207,14 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
         (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
     )
     return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
+
+
+def parameters_of(function: Any) -> dict[str, Parameter]:
+    """The arguments by name; what a class takes as ``**`` it hands on to its base, whose arguments they are."""
+    own = signature(function).parameters
+    named = {name: parameter for name, parameter in own.items() if parameter.kind is not Parameter.VAR_KEYWORD}
+    hands_on = isinstance(function, type) and len(named) < len(own)
+    return parameters_of(function.__mro__[1]) | named if hands_on else named
 
 
 def checked_device(name: str) -> Any:
