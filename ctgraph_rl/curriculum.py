@@ -60,7 +60,7 @@ class Block:
                 f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}",
             ),
         )
-        enough = self.switch is None or len(tasks) > 1  # type: ignore
+        enough = self.switch is None or len(self.tasks) > 1
         require((enough, "a block with a switch needs at least two tasks, got one; leave the switch out"))
 
     def rows(self, num_envs: int) -> list[Task]:
@@ -125,7 +125,7 @@ class Evaluation:
         )
         require(
             (n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"),
-            (len(set(held_out)) == len(held_out), "held_out tasks must differ"),  # type: ignore
+            (len(set(self.held_out)) == len(self.held_out), "held_out tasks must differ"),
         )
 
     def every_rule(self, num_envs: int) -> tuple[bool, str]:
