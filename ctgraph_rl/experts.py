@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +15,12 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Block, Curriculum, Protocol
+from ctgraph_rl.files import locked
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.task import Task
 
 Learn = Callable[[Curriculum, Path], None]
-"""Runs the learning of a curriculum into an empty directory."""
+"""Runs the learning of a curriculum into a directory, or goes on with what was begun there."""
 
 
 EXPERT = "single-task expert"
@@ -72,7 +71,7 @@ def find_or_train(
 
     Args:
         curriculum: whose tasks.
-        learn: trains one.
+        learn: trains one, or goes on training it.
         folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
         settings: all else that an expert's numbers depend on: agent, seed, versions.
         tell: is given a line about each expert.
@@ -83,7 +82,7 @@ def find_or_train(
     alone = [expert_curriculum(curriculum, task) for task in curriculum.tasks]
     experts = [Expert(number, each.fingerprint, folder / _key(each, settings)) for number, each in enumerate(alone, 1)]
     for expert, each, label in zip(experts, alone, curriculum.labels, strict=True):
-        found = (expert.run_dir / "metrics.json").exists()
+        found = _is_trained(expert.run_dir)
         state = "found in" if found else "learns into"
         tell(f"expert {expert.task} of {len(experts)}, {label}: {state} {expert.run_dir}")
         if not found:
@@ -92,18 +91,15 @@ def find_or_train(
 
 
 def _train(curriculum: Curriculum, learn: Learn, run_dir: Path) -> None:
-    """Train into a directory of this process, which gets its name when it is complete."""
-    partial = run_dir.with_name(f".{run_dir.name}-{os.getpid()}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        learn(curriculum, partial)
-        partial.rename(run_dir)
-    except OSError:
-        if not run_dir.exists():  # else another process was faster, with the same result
-            raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    """Train into the directory, alone; go on with what was begun there, wait for a process that is at it."""
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with locked(run_dir, wait=True):
+        if not _is_trained(run_dir):
+            learn(curriculum, run_dir)
+
+
+def _is_trained(run_dir: Path) -> bool:
+    return (run_dir / "metrics.json").exists()
 
 
 def _key(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any, Protocol
@@ -23,6 +23,9 @@ from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.task import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
+Checkpoint = Callable[[Callable[[], dict[str, Any]], bool], object]
+"""Is offered a function that makes the run's state, and whether a block ends here."""
+
 InitialState = Callable[[int], TensorDict]
 
 
@@ -45,6 +48,8 @@ def learn_curriculum(
     log: RunLog | None = None,
     progress: Progress | None = None,
     device: torch.device | str = "cpu",
+    saved: Mapping[str, Any] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> RunLog:
     """Let an agent learn a curriculum block by block, evaluated as the curriculum says.
 
@@ -59,6 +64,9 @@ def learn_curriculum(
         log: where measurements go; default: a new one in memory.
         progress: is told after every batch.
         device: where the environment lives.
+        saved: a state that ``checkpoint`` was offered, to go on from as if never stopped; the agent is built as it was,
+            and the log holds what it held then.
+        checkpoint: is offered the state after every update.
 
     Returns:
         The log; ``log.performance()`` is the performance matrix.
@@ -71,11 +79,14 @@ def learn_curriculum(
     check_rows(curriculum, agent.num_envs)
     env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
     examiner = Examiner(curriculum, seed, log, device)
-    examiner.examine(agent, 0)
-    frames = 0
-    for blocks in curriculum.stretches:
-        agent.start_task(_given_id(curriculum, blocks[0]))
-        for batch in _collect_blocks(env, agent, blocks, partial(examiner.examine, agent), frames):
+    if saved is None:
+        examiner.examine(agent, 0)
+    frames = 0 if saved is None else saved["frames"]
+    for start, blocks in _left(curriculum, frames):
+        if frames == start:
+            agent.start_task(_given_id(curriculum, blocks[0]))
+            saved = None
+        for batch, carried in _collect_blocks(env, agent, blocks, partial(examiner.examine, agent), start, saved):
             after = frames + batch.numel()
             measurements = _learn(agent, batch, curriculum.block_at(after), after)
             for part in _of_one_block(batch, frames, curriculum.ends):
@@ -85,6 +96,8 @@ def learn_curriculum(
                 log.append("training", block=block, frames=frames, **episodes, **measurements)
             if progress is not None:
                 progress.update(block, frames, episodes["return_mean"])
+            if checkpoint is not None:
+                checkpoint(partial(_state, frames, agent, env, carried, log), frames in curriculum.ends)
         agent.end_task()
         examiner.examine(agent, frames)
     return log
@@ -104,13 +117,57 @@ def make_env(
     return CTGraphEnv(tasks, seed, task_pool=pool, device=device, task_ids=curriculum.task_ids, num_task_ids=length)
 
 
+def _left(curriculum: Curriculum, frames: int) -> Iterator[tuple[int, tuple[Block, ...]]]:
+    """The stretches that do not end before ``frames`` frames of the run, each with the frames at its start."""
+    start = 0
+    for blocks in curriculum.stretches:
+        end = start + sum(block.num_frames for block in blocks)
+        if frames <= end:
+            yield start, blocks
+        start = end
+
+
+def _state(frames: int, agent: Agent, env: CTGraphEnv, carried: TensorDictBase, log: RunLog) -> dict[str, Any]:
+    """All that the rest of a run depends on, as tensors and plain values."""
+    on_cuda = env.device.type == "cuda"
+    return {
+        "frames": frames,
+        "agent": agent.state_dict(),
+        "env": env.state_dict(),
+        "carried": carried.to_dict(),
+        "random": torch.get_rng_state(),
+        "random_cuda": torch.cuda.get_rng_state(env.device) if on_cuda else None,
+        "log": log.position(),
+    }
+
+
+def _restore(saved: Mapping[str, Any], agent: Agent, env: CTGraphEnv) -> TensorDictBase:
+    """Go back to a saved state; returns what the next step starts from."""
+    agent.load_state_dict(saved["agent"])
+    env.load_state_dict(saved["env"])
+    torch.set_rng_state(saved["random"])
+    if saved["random_cuda"] is not None:
+        torch.cuda.set_rng_state(saved["random_cuda"], env.device)
+    return TensorDict(saved["carried"], env.batch_size, device=env.device)
+
+
 def _collect_blocks(
-    env: CTGraphEnv, agent: Agent, blocks: Sequence[Block], examine: Callable[[int], object], start: int
-) -> Iterator[TensorDictBase]:
-    """Batches of blocks with hidden boundaries between them, after ``start`` frames of the run."""
-    ends = accumulate(block.num_frames for block in blocks)
+    env: CTGraphEnv,
+    agent: Agent,
+    blocks: Sequence[Block],
+    examine: Callable[[int], object],
+    start: int,
+    saved: Mapping[str, Any] | None = None,
+) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+    """Batches of blocks with hidden boundaries between them, after ``start`` frames of the run.
+
+    With each comes what the next step starts from. A saved state is one between two batches of these blocks.
+    """
+    ends = list(accumulate(block.num_frames for block in blocks))
     following = dict(zip(ends, blocks[1:], strict=False))
-    _enter(env, blocks[0])
+    done = 0 if saved is None else saved["frames"] - start
+    _enter(env, blocks[sum(end <= done for end in ends[:-1])])
+    carried = None if saved is None else _restore(saved, agent, env)
 
     def between_steps(frames: int) -> None:
         if frames:
@@ -119,8 +176,7 @@ def _collect_blocks(
         if next_end in following:  # so that a row whose episode ends with the block does not begin another of its task
             _enter(env, following[next_end], at_episode_end=True)
 
-    num_frames = sum(block.num_frames for block in blocks)
-    return collect(env, agent.policy, num_frames, agent.num_steps, agent.initial_state, between_steps)
+    return _batches(env, agent.policy, ends[-1], agent.num_steps, agent.initial_state, between_steps, carried, done)
 
 
 def _of_one_block(batch: TensorDictBase, start: int, ends: Iterable[int]) -> Iterator[TensorDictBase]:
@@ -159,7 +215,6 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     require(*rules.values())
 
 
-@torch.no_grad()
 def collect(
     env: CTGraphEnv,
     policy: Policy,
@@ -186,17 +241,32 @@ def collect(
         (whole, f"num_frames must be a multiple of the {env.numel()} rows, got {num_frames!r}"),
         *at_least_one(num_steps=num_steps),
     )
+    return (batch for batch, _ in _batches(env, policy, num_frames, num_steps, initial_state, between_steps))
+
+
+@torch.no_grad()
+def _batches(
+    env: CTGraphEnv,
+    policy: Policy,
+    num_frames: int,
+    num_steps: int,
+    initial_state: InitialState | None = None,
+    between_steps: Callable[[int], object] | None = None,
+    carried: TensorDictBase | None = None,
+    done: int = 0,
+) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+    """`collect`, with what the step after each batch starts from; goes on from there after ``done`` frames."""
     start = _start(env, initial_state)
-    carried = env.reset().update(start)
+    carried = env.reset().update(start) if carried is None else carried
     steps: list[TensorDictBase] = []
-    for frames in range(0, num_frames, env.numel()):
+    for frames in range(done, num_frames, env.numel()):
         if between_steps is not None:
             between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
             step, carried = _act(env, policy, carried, start)
         steps.append(step)
         if len(steps) == num_steps or frames + env.numel() == num_frames:
-            yield torch.stack(steps, dim=1)
+            yield torch.stack(steps, dim=1), carried
             steps = []
 
 

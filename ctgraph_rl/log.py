@@ -25,15 +25,17 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.files import cannot_write, write_whole
 from ctgraph_rl.metrics import Curves, Regime
 
 SCHEMA = 1
@@ -42,6 +44,8 @@ SCHEMA = 1
 
 class RunLog:
     """Measurements of one run, in memory and, with a path, in a file that is written line by line.
+
+    ``listeners`` are called with every measurement that is appended.
 
     Args:
         path: the file to append to; None keeps measurements in memory only.
@@ -53,18 +57,53 @@ class RunLog:
     def __init__(self, path: Path | str | None = None) -> None:
         self.measurements: list[dict[str, Any]] = []
         self.torn_lines = 0
+        self.listeners: list[Callable[[dict[str, Any]], object]] = []
         self._start = time.perf_counter()
-        self._file: TextIO | None = None
-        if path is not None:
-            self._file = Path(path).open("x", buffering=1, encoding="utf-8")  # noqa: SIM115, open until `close`
+        self._path = None if path is None else Path(path)
+        self._file: BinaryIO | None = None
+        if self._path is not None:
+            self._file = self._path.open("xb", buffering=0)
+
+    @classmethod
+    def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
+        """Go on writing a log from a `position`; the lines after it are removed.
+
+        Raises:
+            ValueError: if the file ends before it, or a line is no measurement.
+        """
+        path, size = Path(path), int(position["bytes"])
+        there = path.stat().st_size
+        require((there >= size, f"{path} has {there} bytes and the checkpoint needs {size}: restore the file"))
+        os.truncate(path, size)
+        log = cls.read(path)
+        require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
+        log._path, log._file = path, path.open("ab", buffering=0)
+        log._start -= position["seconds"]
+        return log
+
+    def position(self) -> dict[str, float]:
+        """How far the file is, in bytes that have reached the disk, and the time of the run, in seconds."""
+        size = 0
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+            size = self._file.tell()
+        return {"bytes": size, "seconds": round(time.perf_counter() - self._start, 3)}
 
     def append(self, kind: str, **values: Any) -> None:
         """Add one measurement; NaN and infinity become null, as JSON has neither."""
         finite = {name: _finite(value) for name, value in values.items()}
         measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
         self.measurements.append(measurement)
-        if self._file is not None:
-            self._file.write(json.dumps(measurement) + "\n")
+        if self._file is not None and self._path is not None:
+            line = json.dumps(measurement).encode() + b"\n"
+            try:
+                written = self._file.write(line)
+                while written < len(line):  # a full disk takes a part, and says so at the next attempt
+                    written += self._file.write(line[written:])
+            except OSError as error:
+                raise cannot_write(self._path, len(line), error) from error
+        for listener in self.listeners:
+            listener(measurement)
 
     def close(self) -> None:
         """Close the file."""
@@ -243,4 +282,4 @@ def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
     One run is one seed, and has no interval; `ctgraph_rl.results` has those of several.
     """
     content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
-    Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -20,10 +20,11 @@ class ProgressBar:
         num_blocks: blocks of the run.
         num_frames: frames of the run.
         console: where it shows; default: standard error.
+        done: frames that were learned before, by a run that goes on.
     """
 
-    def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None) -> None:
-        self.num_blocks, self.num_frames = num_blocks, num_frames
+    def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
+        self.num_blocks, self.num_frames, self.done = num_blocks, num_frames, done
         self.console = Console(stderr=True) if console is None else console
         self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._live = self.console.is_terminal
@@ -53,7 +54,7 @@ class ProgressBar:
 
     def describe(self, block: int, frames: int, episode_return: float, seconds: float) -> str:
         """One line: block, frames, rate, return and time left."""
-        rate = frames / seconds
+        rate = (frames - self.done) / seconds
         left = timedelta(seconds=round((self.num_frames - frames) / rate))
         shown = "-" if math.isnan(episode_return) else f"{episode_return:.2f}"
         return (

@@ -39,8 +39,6 @@ def named(curriculum: Curriculum) -> Curriculum:
 
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
     """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
-    import torch
-
     from ctgraph_rl.log import SCHEMA
 
     return {
@@ -52,6 +50,13 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
         "versions": versions(),
-        "machine": f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
-        "num_threads": torch.get_num_threads(),
+        **machine(),
     }
+
+
+def machine() -> dict[str, Any]:
+    """What besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
+    import torch
+
+    kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    return {"machine": kind, "num_threads": torch.get_num_threads()}

@@ -10,8 +10,8 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from inspect import Parameter, signature
@@ -24,11 +24,13 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, positive, require
 
 if TYPE_CHECKING:
+    from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.curriculum import Curriculum
     from ctgraph_rl.experts import Expert
+    from ctgraph_rl.interrupt import Interrupt
 
 SPECS = ("observation_spec", "action_spec")
 """Arguments of agents that come from the environment."""
@@ -36,7 +38,9 @@ SPECS = ("observation_spec", "action_spec")
 KEYS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 """An example of each group that changes a curriculum."""
 
-NOT_HASHED = ("overwrite", "experts_dir")
+RESUME = ("warn", "strict")
+
+NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds")
 """Keys of the configuration that do not change results."""
 
 
@@ -111,9 +115,18 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("overwrite", "experts"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
-    if not is_finished(cfg, run_dir):
-        learn(cfg, run_dir)
-    from ctgraph_rl.report import print_summary
+    require(
+        (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
+        *positive(checkpoint_seconds=cfg.checkpoint_seconds),
+    )
+    from ctgraph_rl.files import locked
+    from ctgraph_rl.interrupt import Interrupt
+
+    with locked(run_dir):
+        if not is_finished(cfg, run_dir):
+            with Interrupt() as interrupt, marked_if_it_fails(run_dir):
+                learn(cfg, run_dir, interrupt)
+    from ctgraph_rl.report.terminal import print_summary
 
     print_summary(run_dir)
     here = Path.cwd()
@@ -121,34 +134,61 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
 
 
 def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
-    """Whether the directory already holds the results of this configuration.
+    """Whether the directory already holds the results of this configuration, complete.
 
     Raises:
-        FileExistsError: if it holds an unfinished run, or one of another configuration.
+        FileExistsError: if it holds a run, finished or not, of another configuration; shows the difference.
     """
     log_file = run_dir / "run.jsonl"
     if cfg.overwrite or not log_file.exists():
         return False
     from ctgraph_rl.log import RunLog
 
-    advice = "choose another hydra.run.dir, or overwrite=true to replace it"
     runs = RunLog.read(log_file).of_kind("run")
-    if not (runs and (run_dir / "metrics.json").exists()):
-        raise FileExistsError(f"{run_dir} holds an unfinished run; {advice}")
-    config = plain(cfg)
-    different = [key for key in config if runs[0]["config"].get(key) != config[key]]
-    if different:
-        raise FileExistsError(f"{run_dir} holds a run with another {', '.join(different)}; {advice}")
-    print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
-    return True
+    if not runs:  # stopped while its first line was written
+        return False
+    before, now = dict(flat(runs[0].get("config") or {})), dict(flat(plain(cfg)))
+    changed = [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
+    if changed:
+        shown = ", ".join(f"{key}={before.get(key)!r} instead of {now.get(key)!r}" for key in changed)
+        advice = "choose another hydra.run.dir, or overwrite=true to replace it"
+        raise FileExistsError(f"{run_dir} holds a run with {shown}; {advice}")
+    finished = (run_dir / "metrics.json").exists()
+    if finished:
+        print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
+    return finished
 
 
-def learn(cfg: DictConfig, run_dir: Path) -> None:
+def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a nested configuration by dotted names."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+@contextmanager
+def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
+    """Leave the reason in ``failed.txt`` where a run that had begun ends by an error."""
+    mark = run_dir / "failed.txt"
+    mark.unlink(missing_ok=True)
+    try:
+        yield
+    except Exception as error:
+        if (run_dir / "run.jsonl").exists():
+            with suppress(OSError):
+                mark.write_text(f"{type(error).__name__}: {explain(error)}\n", encoding="utf-8")
+        raise
+
+
+def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> None:
     """The run itself: build, check, learn, measure, write; the experts before it, where they are asked for."""
     import torch
 
+    from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.experts import expert_curriculum
-    from ctgraph_rl.train import RESULTS, new_agent, train
+    from ctgraph_rl.train import CHECKPOINTS, RESULTS, new_agent, train
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -160,14 +200,20 @@ def learn(cfg: DictConfig, run_dir: Path) -> None:
     make_agent = target(cfg, "agent")
     for checked in (curriculum, *(expert_curriculum(curriculum, task) for task in curriculum.tasks if cfg.experts)):
         new_agent(checked, make_agent, cfg.seed)
-    for name in RESULTS:
-        (run_dir / name).unlink(missing_ok=True)
+
+    def checkpoints(folder: Path) -> Checkpoints:
+        return Checkpoints(folder / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
+
+    if cfg.overwrite:
+        checkpoints(run_dir).clear()
+        for name in RESULTS:
+            (run_dir / name).unlink(missing_ok=True)
     write_configuration(cfg, run_dir / ".hydra")
-    experts = train_experts(cfg, curriculum) if cfg.experts else None
-    train(curriculum, make_agent, run_dir, cfg.seed, device, plain(cfg), experts)
+    experts = train_experts(cfg, curriculum, checkpoints) if cfg.experts else None
+    train(curriculum, make_agent, run_dir, cfg.seed, device, plain(cfg), experts, checkpoints(run_dir))
 
 
-def train_experts(cfg: DictConfig, curriculum: Curriculum) -> list[Expert]:
+def train_experts(cfg: DictConfig, curriculum: Curriculum, checkpoints: Callable[[Path], Checkpoints]) -> list[Expert]:
     """The experts of a curriculum, found or trained with the run's own agent, seed and threads."""
     from ctgraph_rl.experts import find_or_train
     from ctgraph_rl.provenance import versions
@@ -176,7 +222,8 @@ def train_experts(cfg: DictConfig, curriculum: Curriculum) -> list[Expert]:
     settings = {key: value for key, value in plain(cfg).items() if key in ("agent", "seed", "device", "num_threads")}
 
     def learn_alone(alone: Curriculum, run_dir: Path) -> None:
-        train(alone, target(cfg, "agent"), run_dir, cfg.seed, checked_device(cfg.device), settings)
+        device = checked_device(cfg.device)
+        train(alone, target(cfg, "agent"), run_dir, cfg.seed, device, settings, checkpoints=checkpoints(run_dir))
 
     folder = Path(cfg.experts_dir)
     return find_or_train(curriculum, learn_alone, folder, {**settings, "versions": versions()}, print)
@@ -283,7 +330,7 @@ def main() -> None:
         print(f"error: {explain(error)}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
-        print("interrupted; the run cannot be resumed, overwrite=true starts it again", file=sys.stderr)
+        print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(130)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +13,15 @@ import torch
 from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checkpoints import Checkpoints, State
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.experts import Expert
+from ctgraph_rl.files import append_line, write_whole
 from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
 from ctgraph_rl.log import RunLog, write_metrics, write_performance
 from ctgraph_rl.progress import ProgressBar
-from ctgraph_rl.provenance import provenance
+from ctgraph_rl.provenance import machine, provenance
 from ctgraph_rl.scores import scores
 from ctgraph_rl.tables import write_tables
 
@@ -36,8 +41,17 @@ MEMBERS = (
 )
 """What a run needs of an agent."""
 
-RESULTS = ("run.jsonl", "evaluations.csv", "training.csv", "performance.csv", "metrics.json", "agent.pt")
-"""What a run writes into its directory; ``metrics.json`` is there when the run is complete."""
+LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
+
+RESULTS = (LOG, "evaluations.csv", "training.csv", "performance.csv", METRICS, AGENT, CURRICULUM)
+"""What a run writes into its directory; ``metrics.json`` is there when the run is complete, ``curriculum.json`` where
+the curriculum has only parts of this package's classes."""
+
+CHECKPOINTS = "checkpoints"
+"""The folder in a run's directory with what an unfinished run goes on from."""
+
+RESTARTS = "restarts.jsonl"
+"""Says, for a run that was stopped, where it went on and on which machine."""
 
 
 def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: torch.device | str = "cpu") -> Agent:
@@ -66,8 +80,12 @@ def train(
     device: torch.device | str = "cpu",
     config: Mapping[str, Any] | None = None,
     experts: Sequence[Expert] | None = None,
+    checkpoints: Checkpoints | None = None,
+    listeners: Sequence[Callable[[dict[str, Any]], object]] = (),
 ) -> None:
-    """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory that has none.
+    """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
+
+    A run that was stopped there goes on from its last checkpoint, and ends as if it had never been stopped.
 
     Args:
         curriculum: what is learned.
@@ -77,17 +95,59 @@ def train(
         device: where environment and agent live.
         config: what else the first line of the log should hold.
         experts: for each task, who learned it alone; they are named in the log.
+        checkpoints: default: those in the directory, every five minutes.
+        listeners: are called with every measurement.
+
+    Raises:
+        ValueError: if the directory holds a run that cannot be gone on with.
     """
     agent = new_agent(curriculum, make_agent, seed, device)
-    log = RunLog(run_dir / "run.jsonl")
-    log.append("run", **provenance(curriculum), config=config)
-    if experts is not None:
-        log.append("experts", experts=[expert.about for expert in experts])
-    with ProgressBar(len(curriculum.blocks), curriculum.num_frames) as progress:
-        learn_curriculum(curriculum, agent, seed, log, progress, device)
+    checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
+    saved = checkpoints.newest()
+    about = provenance(curriculum)
+    log = _new_log(run_dir) if saved is None else _resumed_log(run_dir, saved, about, checkpoints.strict)
+    log.listeners.extend(listeners)
+    if saved is None:
+        with suppress(ValueError):  # parts of a user's own classes have no JSON
+            curriculum.to_json(run_dir / CURRICULUM)
+        log.append("run", **about, config=config)
+        if experts is not None:
+            log.append("experts", experts=[expert.about for expert in experts])
+    done = 0 if saved is None else saved["frames"]
+    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, done=done) as progress:
+        learn_curriculum(curriculum, agent, seed, log, progress, device, saved, checkpoints.offer)
     log.close()
-    torch.save(agent.state_dict(), run_dir / "agent.pt")
+    weights = io.BytesIO()
+    torch.save(agent.state_dict(), weights)
+    write_whole(run_dir / AGENT, weights.getvalue())
     write_tables(log, run_dir, parquet=False)
     write_performance(run_dir / "performance.csv", log, curriculum.labels)
     logs = None if experts is None else [expert.log for expert in experts]
-    write_metrics(run_dir / "metrics.json", scores(log, curriculum, logs))
+    write_metrics(run_dir / METRICS, scores(log, curriculum, logs))
+    checkpoints.clear()
+
+
+def _new_log(run_dir: Path) -> RunLog:
+    """A log in place of what a run left that was stopped before its first checkpoint."""
+    for name in RESULTS:
+        (run_dir / name).unlink(missing_ok=True)
+    return RunLog(run_dir / LOG)
+
+
+def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
+    """The log as it was at a checkpoint; another machine or other versions are told, or refused if ``strict``.
+
+    Raises:
+        ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.
+    """
+    log = RunLog.resume(run_dir / LOG, saved["log"])
+    before = log.of_kind("run")[0]
+    other = {
+        key: [before[key], about[key]] for key in ("versions", "machine", "num_threads") if before[key] != about[key]
+    }
+    message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
+    require((not (strict and other), f"{message}; resume=warn goes on"))
+    if other:
+        warnings.warn(message, stacklevel=2)
+    append_line(run_dir / RESTARTS, {"frames": saved["frames"], "versions": about["versions"], **machine()})
+    return log

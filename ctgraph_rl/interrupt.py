@@ -1,0 +1,70 @@
+"""Signals that ask a run to stop: it saves within one update, then exits; a second one stops it at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+STOPPING = ("SIGINT", "SIGTERM", "SIGUSR2")
+"""SIGUSR2 only where something handles it, such as submitit before the time limit of a SLURM job."""
+
+
+class Interrupt:
+    """While this context is entered, a signal to stop is kept for `exit` instead of acting at once.
+
+    Where another library handles SIGUSR2 to put the job into the queue again (submitit), it does so after the save.
+    Outside the main thread, where Python allows no handlers, signals act as before.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._before: dict[int, Any] = {}
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether the process was asked to stop."""
+        return self.signal is not None
+
+    def __enter__(self) -> Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            numbers = [getattr(signal, name) for name in STOPPING if hasattr(signal, name)]
+            handled = [number for number in numbers if number != _requeuing() or callable(signal.getsignal(number))]
+            self._before = {number: signal.signal(number, self._ask) for number in handled}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._restore()
+        if self.is_asked and kind is None:
+            self.exit()
+
+    def exit(self) -> None:
+        """Leave the process with the code of the signal, or let the scheduler's library put it into the queue again."""
+        assert self.signal is not None
+        print("saved, the same command goes on from there", file=sys.stderr)
+        requeue = self._before.get(_requeuing())
+        self._restore()
+        if callable(requeue):
+            os.kill(os.getpid(), _requeuing())
+        raise SystemExit(128 + self.signal)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        """Remember the first signal; the next acts as it did before."""
+        self.signal = number
+        self._restore()
+        print(f"\n{signal.Signals(number).name}: saving after this update ... ", end="", file=sys.stderr, flush=True)
+
+    def _restore(self) -> None:
+        for number, before in self._before.items():
+            if signal.getsignal(number) == self._ask:
+                signal.signal(number, before)
+
+
+def _requeuing() -> int:
+    """The signal by which submitit's jobs are put into the queue again; 0 where there is none."""
+    return getattr(signal, "SIGUSR2", 0)
