@@ -7,11 +7,15 @@ x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
 
 from __future__ import annotations
 
+from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
+from curricula.axes import sequence
 from curricula.published import labelled, one_wait_image, pool_ids, words
 
 MASKS = "Ben-Iwhiwhu et al. 2023, arXiv 2212.11110; github.com/dlpbc/mask-lrl"
 BASELINES = "github.com/DMIU-ShELL/LRL-Baselines (2026)"
+MOST_DEPTH = 16
+"""Beyond it the image set of `single_task` takes gigabytes."""
 
 
 def ct8(num_frames: int = 102_400) -> Curriculum:
@@ -45,6 +49,18 @@ def ct8_md(num_frames: int = 102_400) -> Curriculum:
     return _curriculum("ct8_md", MASKS, listing, ids, 60, num_frames)
 
 
+def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
+    """One task alone, the second goal of CT8 multi-depth at a depth, without a task id: how far plain exploration goes.
+
+    Args:
+        depth: d; 0, ..., 0, 1 is the goal.
+        num_frames: frames, as the single-task experts had.
+    """
+    require((is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"))
+    task = one_wait_image("0" * (depth - 1) + "1", image_seed=1)
+    return sequence("single_task", task, num_frames, source=MASKS)
+
+
 def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
     """The interfering pair: the first and the last goal of a depth-3 graph, with no decision in common.
 
@@ -63,5 +79,5 @@ def _curriculum(
     return labelled(name, source, tasks, ids, num_ids, num_frames)
 
 
-NAMED = {f.__name__: f for f in (ct2_interfering, ct8, ct8_md, ct12)}
+NAMED = {f.__name__: f for f in (ct2_interfering, ct8, ct8_md, ct12, single_task)}
 """The curricula of this module by name."""
