@@ -1,0 +1,237 @@
+"""Makes docs/results.md and its figures from the raw results beside this file; and raw results from runs.
+
+``python docs/results/make.py`` makes the page. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
+each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+PAGE = HERE.parent / "results.md"
+EPISODES = 1000
+SEED = 2023
+"""Of the episodes, the same for all agents."""
+
+Raw = list[dict[str, str]]
+
+
+def collect(name: str, folder: Path) -> None:
+    """Write the raw results of all runs under a folder; a run that did not finish is a line with its reason."""
+    from rich.progress import track
+
+    runs = sorted(path.parent for path in folder.rglob("run.jsonl") if "experts" not in path.parts)
+    lines = [measured(run) for run in track(runs, f"{len(runs)} runs")]
+    lines.sort(
+        key=lambda line: [str(line[key]) for key in ("configuration", "depth", "task", "agent")] + [line["seed"]]
+    )
+    write(name, lines)
+
+
+def write(name: str, lines: Sequence[dict[str, Any]]) -> None:
+    """Write the raw results of a table."""
+    with open(HERE / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def measured(run_dir: Path) -> dict[str, Any]:
+    """One line: what was learned by whom, and the mean return and success of the trained agent."""
+    from ctgraph_rl import evaluate, load
+
+    failed = run_dir / "failed.txt"
+    trained = load(run_dir)
+    (task,) = trained.curriculum.tasks
+    configured = trained.log.of_kind("run")[0]["config"]["curriculum"]
+    line: dict[str, Any] = {
+        "configuration": configured.get("configuration", trained.curriculum.name),
+        "depth": task.graph.depth,
+        "task": ".".join(map(str, task.goal)),
+        "agent": run_dir.name.split("-seed")[0],
+        "seed": trained.seed,
+        "frames": trained.frames,
+        "fingerprint": trained.curriculum.fingerprint,
+    }
+    for way, greedy in (("greedy", True), ("sampled", False)):
+        state = trained.agent.initial_state
+        ends = evaluate(trained.agent.policy, [task], EPISODES, SEED, greedy, state, curriculum=trained.curriculum)
+        line[f"{way}_return"] = round(ends["episode_reward"].double().mean().item(), 6)
+        line[f"{way}_success"] = (ends["outcome"] == 3).double().mean().item()
+    finished = (run_dir / "metrics.json").exists()
+    reason = failed.read_text(encoding="utf-8").strip() if failed.exists() else "not finished"
+    return {**line, "failed": "" if finished else reason}
+
+
+def read(name: str) -> Raw:
+    """The raw results of a table; none if it was not run."""
+    path = HERE / f"{name}.csv"
+    if not path.exists():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def cell(lines: Raw, column: str) -> str:
+    """Mean over seeds with its interval; seeds that failed are counted, not averaged."""
+    from ctgraph_rl import statistics
+
+    values = [None if line.get("failed") else float(line[column]) for line in lines]
+    found = statistics.mean(values)
+    if found.value is None:
+        return "-"
+    interval = "" if found.low is None else f" ± {(found.high - found.low) / 2:.2f}"  # type: ignore[operator]
+    missing = f" (n={found.n}/{len(values)})" if found.n_undefined else ""
+    return f"{found.value:.2f}{interval}{missing}".replace("-0.00", "0.00")
+
+
+def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
+    """Lines with the same values under some keys, in order of appearance."""
+    found: dict[tuple[str, ...], Raw] = {}
+    for line in raw:
+        found.setdefault(tuple(line[key] for key in keys), []).append(line)
+    return found
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def by_goal(raw: Raw, configuration: str) -> str:
+    """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
+    from baselines.__main__ import agents
+
+    kinds = dict(agents())
+    of = groups([line for line in raw if line["configuration"] == configuration], "agent", "task")
+    goals = sorted({goal for _, goal in of})
+    names = [name for name in kinds if any(agent == name for agent, _ in of)]
+    rows = []
+    for remembers in (False, True):
+        for name in (name for name in names if kinds[name].memory is remembers):
+            each = [of.get((name, goal), []) for goal in goals]
+            rows.append([f"`{name}`", *map(both_ways, each)])
+        if not remembers and rows:
+            exact = (", ".join(ceilings(configuration, goal)) for goal in goals)
+            rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
+    return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
+
+
+def both_ways(lines: Raw) -> str:
+    """Mean return of the greedy and of the sampled policy."""
+    return f"{cell(lines, 'greedy_return')}, {cell(lines, 'sampled_return')}" if lines else ""
+
+
+def ceilings(configuration: str, goal: str) -> list[str]:
+    """The best mean return without memory, of a policy that always does the same and of any."""
+    from ctgraph_rl.paper import CONFIGURATIONS
+
+    name = "CT-" + configuration.upper().replace("_", "-")
+    task = CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))
+    return [f"{task.memoryless_ceiling(deterministic):.2f}" for deterministic in (True, False)]
+
+
+def ladder(raw: Raw) -> str:
+    """A line for each agent, a column for each depth: seeds that solved it; and how often chance finds the goal."""
+    import curricula
+    from ctgraph_rl.describe import random_frames_to_goal
+
+    of = groups(raw, "agent", "depth")
+    depths = sorted({depth for _, depth in of}, key=int)
+    chance = []
+    for depth in depths:
+        alone = curricula.load("single_task", depth=int(depth))
+        chance.append(f"{alone.num_frames / random_frames_to_goal(alone.tasks[0]):.2g}")
+    rows = [["*goals that random actions find*", *chance]]
+    for agent in dict.fromkeys(agent for agent, _ in of):
+        each = [of.get((agent, depth), []) for depth in depths]
+        rows.append([f"`{agent}`", *map(solved, each)])
+    return table(["", *(f"depth {depth}" for depth in depths)], rows)
+
+
+def solved(lines: Raw) -> str:
+    """How many seeds have a greedy success of at least 0.9, and the mean return."""
+    if not lines:
+        return ""
+    return (
+        f"{sum(float(line['greedy_success']) >= 0.9 for line in lines)} of {len(lines)}; {cell(lines, 'greedy_return')}"
+    )
+
+
+def main_job(raw: Raw) -> str:
+    """The performance matrix of the main job, mean over seeds."""
+    of = groups(raw, "block", "label")
+    blocks, tasks = (list(dict.fromkeys(line[key] for line in raw)) for key in ("block", "label"))
+    rows = [[block, *(cell(of[block, task], "return_mean") for task in tasks)] for block in blocks]
+    return table(["after block", *tasks], rows)
+
+
+def collect_main_job(folder: Path) -> None:
+    """Write the evaluations of all runs of the main job under a folder."""
+    lines = []
+    for run in sorted(folder.rglob("evaluations.csv")):
+        with open(run, newline="", encoding="utf-8") as file:
+            kept = ("seed", "block", "frames", "label", "return_mean")
+            lines += [{key: line[key] for key in kept} for line in csv.DictReader(file)]
+    write("main_job", lines)
+
+
+def page() -> str:
+    """The page: the template with its tables."""
+    small = read("baselines_b1") + read("baselines_recurrent_q")
+    tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
+    tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
+    template = Template((HERE / "template.md").read_text(encoding="utf-8"))
+    return template.substitute(tables, main_job=main_job(read("main_job")))
+
+
+def draw(path: Path) -> None:
+    """Every seed of every agent on every goal of the four small configurations, beside the ceilings without memory."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    raw = read("baselines_b1") + read("baselines_recurrent_q")
+    configurations = list(dict.fromkeys(line["configuration"] for line in raw))
+    agents = list(dict.fromkeys(line["agent"] for line in raw))
+    figure, panels = pyplot.subplots(1, len(configurations), figsize=(2.6 * len(configurations), 2.8), sharey=True)
+    for axes, configuration in zip(panels, configurations, strict=True):
+        for place, agent in enumerate(agents):
+            of = [line for line in raw if (line["configuration"], line["agent"]) == (configuration, agent)]
+            for line in of:
+                goal = sorted({other["task"] for other in of}).index(line["task"])
+                where = place - 0.3 + 0.2 * goal
+                axes.plot(where, float(line["greedy_return"]), "o", color="black", markersize=2.5, alpha=0.5)
+                axes.plot(where, float(line["sampled_return"]), "x", color="tab:orange", markersize=3.5, alpha=0.7)
+        axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right", fontsize=7)
+        axes.set_title("CT-" + configuration.upper().replace("_", "-"), fontsize=9)
+    panels[0].set_ylabel("mean return")
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """See above."""
+    parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
+    commands = parser.add_subparsers(dest="command")
+    collecting = commands.add_parser("collect", help="raw results from runs")
+    collecting.add_argument("name", help="of the table, such as baselines_b1")
+    collecting.add_argument("runs", type=Path, help="folder with runs")
+    options = parser.parse_args()
+    if options.command == "collect":
+        (collect_main_job(options.runs) if options.name == "main_job" else collect(options.name, options.runs))
+        return
+    PAGE.write_text(page(), encoding="utf-8")
+    draw(HERE / "baselines_b1.png")
+
+
+if __name__ == "__main__":
+    main()
