@@ -1,16 +1,17 @@
 """A2C: advantage actor-critic, one gradient step a batch, without memory.
 
-Mnih et al. 2016 (arXiv 1602.01783), in its synchronous form, on TorchRL's `A2CLoss`.
+Mnih et al. 2016 (arXiv 1602.01783), in its synchronous form.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives import A2CLoss
 
-from baselines.policy_gradient import PolicyGradient, loss_weight
+from baselines.networks import Data
+from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss, loss_weight
 from ctgraph_rl.checks import require
 
 
@@ -38,11 +39,13 @@ class A2C(PolicyGradient):
     ) -> None:
         require(*loss_weight(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
         super().__init__(observation_spec, action_spec, **settings)
-        self.objective = A2CLoss(
-            self.actor,
-            self.critic,
-            entropy_coeff=entropy_coeff,
-            critic_coeff=critic_coeff,
-            loss_critic_type="l2",
-            functional=False,
-        )
+        self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Policy gradient, critic's error and entropy, as TorchRL's `A2CLoss` has them."""
+        log_probs, taken, values = self.judged(batch)
+        return {
+            "loss_objective": -(taken * batch["advantage"]).mean(),
+            "loss_critic": critic_loss(values, batch, self.critic_coeff),
+            **entropy_loss(log_probs, self.entropy_coeff),
+        }

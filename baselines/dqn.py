@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
+from torch.func import functional_call
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import MLP, QValueActor
-from torchrl.objectives import DQNLoss, ValueEstimators
+from torchrl.objectives import DQNLoss
 
 from baselines.learner import true_or_false
-from baselines.networks import encoder
+from baselines.networks import Data, encoder
 from baselines.q_learning import QLearner
 from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
 
@@ -59,14 +61,13 @@ class DQN(QLearner):
             *fraction(priority_beta=priority_beta),
             (is_real(priority_alpha, 0), f"priority_alpha must be a number >= 0, got {priority_alpha!r}"),
         )
-        self.priority_alpha, self.priority_beta = priority_alpha, priority_beta
+        self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
         super().__init__(gamma=gamma, **settings)
         head = MLP(hidden_size, action_spec.space.n, num_cells=[hidden_size], activation_class=nn.ReLU)
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
         features = encoder(observation_spec, hidden_size)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
         self.dqn = DQNLoss(self.greedy, delay_value=True, double_dqn=double, action_space=action_spec)
-        self.dqn.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.act_with(self.greedy, self.dqn, action_spec, learning_rate)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
@@ -75,6 +76,34 @@ class DQN(QLearner):
         after = [("next", key) for key in (*seen, "reward", "done", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
-    def loss(self, batch: TensorDictBase) -> TensorDictBase:
-        """The DQN loss of transitions, with the target network's values."""
-        return TensorDict({"loss_value": self.dqn(batch)["loss"]})
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """The loss of transitions, with the target network's values, as TorchRL's `DQNLoss` has it; ``td_error``, too.
+
+        What is predicted is the value of the action taken; the target is the multi-step reward plus the discounted
+        value of the best action where it ends.
+        """
+        after = {key: batch["next", key] for key in self.greedy.in_keys}
+        predicted = self._values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
+        with torch.no_grad():
+            later = self._target_values(after)
+            best = (self._values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
+            gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
+            goes_on = (~batch["next", "terminated"]).int()
+            target = (batch["next", "reward"] + gamma * goes_on * later.gather(-1, best)).squeeze(-1)
+            squared = (predicted - target).square()
+        loss, weight = (predicted - target).square(), batch.get("priority_weight")
+        mean = loss.mean() if weight is None else (loss * weight).sum() / weight.sum()
+        return {"loss_value": mean, "td_error": squared}
+
+    def _values(self, data: Data) -> Tensor:
+        """The online network's action values."""
+        trunk, head = self.greedy.module[0].module
+        return head.module(trunk.over_time(data))
+
+    def _target_values(self, data: Data) -> Tensor:
+        """The target network's action values."""
+        trunk, head = self.greedy.module[0].module
+        old = [self.dqn.target_value_network_params["module", "0", "module", i, "module"] for i in ("0", "1")]
+        weights = [dict(part.flatten_keys(".").items()) for part in old]
+        features = functional_call(trunk.module, weights[0], tuple(data[key] for key in trunk.in_keys))
+        return functional_call(head.module, weights[1], (features,))

@@ -7,10 +7,12 @@ from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from baselines.compiled import compiled_step, total
+from baselines.networks import Data
 from ctgraph_rl.checks import at_least_one, positive, require
 
 LARGEST_WEIGHT = 1e12
@@ -26,6 +28,8 @@ class Learner(nn.Module):
         num_envs: rows that it learns from.
         num_steps: steps of each row in a batch.
         max_grad_norm: gradients are scaled down to this norm.
+        compile: run gradient steps of the usual size through ``torch.compile``: faster where networks and minibatches
+            are small, after seconds of compiling. An agent with ``memory`` refuses it: its LSTM gains nothing.
     """
 
     memory: ClassVar[bool] = False
@@ -37,9 +41,18 @@ class Learner(nn.Module):
     policy: TensorDictModuleBase
     optimiser: torch.optim.Optimizer
 
-    def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float) -> None:
+    minibatch_size: int
+    """Items that a gradient step learns from, unless a batch was shortened."""
+
+    def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float, compile: bool = False) -> None:
         super().__init__()
-        require(*at_least_one(num_envs=num_envs, num_steps=num_steps), *positive(max_grad_norm=max_grad_norm))
+        require(
+            *at_least_one(num_envs=num_envs, num_steps=num_steps),
+            *positive(max_grad_norm=max_grad_norm),
+            *true_or_false(compile=compile),
+        )
+        require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
+        self.compiled_step = compiled_step() if compile else None
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -56,23 +69,35 @@ class Learner(nn.Module):
     def end_task(self) -> None:
         """Nothing to do."""
 
-    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+    def loss(self, batch: Data) -> dict[str, Tensor]:
         """The losses of a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
-    def gradient_step(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def gradient_step(self, batch: Data) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
+        usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
+        if self.compiled_step is not None and usual:
+            return self.compiled_step(self, batch)
         losses = self.loss(batch)
-        for key, value in losses.items():
-            require_finite(key, value)
         self.optimiser.zero_grad()
-        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+        total(losses).backward()
         norm = nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
-        require_finite("grad_norm", norm)
         self.optimiser.step()
+        return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
+
+    def measured(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
+        """The mean of each measurement over gradient steps, none of which may have gone wrong.
+
+        Raises:
+            FloatingPointError: names the first number that is not finite, or the largest weight.
+        """
+        table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1)
+        for wrong in (~table.isfinite()).any(dim=0).nonzero()[:1, 0]:
+            for name, value in zip(steps[0], table[:, wrong], strict=True):
+                require_finite(name, value)
         largest = torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max()
         require_finite("the largest weight", largest, LARGEST_WEIGHT)
-        return {**losses.detach(), "grad_norm": norm}
+        return dict(zip(steps[0], table.mean(dim=1).tolist(), strict=True))
 
     def get_extra_state(self) -> dict[str, Any]:
         """The optimiser's state, so that `state_dict` is complete."""
@@ -111,8 +136,3 @@ def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:
     """
     if not (value.isfinite() and value.abs() <= most):
         raise FloatingPointError(f"{name} is {value.item():g}")
-
-
-def mean_measurements(steps: list[dict[str, Tensor]]) -> dict[str, float]:
-    """The mean of each measurement over gradient steps."""
-    return {key: torch.stack([step[key] for step in steps]).mean().item() for key in steps[0]}

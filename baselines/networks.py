@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
+from torch.nn.utils.rnn import PackedSequence
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor, ValueOperator
+
+Data = Mapping[Any, Tensor]
+"""Tensors by key, in a dictionary or a TensorDict."""
 
 STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")
 """Where a recurrent policy keeps its state."""
@@ -40,7 +48,56 @@ class Encoder(nn.Module):
         return self.further(self.linear(flat).relu())
 
 
-def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> TensorDictModule:
+class EncoderModule(TensorDictModule):
+    """An `Encoder` and the keys that it reads: a trunk without memory; writes ``features``."""
+
+    def act(self, data: Data) -> dict[Any, Tensor]:
+        """What the trunk makes of one step of all rows."""
+        return {"features": self.over_time(data)}
+
+    def over_time(self, data: Data) -> Tensor:
+        """The features of any number of steps."""
+        return self.module(*(data[key] for key in self.in_keys))
+
+
+class RecurrentModule(TensorDictSequential):
+    """An encoder with an `LSTMModule` behind it; writes ``memory``, and its state under `STATE_KEYS`.
+
+    `act` and `over_time` are TorchRL's sequential and recurrent mode in plain tensors.
+    """
+
+    def act(self, data: Data) -> dict[Any, Tensor]:
+        """What the trunk makes of one step of all rows: ``memory`` and the next state."""
+        encoder, lstm = self.module[0], self.module[1].lstm
+        fresh = data["is_init"].unsqueeze(-1)
+        state = (torch.where(fresh, 0.0, data[key]).transpose(0, 1).contiguous() for key in STATE_KEYS)
+        memory, state = lstm(encoder.over_time(data).unsqueeze(1), tuple(state))
+        following = {("next", key): value.transpose(0, 1) for key, value in zip(STATE_KEYS, state, strict=True)}
+        return {"memory": memory.squeeze(1), **following}
+
+    def over_time(self, data: Data) -> Tensor:
+        """``memory`` at all steps of sequences [rows, steps]; starts with the state there, and anew at ``is_init``.
+
+        Each stretch between two starts is a sequence of its own, and the LSTM runs over all of them at once.
+        """
+        lstm, features = self.module[1].lstm, self.module[0].over_time(data)
+        starts = data["is_init"].squeeze(-1).clone()
+        if not starts[:, 1:].any():
+            state = (data[key][:, 0].transpose(0, 1).contiguous() for key in STATE_KEYS)
+            return lstm(features, tuple(state))[0]
+        starts[:, 0] = True
+        first = starts.flatten().nonzero().squeeze(-1)
+        lengths, order = first.diff(append=first.new_tensor([starts.numel()])).sort(descending=True)
+        first, time = first[order], torch.arange(int(lengths[0]), device=first.device).unsqueeze(-1)
+        within = time < lengths
+        places = (first + time)[within]
+        state = (data[key].flatten(0, 1)[first].transpose(0, 1).contiguous() for key in STATE_KEYS)
+        packed = PackedSequence(features.flatten(0, 1).index_select(0, places), within.sum(dim=1).cpu())
+        memory = lstm(packed, tuple(state))[0].data
+        return memory.index_select(0, places.argsort()).view_as(features)
+
+
+def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:
     """An `Encoder` that reads ``observation`` and, where the environment gives it, ``task_id``; writes ``features``.
 
     Args:
@@ -53,13 +110,13 @@ def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1,
     if "task_id" in observation_spec.keys():  # noqa: SIM118, a Composite is no dict
         extra = {"task_id": observation_spec["task_id"].shape.numel(), **extra}
     module = Encoder(spec.shape, spec.space.high.max().item(), num_features, num_layers, sum(extra.values()))
-    return TensorDictModule(module, in_keys=["observation", *extra], out_keys=["features"])
+    return EncoderModule(module, in_keys=["observation", *extra], out_keys=["features"])
 
 
-def recurrent(observation_spec: Composite, num_features: int, num_layers: int, **extra: int) -> TensorDictSequential:
+def recurrent(observation_spec: Composite, num_features: int, num_layers: int, **extra: int) -> RecurrentModule:
     """An `encoder` with an LSTM of the same width behind it; writes ``memory``, and its state under `STATE_KEYS`."""
     lstm = LSTMModule(num_features, num_features, in_key="features", out_key="memory")
-    return TensorDictSequential(encoder(observation_spec, num_features, num_layers, **extra), lstm)
+    return RecurrentModule(encoder(observation_spec, num_features, num_layers, **extra), lstm)
 
 
 def zero_state(trunk: TensorDictSequential, num_envs: int) -> TensorDict:
@@ -88,3 +145,42 @@ def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> Probabilis
 def critic(in_key: str, num_features: int) -> ValueOperator:
     """A value of features, ``state_value``."""
     return ValueOperator(nn.Linear(num_features, 1), in_keys=[in_key])
+
+
+class ActorCritic(TensorDictSequential):
+    """A policy of a trunk, an `actor` and a `critic`: what TorchRL makes of the three, in plain tensors.
+
+    Modules behind them act as they are.
+    """
+
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write ``action``, ``action_log_prob``, ``state_value`` and the trunk's next state."""
+        trunk, actor, critic, *others = self.module
+        written = trunk.act(tensordict)
+        features = written.pop(actor.in_keys[0])
+        log_probs = log_probabilities(actor, features)
+        chances = log_probs.softmax(dim=-1)
+        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+            action = chances.argmax(dim=-1)
+        else:
+            action = chances.flatten(0, -2).multinomial(1, replacement=True).view(chances.shape[:-1])
+        written["action"] = action
+        written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        written["state_value"] = critic.module(features)
+        for key, value in written.items():
+            tensordict.set(key, value)
+        for module in others:
+            module(tensordict)
+        return tensordict
+
+
+def log_probabilities(actor: ProbabilisticActor, features: Tensor) -> Tensor:
+    """The logarithms of an `actor`'s probabilities, [..., num_actions]."""
+    logits = actor.module[0].module(features)
+    return logits - logits.logsumexp(dim=-1, keepdim=True)
+
+
+def entropy(log_probs: Tensor) -> Tensor:
+    """The entropy of categorical distributions, [...]."""
+    least = torch.finfo(log_probs.dtype).min  # so that a probability of 0 counts as 0
+    return -(log_probs.clamp(min=least) * log_probs.softmax(dim=-1)).sum(dim=-1)

@@ -1,16 +1,18 @@
 """PPO: clipped policy gradients, without memory.
 
-Schulman et al. 2017 (arXiv 1707.06347) on TorchRL's `ClipPPOLoss`.
+Schulman et al. 2017 (arXiv 1707.06347).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import torch
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives import ClipPPOLoss
 
-from baselines.policy_gradient import PolicyGradient, loss_weight
+from baselines.networks import Data
+from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss, loss_weight
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 
 
@@ -49,15 +51,19 @@ class PPO(PolicyGradient):
         super().__init__(observation_spec, action_spec, **settings)
         require(self._split_rule(num_minibatches))
         self.num_epochs, self.num_minibatches = num_epochs, num_minibatches
-        self.objective = ClipPPOLoss(
-            self.actor,
-            self.critic,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            critic_coeff=critic_coeff,
-            loss_critic_type="l2",
-            functional=False,
-        )
+        self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
+        self.clip_range = torch.tensor([-clip_epsilon, clip_epsilon]).log1p().tolist()
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Clipped surrogate, eq. (7) of the paper, critic's error and entropy, as TorchRL's `ClipPPOLoss` has them."""
+        log_probs, taken, values = self.judged(batch)
+        change = taken - batch["action_log_prob"].unsqueeze(-1)
+        gain, clipped = (value.exp() * batch["advantage"] for value in (change, change.clamp(*self.clip_range)))
+        return {
+            "loss_objective": -torch.minimum(gain, clipped).mean(),
+            "loss_critic": critic_loss(values, batch, self.critic_coeff),
+            **entropy_loss(log_probs, self.entropy_coeff),
+        }
 
     def _split_rule(self, num_minibatches: int) -> tuple[bool, str]:
         """Whether minibatches split the rows, or the frames, evenly."""

@@ -14,9 +14,24 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from baselines.learner import Learner, make_optimiser, mean_measurements, one_of
+from baselines.learner import Learner, make_optimiser, one_of
 from baselines.prioritized import PrioritySampler
 from ctgraph_rl.checks import at_least_one, fraction, positive, require
+
+
+class EpsilonGreedy(TensorDictSequential):
+    """A `QValueActor` of a trunk and a head, and exploration: what TorchRL makes of the first, in plain tensors."""
+
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        """Write ``action`` and the trunk's next state."""
+        greedy, exploration = self.module
+        trunk, head = greedy.module[0].module
+        written = trunk.act(tensordict)
+        values = head.module(written.pop(head.in_keys[0]))
+        written["action"] = (values[0] if isinstance(values, tuple) else values).argmax(dim=-1)
+        for key, value in written.items():
+            tensordict.set(key, value)
+        return exploration(tensordict)
 
 
 class QLearner(Learner):
@@ -39,6 +54,7 @@ class QLearner(Learner):
         annealing_num_steps: frames of a task over which exploration falls linearly.
         max_grad_norm: gradients are scaled down to this norm.
         replay_on_task_change: ``clear`` or ``keep`` the replay buffer where a task change is announced.
+        compile: run gradient steps through ``torch.compile``; only without memory.
     """
 
     priority_alpha = priority_beta = 0.0
@@ -59,8 +75,9 @@ class QLearner(Learner):
         annealing_num_steps: int,
         max_grad_norm: float,
         replay_on_task_change: str,
+        compile: bool = False,
     ) -> None:
-        super().__init__(num_envs, num_steps, max_grad_norm)
+        super().__init__(num_envs, num_steps, max_grad_norm, compile)
         counts = {"n_steps": n_steps, "batch_size": batch_size, "num_updates": num_updates, "buffer_size": buffer_size}
         require(
             *at_least_one(**counts, target_update_interval=target_update_interval),
@@ -70,7 +87,8 @@ class QLearner(Learner):
             *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),
         )
         require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
-        self.num_updates, self.replay_on_task_change = num_updates, replay_on_task_change
+        self.minibatch_size, self.num_updates = batch_size, num_updates
+        self.replay_on_task_change = replay_on_task_change
         self.eps_range = float(eps_init), float(eps_end)
         self.annealing_batches = max(1, annealing_num_steps // (num_envs * num_steps))
         self.target_update_interval = target_update_interval
@@ -101,7 +119,7 @@ class QLearner(Learner):
             state: keys of the network's recurrent state, as it writes them.
         """
         self.exploration = EGreedyModule(action_spec, *self.eps_range, self.annealing_batches)
-        self.policy = TensorDictSequential(greedy, self.exploration, selected_out_keys=["action", *state])
+        self.policy = EpsilonGreedy(greedy, self.exploration, selected_out_keys=["action", *state])
         self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
 
@@ -120,17 +138,25 @@ class QLearner(Learner):
         self.replay.extend(self.experience(self.multi_step(batch)))
         steps = [self._update() for _ in range(self.num_updates)]
         self.exploration.step()
-        return {**mean_measurements(steps), "exploration": self.exploration.eps.item()}
+        return {**self.measured(steps), "exploration": self.exploration.eps.item()}
 
     def _update(self) -> dict[str, Tensor]:
-        sample = self.replay.sample()
-        items = sample.to(next(self.parameters()).device)  # the buffer stays on the CPU
+        index, items = self._sample()
         measured = self.gradient_step(items)
-        if self.prioritized:
-            squared = items["td_error"].flatten().cpu()
-            self.replay.update_priority(sample["index"], squared.sqrt())
+        squared = measured.pop("td_error", None)
+        if self.prioritized and squared is not None:
+            self.measured([measured])  # before a priority is not a number
+            self.replay.update_priority(index, squared.cpu().sqrt())
         self.target_update.step()
         return measured
+
+    def _sample(self) -> tuple[Tensor, dict[Any, Tensor]]:
+        """Numbers of replayed items and the items: what ``replay.sample()`` gives, in plain tensors."""
+        storage, device = self.replay.storage, next(self.parameters()).device
+        index, more = self.replay.sampler.sample(storage, self.minibatch_size)
+        stored = storage._storage.items(True, True)
+        items = {key: value.index_select(0, index).to(device) for key, value in stored}  # the buffer stays on the CPU
+        return index, {**items, **{key: value.to(device) for key, value in more.items()}}
 
     def get_extra_state(self) -> dict[str, Any]:
         """The optimiser's state, the replay buffer and the gradient steps since the last copy to the target network."""

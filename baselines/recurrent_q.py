@@ -14,10 +14,10 @@ from tensordict import TensorDict, TensorDictBase, pad
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.modules import QValueActor, set_recurrent_mode
+from torchrl.modules import QValueActor
 from torchrl.objectives.common import LossModule
 
-from baselines.networks import STATE_KEYS, recurrent, zero_state
+from baselines.networks import STATE_KEYS, Data, recurrent, zero_state
 from baselines.q_learning import QLearner
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 
@@ -57,7 +57,7 @@ class RecurrentTargets(LossModule):
         super().__init__()
         self.convert_to_functional(network, "value_network", create_target_params=True)
 
-    def forward(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def forward(self, batch: Data) -> tuple[Tensor, Tensor]:
         """Both [B, L, K]; where ``learnt`` is False, they mean nothing.
 
         The target is the multi-step reward plus the target network's quantiles of the action that the online network
@@ -67,15 +67,17 @@ class RecurrentTargets(LossModule):
         with torch.no_grad():
             later = self._quantiles(self.target_value_network_params, batch)
         best = of_action(later, online.mean(dim=-1).argmax(dim=-1))
-        positions = torch.arange(batch.shape[1], device=best.device) + batch["steps_to_next_obs"]
-        positions = positions.clamp(max=batch.shape[1] - 1).unsqueeze(-1).expand_as(best)
+        steps = best.shape[1]
+        positions = torch.arange(steps, device=best.device) + batch["steps_to_next_obs"]
+        positions = positions.clamp(max=steps - 1).unsqueeze(-1).expand_as(best)
         bootstrap = batch["gamma"].unsqueeze(-1) * best.gather(1, positions)
         target = batch["next", "reward"] + torch.where(batch["next", "terminated"], 0.0, bootstrap)
         return of_action(online, batch["action"]), target
 
-    def _quantiles(self, params: TensorDictBase, batch: TensorDictBase) -> Tensor:
-        with params.to_module(self.value_network, preserve_module_state=False), set_recurrent_mode(True):
-            return self.value_network(batch.select(*self.value_network.in_keys))["quantiles"]
+    def _quantiles(self, params: TensorDictBase, batch: Data) -> Tensor:
+        trunk, head = self.value_network.module[0].module
+        with params.to_module(self.value_network, preserve_module_state=False):
+            return head.module(trunk.over_time(batch))[1]
 
 
 def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
@@ -154,8 +156,8 @@ class RecurrentQ(QLearner):
         """The loss of every step, [B, L], of quantiles [B, L, K]."""
         raise NotImplementedError
 
-    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+    def loss(self, batch: Data) -> dict[str, Tensor]:
         """The mean loss of the steps of sequences."""
         distance = self.distance(*self.targets(batch))
         learnt = batch["learnt"]
-        return TensorDict({"loss_value": (distance * learnt).sum() / learnt.sum().clamp(min=1)})
+        return {"loss_value": (distance * learnt).sum() / learnt.sum().clamp(min=1)}

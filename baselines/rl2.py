@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import STATE_KEYS, recurrent, zero_state
+from baselines.networks import STATE_KEYS, ActorCritic, Data, RecurrentModule, recurrent, zero_state
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 
@@ -36,7 +36,7 @@ class TrialTrunk(TensorDictModuleBase):
         trial_episodes: episodes of a trial.
     """
 
-    def __init__(self, trunk: TensorDictSequential, num_actions: int, trial_episodes: int) -> None:
+    def __init__(self, trunk: RecurrentModule, num_actions: int, trial_episodes: int) -> None:
         super().__init__()
         self.trunk, self.num_actions, self.trial_episodes = trunk, num_actions, trial_episodes
         self.in_keys = [*(key for key in trunk.in_keys if key != "previous"), *OWN_KEYS]
@@ -44,17 +44,27 @@ class TrialTrunk(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``memory``, the LSTM's next state and the number of the episode in its trial, from 1."""
-        episode = tensordict["trial"] + tensordict["is_init"]
-        fresh = tensordict["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
-        keys = [key for key in self.trunk.in_keys if key != "previous"]
-        given = tensordict.select(*keys)
+        return tensordict.update(self.act(tensordict))
+
+    def act(self, data: Data) -> dict[Any, Tensor]:
+        """What the trunk makes of one step of all rows: ``memory`` and the next state."""
+        given, episode = self._given(data)
+        return {**self.trunk.act(given), ("next", "trial"): torch.where(given["is_init"], 1, episode)}
+
+    def over_time(self, data: Data) -> Tensor:
+        """``memory`` at all steps of sequences [rows, steps]."""
+        return self.trunk.over_time(self._given(data)[0])
+
+    def _given(self, data: Data) -> tuple[dict[str, Tensor], Tensor]:
+        """What the inner trunk reads, and the number of the episode in its trial, from 1."""
+        episode = data["trial"] + data["is_init"]
+        fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
+        given = {key: data[key] for key in self.trunk.in_keys if key != "previous"}
         for key in STATE_KEYS:
             given[key] = torch.where(fresh.unsqueeze(-1), 0.0, given[key])
-        action = one_hot(tensordict["previous_action"], self.num_actions)
-        previous = torch.cat([action, tensordict["reward"]], dim=-1)
-        remembered = self.trunk(given.set("is_init", fresh).set("previous", torch.where(fresh, 0.0, previous)))
-        written = remembered.select(*self.out_keys, strict=False)
-        return tensordict.update(written.set(("next", "trial"), torch.where(fresh, 1, episode)))
+        action = one_hot(data["previous_action"], self.num_actions)
+        previous = torch.cat([action, data["reward"]], dim=-1)
+        return given | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode
 
 
 class RL2(PPO):
@@ -78,7 +88,7 @@ class RL2(PPO):
         super().__init__(observation_spec, action_spec, **settings)
         keys = [*self.policy.out_keys, ("next", "trial"), ("next", "previous_action")]
         copied = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", "previous_action")])
-        self.policy = TensorDictSequential(self.trunk, self.actor, self.critic, copied, selected_out_keys=keys)
+        self.policy = ActorCritic(self.trunk, self.actor, self.critic, copied, selected_out_keys=keys)
 
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
@@ -115,7 +125,7 @@ class RL2(PPO):
         return losses
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> TensorDictBase:
+    def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """All steps but the last; only the end of a trial ends the return."""
         after = batch["next"]
         ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]

@@ -20,6 +20,7 @@ from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.policies import RandomPolicy
+from ctgraph_rl.stepping import Step, in_time_order, take_step
 from ctgraph_rl.task import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -142,9 +143,17 @@ def _state(frames: int, agent: Agent, env: CTGraphEnv, carried: TensorDictBase, 
 
 
 def _restore(saved: Mapping[str, Any], agent: Agent, env: CTGraphEnv) -> TensorDictBase:
-    """Go back to a saved state; returns what the next step starts from."""
-    agent.load_state_dict(saved["agent"])
-    env.load_state_dict(saved["env"])
+    """Go back to a saved state; returns what the next step starts from.
+
+    Raises:
+        ValueError: if it is not one of this agent and curriculum.
+    """
+    try:
+        agent.load_state_dict(saved["agent"])
+        env.load_state_dict(saved["env"])
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        message = f"the saved state does not fit this agent and curriculum, start anew (overwrite=true): {error}"
+        raise ValueError(message) from error
     torch.set_rng_state(saved["random"])
     if saved["random_cuda"] is not None:
         torch.cuda.set_rng_state(saved["random_cuda"], env.device)
@@ -258,7 +267,7 @@ def _batches(
     """`collect`, with what the step after each batch starts from; goes on from there after ``done`` frames."""
     start = _start(env, initial_state)
     carried = env.reset().update(start) if carried is None else carried
-    steps: list[TensorDictBase] = []
+    steps: list[Step] = []
     for frames in range(done, num_frames, env.numel()):
         if between_steps is not None:
             between_steps(frames)
@@ -266,7 +275,7 @@ def _batches(
             step, carried = _act(env, policy, carried, start)
         steps.append(step)
         if len(steps) == num_steps or frames + env.numel() == num_frames:
-            yield torch.stack(steps, dim=1), carried
+            yield in_time_order(steps, env), carried
             steps = []
 
 
@@ -333,7 +342,8 @@ def _first_episodes(
     while (played < num_episodes).any():
         step, carried = _act(env, policy, carried, start)
         ends = (step["next", "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
-        result[ends, played[ends]] = step["next"].select(*result.keys())[ends]
+        for key, value in result.items():
+            value[ends, played[ends]] = step["next", key][ends]
         played[ends] += 1
     return result
 
@@ -343,17 +353,15 @@ def _start(env: CTGraphEnv, initial_state: InitialState | None) -> TensorDict:
     return TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
 
 
-def _act(
-    env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict
-) -> tuple[TensorDictBase, TensorDictBase]:
+def _act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict) -> tuple[Step, TensorDictBase]:
     """One step of every row, and what the next one starts from: a new episode with the state of a start."""
-    step, following = env.step_and_maybe_reset(policy(carried))
-    if start.is_empty():
-        return step, following
-    state = step["next"].select(*start.keys())
-    if TRIAL in start.keys():  # noqa: SIM118, a TensorDict iterates over rows
-        return step, following.update(state)
-    return step, following.update(torch.where(following["is_init"].squeeze(-1), start, state))
+    step, following = take_step(env, policy(carried))
+    lasts = TRIAL in start.keys()  # noqa: SIM118, a TensorDict iterates over rows
+    for key, value in start.items():
+        state = step["next", key]
+        begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
+        following.set(key, state if lasts else torch.where(begins, value, state))
+    return step, following
 
 
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:

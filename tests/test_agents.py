@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import SMALL_AGENT
+from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from baselines.networks import Encoder
@@ -16,13 +17,15 @@ from ctgraph_rl.lifelong import collect
 from ctgraph_rl.run import conf_dir
 from curricula.paper import ct_su_b1
 
-AGENTS = sorted(path.stem for path in Path(conf_dir(), "agent").glob("*.yaml"))
+YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
+AGENTS = list(YAML)
+OWN = [name for name in AGENTS if "_target_" in YAML[name]]  # others only change some values of one of these
 OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
 ONE_HOT_TASK = Task(CTGraph(3, 1), (3,), OBSERVATIONS, OneHot(5))
 GREEDY, SAMPLED = ExplorationType.DETERMINISTIC, ExplorationType.RANDOM
 
 Q_LEARNERS = ("dqn", "drqn", "qrdqn_lstm")
-POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "reinforce", "rl2")
+POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "ppo_published", "reinforce", "rl2")
 RECURRENT = ("drqn", "lstm_ppo", "qrdqn_lstm", "rl2")
 
 for _name in AGENTS:
@@ -42,7 +45,7 @@ def batches(agent, task: Task, count: int, seed: int = 0) -> list:
 def learnt_from(agent, batch) -> list:
     """The batches of which the agent minimises the loss when it learns from a batch."""
     seen, loss = [], agent.loss
-    agent.loss = lambda minibatch: (seen.append(minibatch.clone()), loss(minibatch))[1]
+    agent.loss = lambda minibatch: (seen.append(dict(minibatch)), loss(minibatch))[1]
     agent.learn(batch)
     agent.loss = loss
     return seen

@@ -21,7 +21,7 @@ def values_in_loss(agent, batch):
     zeros = torch.zeros(*batch.batch_size, 1)
     values = []
     hook = agent.critic.module.register_forward_hook(lambda module, given, value: values.append(value.detach()))
-    agent.loss(batch.select(*keys).clone().set("advantage", zeros).set("value_target", zeros))
+    agent.loss(batch.select(*keys).set("advantage", zeros).set("value_target", zeros))
     hook.remove()
     return values[-1]
 
@@ -123,7 +123,7 @@ def test_reinforce_weighs_log_probabilities_by_the_return_less_the_baseline(smal
     # Returns: 1 + 0.5 * 4 = 3 and 0.5 * 3; 0 and 3; 0.5 * 1 and 1.
     returns = torch.tensor([[1.5, 3.0], [0.0, 3.0], [0.5, 1.0]]).unsqueeze(-1)
     torch.testing.assert_close(learnt["value_target"], returns, atol=1e-6, rtol=0)
-    losses = agent.loss(learnt.reshape(-1))
+    losses = agent.loss({key: value.flatten(0, 1) for key, value in learnt.items()})
     expected = -(batch["action_log_prob"].unsqueeze(-1) * (returns - batch["state_value"])).mean()
     torch.testing.assert_close(losses["loss_actor"], expected)
 
@@ -153,7 +153,7 @@ def test_lstm_ppo_learns_from_every_row_once_in_every_epoch(small_agent):
 
     seen = learnt_from(agent, batch)
 
-    assert [tuple(minibatch.batch_size) for minibatch in seen] == [(4, 8)] * 12
+    assert [tuple(minibatch["advantage"].shape[:-1]) for minibatch in seen] == [(4, 8)] * 12
     epochs = [sum(m["action_log_prob"].sum().item() for m in seen[i : i + 4]) for i in (0, 4, 8)]
     assert epochs == pytest.approx([logged] * 3, rel=1e-5)
 
@@ -165,7 +165,7 @@ def test_ppo_learns_from_every_frame_once_in_every_epoch(small_agent):
 
     seen = learnt_from(agent, batch)
 
-    assert [tuple(minibatch.batch_size) for minibatch in seen] == [(32,)] * 12
+    assert [tuple(minibatch["advantage"].shape[:-1]) for minibatch in seen] == [(32,)] * 12
     epochs = [sum(m["action_log_prob"].sum().item() for m in seen[i : i + 4]) for i in (0, 4, 8)]
     assert epochs == pytest.approx([logged] * 3, rel=1e-5)
 
@@ -176,7 +176,7 @@ def test_a_batch_is_one_gradient_step(small_agent, name):
 
     seen = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])
 
-    assert [tuple(minibatch.batch_size) for minibatch in seen] == [(128,)]
+    assert [tuple(minibatch["advantage"].shape[:-1]) for minibatch in seen] == [(128,)]
 
 
 def test_the_published_settings_of_ppo_can_be_expressed(build_agent):
@@ -201,7 +201,7 @@ def test_the_published_settings_of_ppo_can_be_expressed(build_agent):
     seen = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])
 
     assert type(agent.optimiser) is torch.optim.RMSprop
-    assert [tuple(minibatch.batch_size) for minibatch in seen] == [(8,)] * 64
+    assert [tuple(minibatch["advantage"].shape[:-1]) for minibatch in seen] == [(8,)] * 64
     widths = [layer.weight.shape for layer in agent.trunk.modules() if isinstance(layer, torch.nn.Linear)]
     assert widths == [(200, 144), (200, 200), (200, 200)]
 

@@ -141,12 +141,12 @@ def test_dqn_with_priorities_remembers_errors_and_weighs_its_loss(small_agent):
     agent.learn(batches(agent, ct_su_b1(), 1)[0])
 
     sample = agent.replay.sample()
-    loss = agent.loss(sample)["loss_value"]
+    losses = agent.loss(sample)
 
     kept = agent.replay.sampler.priorities[:128]
     assert ((kept != 1).sum() > 20) and (kept > 0).all()
-    weighed = sample["priority_weight"] * sample["td_error"].squeeze(-1)
-    torch.testing.assert_close(loss, weighed.sum() / sample["priority_weight"].sum())
+    weighed = sample["priority_weight"] * losses["td_error"]
+    torch.testing.assert_close(losses["loss_value"], weighed.sum() / sample["priority_weight"].sum())
 
 
 def test_dqn_with_priorities_goes_on_as_if_never_stopped(small_agent):

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from test_agents import GREEDY, ONE_HOT_TASK, batches
 from torchrl.envs.utils import set_exploration_type
-from torchrl.modules import set_recurrent_mode
 
 from baselines.rl2 import episodes_to_goal
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, evaluate, learn_curriculum
@@ -25,8 +24,8 @@ def small_rl2(small_agent, *overrides):
 
 def over_sequences(agent, batch):
     """What the LSTM writes over whole sequences."""
-    with set_recurrent_mode(True), torch.no_grad():
-        return agent.trunk(batch.select(*agent.trunk.in_keys))["memory"]
+    with torch.no_grad():
+        return agent.trunk.over_time(batch)
 
 
 def trial_starts(batch):

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import hydra
 import pytest
-from omegaconf import OmegaConf
-from test_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS
+from test_agents import OWN, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.run import conf_dir
 from curricula.paper import ct_su_b1
 
 ENV = CTGraphEnv([ct_su_b1()])
@@ -40,6 +36,7 @@ OF_PPO = [
     ("num_epochs=0", "num_epochs must be an integer >= 1, got 0"),
     ("num_minibatches=0", "num_minibatches must be an integer >= 1, got 0"),
 ]
+OF_COMPILED = [("compile=1", "compile must be true or false, got 1")]
 OF_Q_LEARNERS = [
     ("n_steps=0", "n_steps must be an integer >= 1, got 0"),
     ("batch_size=0", "batch_size must be an integer >= 1, got 0"),
@@ -80,14 +77,15 @@ def bad_values(name: str) -> list[tuple[str, str]]:
         (OF_ACTOR_CRITICS, name in POLICY_GRADIENTS and name != "reinforce"),
         (OF_PPO, name in POLICY_GRADIENTS and name not in ("reinforce", "a2c")),
         (OF_Q_LEARNERS, name in Q_LEARNERS),
+        (OF_COMPILED, name not in RECURRENT),
         (OF_ONE.get(name, []), True),
     ]
     return [bad for group, applies in groups if applies for bad in group]
 
 
-@pytest.mark.parametrize(("name", "override", "message"), [(name, *bad) for name in AGENTS for bad in bad_values(name)])
+@pytest.mark.parametrize(("name", "override", "message"), [(name, *bad) for name in OWN for bad in bad_values(name)])
 def test_a_hyperparameter_out_of_range_is_refused_by_name(name, override, message):
-    given = OmegaConf.load(Path(conf_dir(), "agent", f"{name}.yaml"))
+    given = YAML[name].copy()
     given.merge_with_dotlist([override])
     kind = hydra.utils.get_object(given.pop("_target_"))
 
@@ -95,9 +93,9 @@ def test_a_hyperparameter_out_of_range_is_refused_by_name(name, override, messag
         kind(ENV.observation_spec_unbatched, ENV.action_spec_unbatched, **given)
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", OWN)
 def test_every_hyperparameter_has_a_rule(name):
-    given = {str(key) for key in OmegaConf.load(Path(conf_dir(), "agent", f"{name}.yaml"))} - {"_target_"}
+    given = {str(key) for key in YAML[name]} - {"_target_"}
     ruled = {override.split("=")[0] for override, _ in bad_values(name)} | {"eps_end"}
 
     assert given <= ruled

@@ -28,8 +28,8 @@ def test_entropy_is_rewarded_and_the_critics_error_is_weighed(small_agent, name)
 
     losses = agent.loss(minibatch)
 
-    values = agent.critic(minibatch.select(agent.features))
-    error = (values["state_value"] - minibatch["value_target"]).square().mean()
+    values = agent.critic.module(agent.trunk.over_time(minibatch))
+    error = (values - minibatch["value_target"]).square().mean()
     torch.testing.assert_close(losses["loss_entropy"], -0.25 * losses["entropy"])
     torch.testing.assert_close(losses["loss_critic"], 2.0 * error)
 

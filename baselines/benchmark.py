@@ -1,0 +1,212 @@
+"""How fast agents learn, beside Stable-Baselines3: ``python -m baselines.benchmark``.
+
+Every agent learns with the settings of its yaml file on 256 rows, Stable-Baselines3's with the same ones as far as it
+has them: on `ctgraph_rl.sb3.SB3VecEnv`, and on what its ``make_vec_env`` makes of the single environment; and with its
+own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
+slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
+it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
+core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+import yaml
+from rich.console import Console
+from rich.progress import track
+
+from ctgraph_rl import CTGraphEnv, Task, evaluate
+from ctgraph_rl.benchmark import machine
+from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.lifelong import collect
+from ctgraph_rl.paper import ct_co_b1, ct_fo_b1, ct_su_b1
+from ctgraph_rl.run import conf_dir
+
+ROWS = 256
+GOAL = (1, 2)
+SOLVED = 0.9
+CHUNK = 8192
+"""Frames between two evaluations."""
+
+TASKS = {"CT-FO-B1": ct_fo_b1(GOAL), "CT-SU-B1": ct_su_b1(GOAL), "CT-CO-B1": ct_co_b1(GOAL)}
+PAIRS = (
+    ("a2c", "CT-FO-B1"),
+    ("ppo", "CT-FO-B1"),
+    ("dqn", "CT-FO-B1"),
+    ("lstm_ppo", "CT-SU-B1"),
+    ("lstm_ppo", "CT-CO-B1"),
+)
+"""Which agent learns which task."""
+
+
+class Learning(Protocol):
+    """An agent on its rows."""
+
+    def learn(self) -> int:
+        """Learn for a while; returns the number of frames."""
+        ...
+
+    def success(self) -> float:
+        """The share of greedy episodes that reach the goal."""
+        ...
+
+
+@dataclass
+class Contender:
+    """Somebody who learns a task, and what was measured."""
+
+    agent: str
+    task: str
+    who: str
+    make: Callable[[int], Learning]  # of a seed
+    speeds: list[float] = field(default_factory=list)
+    solved: list[tuple[int, float] | None] = field(default_factory=list)
+
+    def measure(self, learning: Learning, seconds: float) -> None:
+        """Frames per second over at least so many seconds."""
+        frames, start = 0, time.process_time()
+        while time.process_time() - start < seconds:
+            frames += learning.learn()
+        self.speeds.append(frames / (time.process_time() - start))
+
+    def solve(self, seed: int, max_frames: int) -> None:
+        """Learn until the task is solved: frames and seconds of learning, None if it takes more than so many frames."""
+        learning, frames, seconds, checked = self.make(seed), 0, 0.0, 0
+        while frames < max_frames:
+            start = time.process_time()
+            frames += learning.learn()
+            seconds += time.process_time() - start
+            if frames - checked >= CHUNK:
+                checked = frames
+                if learning.success() >= SOLVED:
+                    self.solved.append((frames, seconds))
+                    return
+        self.solved.append(None)
+
+
+def settings(name: str) -> dict[str, Any]:
+    """An agent's hyperparameters, on `ROWS` rows with as many frames in a batch as its yaml file says."""
+    given = yaml.safe_load(Path(conf_dir(), "agent", f"{name}.yaml").read_text(encoding="utf-8"))
+    frames = given["num_envs"] * given["num_steps"]
+    return {**given, "num_envs": ROWS, "num_steps": max(1, frames // ROWS)}
+
+
+class Ours:
+    """One of the agents of this package.
+
+    Args:
+        name: the agent.
+        task: what it learns.
+        seed: decides weights, exploration and environment.
+    """
+
+    def __init__(self, name: str, task: Task, seed: int) -> None:
+        given = settings(name)
+        module, kind = given.pop("_target_").rsplit(".", 1)
+        torch.manual_seed(seed)
+        env = CTGraphEnv([task] * given["num_envs"], seed)
+        self.task = task
+        self.agent = getattr(import_module(module), kind)(
+            env.observation_spec_unbatched, env.action_spec_unbatched, **given
+        )
+        agent = self.agent
+        batch = agent.num_envs * agent.num_steps
+        agent.start_task()
+        self.batches = collect(env, agent.policy, 10**6 * batch, agent.num_steps, agent.initial_state)
+
+    def learn(self) -> int:
+        """Learn from one batch."""
+        batch = next(self.batches)
+        self.agent.learn(batch)
+        return batch.numel()
+
+    def success(self) -> float:
+        """The share of 100 greedy episodes that reach the goal."""
+        ends = evaluate(self.agent.policy, [self.task], seed=1, initial_state=self.agent.initial_state)
+        return (ends["outcome"] == 3).double().mean().item()
+
+
+def contenders(agents: list[str]) -> Iterator[Contender]:
+    """Everybody who is measured; Stable-Baselines3 only where it is installed."""
+    for name, label in PAIRS:
+        if name not in agents:
+            continue
+        task = TASKS[label]
+        yield Contender(name, label, "ours", partial(Ours, name, task))
+        if find_spec("sb3_contrib"):
+            from baselines._stable import Stable, ways
+
+            for who, way in ways().items():
+                yield Contender(name, label, who, partial(Stable, name, settings(name), task, way))
+
+
+def table(measured: list[Contender]) -> str:
+    """Medians in Markdown; the ratio says how many times as fast ours is."""
+    ours = {(one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours"}
+    lines = ["| agent | task | who | frames/s | ours is | frames to 90 % | seconds to 90 % |", "|---" * 7 + "|"]
+    for one in measured:
+        speed = statistics.median(one.speeds)
+        ratio = "" if one.who == "ours" else f"{ours[one.agent, one.task] / speed:.1f} x"
+        cells = [one.agent, one.task, one.who, f"{speed:,.0f}", ratio, *_solved(one.solved)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
+    """Median frames and seconds, where most seeds solved the task; else how many did."""
+    times = sorted(one for one in found if one is not None)
+    if len(times) * 2 <= len(found):
+        return (f"{len(times)} of {len(found)} seeds", "") if found else ("", "")
+    frames, seconds = (statistics.median(values) for values in zip(*times, strict=True))
+    return f"{frames:,.0f}", f"{seconds:.2f}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
+    names = list(dict.fromkeys(name for name, _ in PAIRS))
+    parser = argparse.ArgumentParser(prog="python -m baselines.benchmark", description=__doc__)
+    parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
+    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
+    parser.add_argument("--seconds", type=float, default=2.0, help="least time of a measurement")
+    parser.add_argument("--seeds", type=int, default=3, help="how often each learns from scratch")
+    parser.add_argument(
+        "--max-frames", type=int, default=500_000, help="frames after which a task counts as not solved"
+    )
+    options = parser.parse_args(arguments)
+    require(
+        *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
+        (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
+        *positive(seconds=options.seconds),
+    )
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    console = Console(stderr=True)
+    if not find_spec("sb3_contrib"):
+        missing = "Stable-Baselines3 is missing, ours are measured alone: pip install 'ctgraph_rl[benchmark]'"
+        console.print(missing, markup=False, soft_wrap=True)
+    measured = list(contenders(options.agents))
+    learners = [contender.make(0) for contender in track(measured, "building", console=console)]
+    for learner in learners:
+        learner.learn()
+    for _ in track(range(options.rounds), "measuring", console=console):
+        for contender, learner in zip(measured, learners, strict=True):
+            contender.measure(learner, options.seconds)
+    for seed in track(range(options.seeds), "learning", console=console):
+        for contender in measured:
+            contender.solve(seed, options.max_frames)
+    print(f"{machine()}; medians of {options.rounds} rounds and {options.seeds} seeds\n\n{table(measured)}")
+
+
+if __name__ == "__main__":
+    main()

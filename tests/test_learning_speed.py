@@ -1,0 +1,202 @@
+"""What makes learning fast: plain tensors equal to TorchRL's parts, compiled gradient steps, and the benchmark."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from test_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
+
+from baselines import benchmark
+from baselines.compiled import whole_step
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.lifelong import collect
+from ctgraph_rl.stepping import in_time_order, take_step
+from curricula.paper import ct_su_b1
+
+COMPILED = ("a2c", "dqn", "ppo", "ppo_count", "ppo_published", "reinforce")
+
+
+def whole_step_of(agent, batch) -> dict:
+    """A gradient step as it is compiled, without compiling it, after one that gives the optimiser its state."""
+    agent.gradient_step(batch)
+    return whole_step(agent, batch)
+
+
+def test_a_step_in_plain_tensors_equals_torchrls():
+    tasks = [ct_su_b1((1, 2)), ct_su_b1((2, 1))] * 8
+    plain, stock = (CTGraphEnv(tasks, 3, task_ids={task: i for i, task in enumerate(tasks[:2])}) for _ in range(2))
+    data, other = plain.reset(), stock.reset()
+    generator = torch.Generator().manual_seed(0)
+
+    steps, others = [], []
+    for _ in range(12):
+        action = torch.randint(3, (16,), generator=generator)
+        written = {"action": action, "own": action.float(), ("next", "own"): action + 1.0}
+        step, data = take_step(plain, data.update(written))
+        expected, other = stock.step_and_maybe_reset(other.update(written))
+        steps.append(step)
+        others.append(expected)
+        assert set(data.keys()) == set(other.keys()) and (data == other).all()
+
+    batch, expected = in_time_order(steps, plain), torch.stack(others, dim=1)
+    assert expected["next", "done"].any()
+    assert set(batch.keys(True, True)) == set(expected.keys(True, True)) and (batch == expected).all()
+
+
+@pytest.mark.parametrize("exploration", [GREEDY, SAMPLED])
+@pytest.mark.parametrize("name", ["dqn", "drqn", "lstm_ppo", "ppo"])
+def test_a_policy_in_plain_tensors_equals_torchrls(small_agent, name, exploration):
+    agent = small_agent(name, [ct_su_b1()])
+    stock = TensorDictSequential(*agent.policy.module)
+    batch = batches(agent, ct_su_b1(), 1)[0]
+    found, expected = (batch[:, 5].select(*agent.policy.in_keys) for _ in range(2))
+
+    with set_exploration_type(exploration), torch.no_grad():
+        for policy, data in ((agent.policy, found), (stock, expected)):
+            torch.manual_seed(2)
+            policy(data)
+
+    keys = [key for key in found.keys(True, True) if key not in agent.policy.in_keys]
+    assert "action" in keys
+    assert all(torch.equal(found[key], expected[key]) for key in keys)
+
+
+@pytest.mark.parametrize("episodes_start", [True, False])
+def test_an_lstm_over_time_in_plain_tensors_equals_torchrls(small_agent, episodes_start):
+    agent = small_agent("lstm_ppo", [ct_su_b1()])
+    batch = batches(agent, ct_su_b1(), 2)[1]
+    batch["is_init"][:, 1:] &= episodes_start
+
+    memory = agent.trunk.over_time(batch)
+
+    with set_recurrent_mode(True):
+        expected = TensorDictSequential(*agent.trunk.module)(batch.select(*agent.trunk.in_keys))["memory"]
+    assert batch["is_init"][:, 1:].any() == episodes_start
+    assert torch.equal(memory, expected)
+
+
+STOCK_LOSSES = {
+    "a2c": (A2CLoss, ("entropy_coeff", "critic_coeff")),
+    "ppo": (ClipPPOLoss, ("entropy_coeff", "critic_coeff", "clip_epsilon")),
+    "reinforce": (ReinforceLoss, ()),
+}
+
+
+@pytest.mark.parametrize("name", STOCK_LOSSES)
+def test_a_loss_and_its_gradients_in_plain_tensors_equal_torchrls(small_agent, name):
+    make, keys = STOCK_LOSSES[name]
+    values = {"entropy_coeff": 0.25, "critic_coeff": 2.0, "clip_epsilon": 0.01}
+    agent = small_agent(name, [ct_su_b1()], *(f"agent.{key}={values[key]}" for key in keys))
+    minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[0]
+    given = {key: values[key] for key in keys}
+    stock = make(agent.actor, agent.critic, loss_critic_type="l2", functional=False, **given)
+
+    losses = agent.loss(minibatch)
+    features = agent.trunk.over_time(minibatch)
+    expected = stock(TensorDict({**minibatch, "features": features}, features.shape[:1]))
+
+    gradients, others = (
+        torch.autograd.grad(sum(found[key] for key in losses if key.startswith("loss_")), list(agent.parameters()))
+        for found in (losses, expected)
+    )
+    assert all(torch.equal(losses[key], expected[key]) for key in losses)
+    assert all(torch.equal(*pair) for pair in zip(gradients, others, strict=True))
+
+
+@pytest.mark.parametrize("double", ["true", "false"])
+def test_the_loss_of_dqn_in_plain_tensors_equals_torchrls(small_agent, double):
+    agent = small_agent("dqn", [ct_su_b1()], f"agent.double={double}", "agent.priority_alpha=0.6")
+    agent.learn(batches(agent, ct_su_b1(), 1)[0])
+    agent.dqn.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
+    sample = agent.replay[:].set("priority_weight", torch.rand(128))
+
+    losses = agent.loss(sample)
+    expected = agent.dqn(sample)
+
+    assert torch.equal(losses["loss_value"], expected["loss"])
+    assert torch.equal(losses["td_error"], sample["td_error"].flatten())
+
+
+@pytest.mark.parametrize("name", ["a2c", "dqn", "ppo", "ppo_published"])
+def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent, name):
+    agent, other = (small_agent(name, [ct_su_b1()]) for _ in range(2))
+    minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[-1]
+    other.load_state_dict(saved_and_loaded(agent.state_dict()))
+
+    eager, whole = agent.gradient_step(minibatch), whole_step(other, minibatch)
+
+    assert list(eager) == list(whole)
+    torch.testing.assert_close(whole, eager)
+    for one, two in zip(agent.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-4)
+    expected, found = (one.optimiser.state_dict()["state"] for one in (agent, other))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_compiled_agent_learns_the_same_but_for_rounding(small_agent, name):
+    agents = [small_agent(name, [ct_su_b1()], f"agent.compile={compiled}") for compiled in ("true", "false")]
+    for agent in agents:
+        torch.manual_seed(1)
+        for batch in collect(CTGraphEnv([ct_su_b1()] * 16), agent.policy, 128 * 2 + 16, 8, agent.initial_state):
+            agent.learn(batch)
+
+    for one, two in zip(*(agent.parameters() for agent in agents), strict=True):
+        torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-3)
+    agents[1].load_state_dict(saved_and_loaded(agents[0].state_dict()))
+    assert parameters_equal(*agents)
+
+
+@pytest.mark.slow
+def test_a_loss_that_is_not_a_number_stops_a_compiled_agent_and_is_named(small_agent):
+    agent = small_agent("ppo", [ct_su_b1()], "agent.compile=true")
+    first, second = batches(agent, ct_su_b1(), 2)
+    agent.learn(first)
+    second["next", "reward"][3, 2] = float("nan")
+
+    with pytest.raises(FloatingPointError, match=r"^loss_\w+ is nan$"):
+        agent.learn(second)
+
+
+@pytest.mark.parametrize("name", ["lstm_ppo", "drqn"])
+def test_an_agent_with_an_lstm_is_not_compiled(small_agent, name):
+    with pytest.raises(Exception, match="compile must be false for an agent with an LSTM"):
+        small_agent(name, [ct_su_b1()], "+agent.compile=true")
+
+
+def test_the_benchmark_prints_a_row_for_everybody(capsys):
+    benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1", "--max-frames", "1"])
+
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split("|")[3].strip() for line in lines[2:]] == [
+        "ours",
+        "SB3, 256 rows, SB3VecEnv",
+        "SB3, 256 rows, make_vec_env",
+        "SB3, its defaults, 8 rows",
+    ]
+    assert all("0 of 1 seeds" in line for line in lines[2:])
+
+
+def test_without_stable_baselines_ours_is_measured_alone(capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
+
+    benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "0"])
+
+    printed = capsys.readouterr()
+    assert "pip install 'ctgraph_rl[benchmark]'" in printed.err.replace("\n", " ")
+    assert [line.split("|")[3].strip() for line in printed.out.splitlines()[4:]] == ["ours"]
+
+
+def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
+    ours = benchmark.Contender("ppo", "CT-FO-B1", "ours", None, [100.0, 300.0, 200.0], [(8, 1.0), None, (16, 3.0)])
+    theirs = benchmark.Contender("ppo", "CT-FO-B1", "SB3", None, [50.0, 10.0, 40.0], [None, None, (16, 3.0)])
+
+    rows = [[cell.strip() for cell in line.split("|")[3:-1]] for line in benchmark.table([ours, theirs]).splitlines()]
+
+    assert rows[2:] == [["ours", "200", "", "12", "2.00"], ["SB3", "40", "5.0 x", "1 of 3 seeds", ""]]
