@@ -1,38 +1,41 @@
-"""The graphs and goals of a curriculum as a figure, with a panel for each graph.
+"""The style of all pictures of trees, and the graphs and goals of a curriculum as a figure with a panel for each graph.
 
-Of a small tree all decision and end states are drawn; of a large one the ways to some goals, with stubs for the other
-branches. Wait states are left out: there is one before each decision and end state.
+Every kind of state has a colour and a shape of its own, so a grey print and any colour vision keep them apart. The
+panels leave wait states out: there is one before each decision and end state.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.curriculum import Curriculum
-from ctgraph_rl.graph import CTGraph
+from ctgraph_rl.graph import CTGraph, StateType
+from ctgraph_rl.layout import MOST_WAYS, Layout, Way, end_of, in_digits, lay_out, parent, way_to
+from ctgraph_rl.render import GOAL, PALETTE
 
 MOST_PANELS = 12
-MOST_LEAVES = 32
-"""End states up to which a tree is drawn whole."""
-MOST_GOALS = 8
-"""Goals that a large graph's panel shows."""
-MOST_STUBS = 3
-"""Branches not drawn that are hinted at on each side."""
 MOST_LEVEL = 4
 """End states up to which labels stand level."""
-MOST_DIGITS = 14
-"""Characters up to which a goal's decisions are written out."""
 COLUMNS = 3
+DPI = 160
 
-Path_ = tuple[int, ...]
-Places = dict[Path_, tuple[float, float]]
+MARKERS = {
+    StateType.HOME: "p",
+    StateType.WAIT: "o",
+    StateType.DECISION: "D",
+    StateType.END: "s",
+    StateType.FAIL: "8",
+}
+"""Pentagon, circle, diamond, square and octagon."""
+
+Point = tuple[float, float]
 
 
 def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
-    """Draw the graphs and goals of a curriculum; black and grey on white.
+    """Draw the graphs and goals of a curriculum.
 
     Args:
         curriculum: any curriculum.
@@ -53,8 +56,8 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
         _draw_panel(panel, graph, goals[graph])
     for panel in axes[len(panels) :]:
         panel.axis("off")
-    figure.supxlabel("circle: decision state    square: end state    star: goal, with its decisions", fontsize=9)
-    figure.savefig(path, dpi=160)
+    figure.supxlabel("diamond: decision state    square: end state    star: goal, with its decisions", fontsize=9)
+    figure.savefig(path, dpi=DPI)
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -70,46 +73,80 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Path_, str]]:
+def colour(number: int) -> str:
+    """The colour of a kind of state, or of another thing of `ctgraph_rl.render`'s palette, as ``#rrggbb``."""
+    return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
+
+
+def mark(kind: StateType, size: float) -> dict[str, Any]:
+    """How a state is drawn, for matplotlib; sizes in points."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
+    size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
+    return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
+
+
+def goal_mark(size: float) -> dict[str, Any]:
+    """How a goal is drawn: the star of `ctgraph_rl.render`."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
+    return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
+
+
+def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> None:
+    """Draw straight lines behind the states."""
+    from matplotlib.collections import LineCollection
+
+    look: dict[str, Any] = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
+    axes.add_collection(LineCollection(list(lines), **look))
+
+
+def stub_lines(layout: Layout, places: Mapping[int, Point], height: float) -> list[list[Point]]:
+    """Short lines from the states drawn towards branches that are not, left or right of those that are."""
+    reach = 1 / max(len(layout.leaves), 3) / 7
+    ends = [(places[node], side) for node, side in layout.stubs]
+    return [[(x, y), (x + side * reach, y - height)] for (x, y), side in ends]
+
+
+def shape_of(graph: CTGraph) -> str:
+    """A graph's three numbers in a title."""
+    return f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
+
+
+def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Way, str]]:
     """For each graph its goals, each with a label of its decisions and the blocks that train it."""
-    blocks: dict[CTGraph, dict[Path_, list[int]]] = {}
+    blocks: dict[CTGraph, dict[Way, list[int]]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(block.tasks):
             blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
     return {graph: {goal: _label(goal, of) for goal, of in goals.items()} for graph, goals in blocks.items()}
 
 
-def _label(goal: Path_, blocks: Sequence[int]) -> str:
+def _label(goal: Way, blocks: Sequence[int]) -> str:
     numbers = sorted(set(blocks))
     where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
     where = f"block {numbers[0]}" if len(numbers) == 1 else where
-    digits = ("" if max(goal) < 10 else ".").join(map(str, goal))
-    if len(digits) > MOST_DIGITS:
-        digits = f"{digits[: MOST_DIGITS // 2]}...{digits[-MOST_DIGITS // 2 :]}"
-    return f"{digits}\n{where}"
+    return f"{in_digits(goal)}\n{where}"
 
 
-def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Path_, str]) -> None:
-    whole = graph.num_end_states <= MOST_LEAVES
-    shown = list(goals) if whole else sorted(list(goals)[:MOST_GOALS])
-    leaves = _leaves(graph) if whole else shown
-    level = len(leaves) <= MOST_LEVEL
-    places = _places(leaves, graph.depth)
-    stubs = [] if whole else _stubs(graph, places, 1 / max(len(leaves), 3))
-    ways = {goal[:k] for goal in shown for k in range(graph.depth + 1)}
-    _draw_edges(axes, places, stubs, ways)
-    _draw_states(axes, graph, places, set(shown), _mark_size(len(leaves), graph.depth))
-    for goal in shown:
-        _write(axes, places[goal], goals[goal], level=level)
+def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Way, str]) -> None:
+    labels = {end_of(graph, goal): label for goal, label in goals.items()}
+    layout = lay_out(graph, list(labels)[:MOST_WAYS])
+    shown = [end for end in layout.leaves if end in labels]
+    places = {node: (x, -float(layout.level[node])) for node, x in layout.x.items()}
+    level = len(layout.leaves) <= MOST_LEVEL
+    _draw_edges(axes, layout, places, shown)
+    _draw_states(axes, layout, places, shown)
+    for end in shown:
+        _write(axes, places[end], labels[end], level=level)
     axes.set_title(_title(graph, len(goals), len(shown)), fontsize=9)
     axes.set(xlim=(-0.02, 1.02), ylim=(-graph.depth - _room(graph.depth, level), 0.3))
     axes.axis("off")
 
 
 def _title(graph: CTGraph, goals: int, shown: int) -> str:
-    shape = f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
     some = f", {shown} shown" if shown < goals else ""
-    return f"{shape}: {goals:,} {'goal' if goals == 1 else 'goals'}{some}, {graph.num_end_states:,} end states"
+    return (
+        f"{shape_of(graph)}: {goals:,} {'goal' if goals == 1 else 'goals'}{some}, {graph.num_end_states:,} end states"
+    )
 
 
 def _room(depth: int, level: bool) -> float:
@@ -117,63 +154,28 @@ def _room(depth: int, level: bool) -> float:
     return (0.16 if level else 0.32) * depth + 0.2
 
 
-def _leaves(graph: CTGraph) -> list[Path_]:
-    leaves: list[Path_] = [()]
-    for _ in range(graph.depth):
-        leaves = [(*leaf, decision) for leaf in leaves for decision in range(1, graph.branching_factor + 1)]
-    return leaves
+def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+    """The ways to goals are thick and black."""
+    graph, ways = layout.graph, {node for goal in goals for node in way_to(layout.graph, goal)}
+    lines = {node: [places[parent(graph, node)], places[node]] for node in places if node}
+    plain = [line for node, line in lines.items() if node not in ways]
+    draw_lines(axes, [*plain, *stub_lines(layout, places, 0.45)], colors="0.6", linewidths=0.8)
+    draw_lines(axes, [line for node, line in lines.items() if node in ways], linewidths=1.6)
 
 
-def _places(leaves: Sequence[Path_], depth: int) -> Places:
-    """Leaves side by side, every other state in the middle of what is below it; x in [0, 1], y the level below 0."""
-    places = {leaf: ((i + 0.5) / len(leaves), -float(depth)) for i, leaf in enumerate(leaves)}
-    for level in reversed(range(depth)):
-        below: dict[Path_, list[float]] = {}
-        for path in [path for path in places if len(path) == level + 1]:
-            below.setdefault(path[:-1], []).append(places[path][0])
-        places |= {path: ((min(xs) + max(xs)) / 2, -float(level)) for path, xs in below.items()}
-    return places
-
-
-def _stubs(graph: CTGraph, places: Places, width: float) -> list[Any]:
-    """Short lines from the states drawn towards branches that are not, left or right of those that are."""
-    lines = []
-    for path, (x, y) in places.items():
-        drawn = [place[-1] for place in places if place[:-1] == path and place]
-        if drawn:
-            left, right = min(drawn) - 1, graph.branching_factor - max(drawn)
-            sides = [-1 - k for k in range(min(left, MOST_STUBS))] + [1 + k for k in range(min(right, MOST_STUBS))]
-            lines += [[(x, y), (x + side * width / 7, y - 0.45)] for side in sides]
-    return lines
-
-
-def _draw_edges(axes: Any, places: Places, stubs: list[Any], ways: set[Path_]) -> None:
-    from matplotlib.collections import LineCollection
-
-    edges = [(path, [places[path[:-1]], place]) for path, place in places.items() if path]
-    plain = [line for path, line in edges if path not in ways]
-    axes.add_collection(LineCollection([*plain, *stubs], colors="0.6", linewidths=0.8, zorder=1))
-    axes.add_collection(LineCollection([line for path, line in edges if path in ways], colors="0", linewidths=1.6))
-
-
-def _mark_size(leaves: int, depth: int) -> float:
-    return max(3.0, 9.0 - leaves / 6 - depth / 4)
-
-
-def _draw_states(axes: Any, graph: CTGraph, places: Places, goals: set[Path_], size: float) -> None:
-    kinds = {
-        "o": [place for path, place in places.items() if len(path) < graph.depth],
-        "s": [place for path, place in places.items() if len(path) == graph.depth and path not in goals],
-        "*": [places[goal] for goal in goals],
-    }
-    for marker, points in kinds.items():
+def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+    size = max(3.0, 9.0 - len(layout.leaves) / 6 - layout.graph.depth / 4)
+    ends, stars = set(layout.leaves), set(goals)
+    for points, style in (
+        ([place for node, place in places.items() if node not in ends], mark(StateType.DECISION, size)),
+        ([places[end] for end in ends - stars], mark(StateType.END, size)),
+        ([places[goal] for goal in stars], goal_mark(max(2 * size, 9))),
+    ):
         if points:
-            width, fill = (max(2 * size, 9), "0") if marker == "*" else (size, "1")
-            style = {"markersize": width, "markerfacecolor": fill, "markeredgecolor": "0"}
-            axes.plot(*zip(*points, strict=True), marker, zorder=3, clip_on=False, **style)
+            axes.plot(*zip(*points, strict=True), zorder=3, clip_on=False, **style)
 
 
-def _write(axes: Any, place: tuple[float, float], text: str, level: bool) -> None:
+def _write(axes: Any, place: Point, text: str, level: bool) -> None:
     """A goal's label below it, upright where there is little room."""
     words = text if level else text.replace("\n", "  ")
     axes.annotate(
