@@ -64,6 +64,13 @@ def one_hot(
     return Task(CTGraph(b, d, p), tuple(goal or (1,) * d), x, images or OneHot(5))
 
 
+FORKS = [surjective(2, 2, goal=goal) for goal in product((1, 2), repeat=2)]
+"""The four goals of one graph."""
+
+STATE = ("state_type", "node", "observation_id", "tick", "step_count", "episode_reward")
+"""Buffers of an environment that hold the state of its rows."""
+
+
 def optimal(env: CTGraphEnv) -> Tensor:
     """Waits where it must and takes the goal's decisions; sees the true state."""
     states = zip(env.tasks, env.state_type.tolist(), env.node.tolist(), strict=True)

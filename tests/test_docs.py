@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_reference import DELETED, FILES, SHIPPED_2023, TRACES, changed
+from reference_files import DELETED, FILES, SHIPPED_2023, TRACES, changed
 
 from ctgraph_rl import CTGraphEnv, Needle, Observations, PaperImages, Task
 from ctgraph_rl.gym import CTGraphGymEnv

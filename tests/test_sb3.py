@@ -10,6 +10,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from gym_steps import IDS, assert_equal
 from oracles import confounding, fully_observable, surjective
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO
@@ -17,7 +18,6 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
-from test_gym import IDS, assert_equal
 
 from ctgraph_rl import paper
 from ctgraph_rl.gym import CTGraphGymEnv, make_task

@@ -1,0 +1,52 @@
+"""Steps of Gymnasium environments with random actions, and the equality of what they return."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from ctgraph_rl.gym import CONFIGURATIONS
+
+MODES = tuple(AutoresetMode)
+IDS = ["ctgraph/CTGraph-v0", *(f"ctgraph/{name}-v0" for name in CONFIGURATIONS)]
+
+
+def act(rng, num_envs, num_actions=3):
+    """Random actions, half of them waits so that episodes get somewhere."""
+    return rng.integers(num_actions, size=num_envs) * rng.integers(2, size=num_envs)
+
+
+def assert_equal(ours, theirs, where=""):
+    """Equality of nested results, with equal types of arrays."""
+    assert type(ours) is type(theirs), where
+    if isinstance(theirs, dict):
+        assert ours.keys() == theirs.keys(), where
+        for key in theirs:
+            assert_equal(ours[key], theirs[key], f"{where}/{key}")
+    elif isinstance(theirs, (tuple, list)):
+        assert len(ours) == len(theirs), where
+        for i, pair in enumerate(zip(ours, theirs, strict=True)):
+            assert_equal(*pair, f"{where}/{i}")
+    elif isinstance(theirs, np.ndarray):
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), where
+        same = np.array_equal if theirs.dtype != object else all_equal
+        assert same(ours, theirs), where
+    else:
+        assert ours == theirs, where
+
+
+def all_equal(ours, theirs):
+    pairs = zip(ours, theirs, strict=True)
+    return all(np.array_equal(a, b) if b is not None else a is None for a, b in pairs)
+
+
+def play(envs, seed, num_steps):
+    """All that an environment returns for random actions; without autoreset, done rows are reset by a mask."""
+    rng, results = np.random.default_rng(7), [envs.reset(seed=seed)]
+    num_actions = envs.single_action_space.n
+    for _ in range(num_steps):
+        results.append(envs.step(act(rng, envs.num_envs, num_actions)))
+        done = results[-1][2]
+        if envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED and done.any():
+            results.append(envs.reset(options={"reset_mask": done.copy()}))
+    return results
