@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 
 class Agent(Protocol):
@@ -57,7 +58,7 @@ class Agent(Protocol):
         """Called after the last batch of such a block."""
         ...
 
-    def loss(self, batch: TensorDictBase) -> TensorDictBase:
+    def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor] | TensorDictBase:
         """The losses of a batch as scalars named ``loss_*``; their sum is what is minimised."""
         ...
 

@@ -58,7 +58,7 @@ def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
     """
     require((is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"))
     task = one_wait_image("0" * (depth - 1) + "1", image_seed=1)
-    return sequence("single_task", task, num_frames, source=MASKS)
+    return sequence("single_task", (task,), num_frames, source=MASKS)
 
 
 def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
