@@ -2,7 +2,8 @@
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
 table has the medians of the rounds. An observation is one row for one step. The yardsticks are memset and memcpy of as
-many bytes as the observations have, and a native TorchRL environment that does nothing but count.
+many bytes as the observations have, and a native TorchRL environment that does nothing but count, where some rows end at
+every step, as in any batch of episodes.
 """
 
 from __future__ import annotations
@@ -79,7 +80,10 @@ class Contender:
 
 
 class Counter(EnvBase):
-    """The trivial environment: it counts to four and starts anew."""
+    """The trivial environment: it counts to four and starts anew.
+
+    A batch starts at 0, 1, 2, 3, 0, ...: rows end at every step, so that TorchRL merges a reset at every step.
+    """
 
     batch_locked = True
 
@@ -88,11 +92,12 @@ class Counter(EnvBase):
         self.observation_spec = Composite(observation=Unbounded((num_rows, 1), dtype=torch.int64), shape=(num_rows,))
         self.action_spec = Categorical(3, shape=(num_rows,))
         self.reward_spec = Unbounded((num_rows, 1))
-        self.count = torch.zeros(num_rows, 1, dtype=torch.int64)
+        self.first = torch.arange(num_rows).unsqueeze(-1) % 4
+        self.count = self.first
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        self.count = torch.zeros_like(self.count) if mask is None else self.count.masked_fill(mask, 0)
+        self.count = self.first if mask is None else self.count.masked_fill(mask, 0)
         return TensorDict({"observation": self.count}, self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -124,7 +129,7 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
     yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
 
 
-def _fast(task: Task, num_rows: int, with_compiled: bool) -> Iterator[tuple[str, Callable[[], int]]]:
+def _fast(task: Task, num_rows: int, ways: tuple[bool, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
     rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
     steps = Steps.empty(rows, _num_steps(num_rows))
     actions = torch.randint(0, 3, steps.action.shape)
@@ -133,19 +138,26 @@ def _fast(task: Task, num_rows: int, with_compiled: bool) -> Iterator[tuple[str,
         rollout(rows, actions, steps, compiled)
         return steps.action.numel()
 
-    def core() -> int:
+    def core(rows: Rows) -> int:
         for action in actions[:16]:
             rows.restart(rows.act(action)[1])
         return min(16, len(actions)) * num_rows
 
-    yield "core, observations of the step and of the reset", core
-    for compiled, suffix in ((False, ""), (True, ", compiled"))[: 1 + with_compiled]:
-        yield f"fast rollout{suffix}", partial(run, rows, compiled)
+    for compiled in ways:
+        own = Rows([task] * num_rows, compiled=compiled)
+        yield f"core, observations of the step and of the reset{_suffix(compiled)}", partial(core, own)
+        yield f"fast rollout{_suffix(compiled)}", partial(run, rows, compiled)
         if task.observations.read_noise:
-            yield f"fast rollout, noise bank{suffix}", partial(run, banked, compiled)
+            yield f"fast rollout, noise bank{_suffix(compiled)}", partial(run, banked, compiled)
 
 
-def _torchrl(make: Callable[[], EnvBase], prefix: str = "") -> Iterator[tuple[str, Callable[[], int]]]:
+def _suffix(compiled: bool) -> str:
+    return ", compiled" if compiled else ""
+
+
+def _torchrl(
+    make: Callable[[], EnvBase], prefix: str = "", suffix: str = ""
+) -> Iterator[tuple[str, Callable[[], int]]]:
     env, collected = make(), make()
     n = env.batch_size[0]
     steps = max(4, min(64, 2**25 // (n * 300)))
@@ -166,8 +178,8 @@ def _torchrl(make: Callable[[], EnvBase], prefix: str = "") -> Iterator[tuple[st
         env.rollout(steps, policy, break_when_any_done=False)
         return steps * n
 
-    yield f"{prefix}TorchRL rollout", torch.no_grad()(run)
-    yield f"{prefix}TorchRL Collector", lambda: next(batches).numel()
+    yield f"{prefix}TorchRL rollout{suffix}", torch.no_grad()(run)
+    yield f"{prefix}TorchRL Collector{suffix}", lambda: next(batches).numel()
 
 
 class _Random(TensorDictModuleBase):
@@ -184,8 +196,8 @@ class _Random(TensorDictModuleBase):
         return tensordict.set("action", torch.randint(0, 3, (self.num_rows,)))
 
 
-def _gymnasium(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
-    envs = CTGraphVectorEnv(num_rows, task)
+def _gymnasium(task: Task, num_rows: int, compiled: bool) -> Iterator[tuple[str, Callable[[], int]]]:
+    envs = CTGraphVectorEnv(num_rows, task, compiled=compiled)
     envs.reset(seed=0)
     actions = torch.randint(0, 3, (16, num_rows)).numpy()
 
@@ -194,9 +206,9 @@ def _gymnasium(task: Task, num_rows: int) -> Iterator[tuple[str, Callable[[], in
             envs.step(action)
         return actions.size
 
-    yield "Gymnasium VectorEnv", run_batch
+    yield f"Gymnasium VectorEnv{_suffix(compiled)}", run_batch
     if num_rows == 1:
-        yield "Gymnasium Env", _single(CTGraphGymEnv(task))
+        yield f"Gymnasium Env{_suffix(compiled)}", _single(CTGraphGymEnv(task, compiled=compiled))
 
 
 def _single(env: gymnasium.Env) -> Callable[[], int]:
@@ -229,15 +241,17 @@ def contenders(num_rows: list[int], names: list[str], with_compiled: bool) -> li
     def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
         found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
 
-    tasks = configurations()
+    tasks, ways = configurations(), (False, True)[: 1 + with_compiled]
     for n in num_rows:
         add("", n, _memory(n))
         add("", n, _torchrl(partial(Counter, n), TRIVIAL))
         for name in names:
             task = tasks[name]
-            add(name, n, _fast(task, n, with_compiled))
-            add(name, n, _torchrl(partial(CTGraphEnv, [task] * n, check_actions=False)))
-            add(name, n, _gymnasium(task, n))
+            add(name, n, _fast(task, n, ways))
+            for compiled in ways:
+                make = partial(CTGraphEnv, [task] * n, check_actions=False, compiled=compiled)
+                add(name, n, _torchrl(make, suffix=_suffix(compiled)))
+                add(name, n, _gymnasium(task, n, compiled))
     add("", 1, _authors())
     return found
 
@@ -250,7 +264,7 @@ def table(measured: list[Contender]) -> str:
         speed = statistics.median(one.speeds)
         spread = (max(one.speeds) - min(one.speeds)) / speed / 2
         yardstick = median.get((one.num_rows, "", MEMCPY))
-        trivial = median.get((one.num_rows, "", TRIVIAL + one.name))
+        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(_suffix(True))))
         cells = [
             f"{one.num_rows:,}",
             one.configuration,
@@ -278,7 +292,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
-    parser.add_argument("--skip-compiled", action="store_true", help="leave out what torch.compile compiles")
+    parser.add_argument("--skip-compiled", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
     options = parser.parse_args(arguments)
     require(
@@ -289,7 +303,7 @@ def main(arguments: list[str] | None = None) -> None:
         torch.set_num_threads(options.threads)
     measured = contenders(options.rows, options.tasks, not options.skip_compiled)
     console = Console(stderr=True)
-    for one in track(measured, "compiling and filling caches", console=console):
+    for one in track(measured, "filling caches", console=console):
         one.run()
     for one in track(measured * options.rounds, "measuring", console=console):
         one.measure(options.seconds)

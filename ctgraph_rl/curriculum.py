@@ -25,6 +25,9 @@ EVALUATED = ("all", "seen")
 MOST_IDS = 2**20
 """One-hot ids are held for every row."""
 
+MOST_ROWS = 2**24
+"""Of an evaluation; they take 10 GB."""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -140,9 +143,13 @@ class Evaluation:
         Raises:
             ValueError: for one episode a row and a task with ``goal_change``.
         """
+        tasks = tuple(tasks)
         changing = self.episodes_per_row == 1 and any(task.goal_change for task in tasks)
+        rows = len(tasks) * self.num_episodes // self.episodes_per_row
+        many = f"num_episodes={self.num_episodes} of {len(tasks)} tasks are {rows:,} rows at once, the limit is"
         require(
-            (not changing, "tasks with goal_change need episodes_per_row > 1: a row's first goal is the task's own")
+            (not changing, "tasks with goal_change need episodes_per_row > 1: a row's first goal is the task's own"),
+            (rows <= MOST_ROWS, f"{many} {MOST_ROWS:,}; use fewer, or more episodes_per_row"),
         )
 
 

@@ -131,6 +131,14 @@ class RowState(NamedTuple):
     paid: Tensor  # float32: the part of it that an end or fail state paid
 
 
+STATE_DTYPES = dict.fromkeys(RowState._fields, torch.int64) | {
+    "state_type": torch.uint8,
+    "episode_reward": torch.float32,
+    "reward": torch.float32,
+    "paid": torch.float32,
+}
+
+
 class Shown(NamedTuple):
     """What a row shows."""
 

@@ -59,15 +59,16 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
         rows: the batch. It is left where the last step led.
         policy: what acts, or the actions, int64 [T, N].
         steps: the buffers, from `Steps.empty`; filled in place.
-        compiled: run the step and the noise through ``torch.compile``: the same bits, several times faster where
-            waiting, ids, views or noise are drawn, after seconds of compiling for each batch size and kind of task.
+        compiled: the same bits, several times faster. On a CPU a C kernel takes the steps, as in ``Rows(...,
+            compiled=True)``, all in one call where actions are given; elsewhere ``torch.compile`` compiles the step and
+            the noise, for seconds for each batch size and kind of task.
 
     Returns:
         ``steps``.
 
     Raises:
-        ValueError: for buffers of another shape, and actions of a wrong shape, dtype or range; the rows stay where they
-            were.
+        ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what cannot be compiled;
+            the rows stay where they were.
     """
     _check_buffers(rows, steps)
     require(
@@ -77,26 +78,49 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
     require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
     if isinstance(policy, Tensor):
         _check_actions(rows, policy, steps.action.shape)
-    params, uses = rows.params, rows.uses
+    if rows.device.type == "cpu" and (compiled or rows.compiled):
+        rows.state = _native(rows, policy, steps)
+    else:
+        rows.state = _tensors(rows, policy, steps, compiled)
+    return steps
+
+
+def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
+    """Fill buffers by the C kernel; the states that the last step led to."""
+    start = rows.state
+    state = rows.native.run(rows, start, mask=rows.is_done, observation=steps.observation[0])
+    torch.eq(state.step_count, 0, out=steps.is_init[0])
+    if isinstance(policy, Tensor):
+        steps.action.copy_(policy)
+        return _fill(rows, state, steps, slice(None))
+    for t in range(len(steps.action)):
+        steps.action[t] = _chosen(rows, policy, steps, t, start)
+        state = _fill(rows, state, steps, slice(t, t + 1))
+    return state
+
+
+def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
+    """Take the steps of a part of the buffers, whose actions are there; the states that they lead to."""
+    outputs = {name: getattr(steps, name)[part] for name in ("action", "reward", "done", "outcome")}
+    seen, is_init = steps.observation[1:][part], steps.is_init[1:][part]
+    state = rows.native.run(rows, state, len(is_init), restarts=True, observation=seen, **outputs)
+    is_init.copy_(outputs["done"])
+    return state
+
+
+def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool) -> RowState:
+    """Fill buffers by the tensor code; the states that the last step led to."""
+    params, uses, start = rows.params, rows.uses, rows.state
     advance, noisy = (
         _compiled(uses, rows.num_rows, str(rows.device)) if compiled else (step_and_reset, reading.add_noise)
     )
-    state = dynamics.begin(rows.state, rows.is_done, params, uses)
+    state = dynamics.begin(start, rows.is_done, params, uses)
     words = dynamics.words_of(state.tick, params, uses)
     steps.observation[0] = dynamics.observe(state, words, params, uses)
     torch.eq(state.step_count, 0, out=steps.is_init[0])
     plain = not (uses.pixel_noise or uses.reward_cue or params.x.taps)
     for t in range(len(steps.action)):
-        if isinstance(policy, Tensor):
-            action = policy[t]
-        else:
-            before = rows.state
-            action = policy(steps.observation[t], steps.is_init[t])
-            same = rows.params is params and all(map(operator.is_, rows.state, before))
-            require(
-                (same, "a policy must leave the rows as they are during a rollout: change them between two rollouts")
-            )
-            _check_actions(rows, action, steps.action.shape[1:])
+        action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
         state, words, reward, done, outcome, seen = advance(state, action, words, params, uses)
         steps.action[t], steps.reward[t], steps.done[t], steps.outcome[t] = action, reward, done, outcome
         steps.is_init[t + 1] = done
@@ -104,8 +128,17 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
             torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
         else:
             steps.observation[t + 1] = dynamics.read(seen, state, params, uses, noisy)
-    rows.state = state
-    return steps
+    return state
+
+
+def _chosen(rows: Rows, policy: Policy, steps: Steps, t: int, start: RowState) -> Tensor:
+    """What a policy does at step t; it must leave the rows as they are at the start."""
+    params = rows.params
+    action = policy(steps.observation[t], steps.is_init[t])
+    same = rows.params is params and all(map(operator.is_, rows.state, start))
+    require((same, "a policy must leave the rows as they are during a rollout: change them between two rollouts"))
+    _check_actions(rows, action, steps.action.shape[1:])
+    return action
 
 
 def step_and_reset(
@@ -134,10 +167,10 @@ def step_and_reset(
 
 @cache
 def _compiled(uses: Uses, num_rows: int, device: str) -> tuple[Callable, Callable]:
-    """The step and the noise as compiled functions, in plain loops, for one kind of batch.
+    """The step and the noise as functions that ``torch.compile`` compiles, for one kind of batch.
 
-    The C++ compiler's vectors are faster than inductor's own, with which the noise comes out wrong: see `reading`. Each
-    kind of batch compiles code objects of its own, as the number of compilations of one is limited.
+    Each kind compiles code objects of its own, as the number of compilations of one is limited. The option is for the
+    tests, which run this on CPUs: with inductor's own vectors the noise comes out wrong there, see `reading`.
     """
     compiler = partial(torch.compile, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1})
     parts = (step_and_reset, reading.noisy)

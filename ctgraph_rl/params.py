@@ -162,14 +162,18 @@ def bank_bytes(tasks: Iterable[Task]) -> int:
     return shown * max(sets.values())
 
 
-def _require_memory(pool: tuple[Task, ...], bytes_each: int, num_rows: int) -> None:
-    """Refuse image sets and observations that cannot be held, before anything is allocated; POSIX systems only."""
+def require_memory(what: str, needed: int, fewer: str) -> None:
+    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
+
+    Args:
+        what: needs memory.
+        needed: bytes at least.
+        fewer: of what to use fewer.
+    """
     if not hasattr(os, "sysconf"):
         return
-    needed = bank_bytes(pool) + 2 * num_rows * bytes_each  # a step holds two observations of every row
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    message = f"images and observations need {needed:,} bytes, this machine has {memory:,}; use fewer images or rows"
-    require((needed < memory, message))
+    require((needed < memory, f"{what} need {needed:,} bytes, this machine has {memory:,}; use fewer {fewer}"))
 
 
 class Bank(NamedTuple):
@@ -191,7 +195,8 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     one_hot = all(len(shape) == 1 for shape in shapes)
     require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
     shape = max(shapes)
-    _require_memory(pool, math.prod(shape), num_rows)
+    needed = bank_bytes(pool) + 2 * num_rows * math.prod(shape)  # a step holds two observations of every row
+    require_memory("images and observations", needed, "images or rows")
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(_bank_key, pool)):
@@ -203,3 +208,23 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
         starts[key] = rows
         rows += len(bank)
     return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts, levels)  # one may be large
+
+
+def of_rows(part: Any, index: Tensor) -> Any:
+    """Parameters of rows from those of their tasks; what is a table of all tasks stays one."""
+    rows = {}
+    for name, value in part._asdict().items():
+        if isinstance(value, LegacyIndex):
+            rows[name] = of_rows(value, index)
+        elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
+            rows[name] = value.index_select(0, index)
+    return part._replace(**rows)
+
+
+_TABLES: dict[type, tuple[str, ...]] = {
+    TreeParams: ("next_kind", "decides"),
+    ObservationParams: ("first_view", "views_per_node", "num_ids"),
+    LegacyIndex: ("num_ids",),
+    RewardParams: (),
+}
+"""What has not one entry for each task."""

@@ -11,20 +11,12 @@ from torch import Tensor, nn
 
 from ctgraph_rl import dynamics, philox, reading
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
-from ctgraph_rl.dynamics import (
-    LegacyIndex,
-    ObservationParams,
-    RewardParams,
-    RowParams,
-    RowState,
-    Shown,
-    TreeParams,
-    Uses,
-    Words,
-)
+from ctgraph_rl.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Words
 from ctgraph_rl.graph import StateType
 from ctgraph_rl.images import white_level
-from ctgraph_rl.params import make_params, shared_bank
+from ctgraph_rl.native import Native, require_native
+from ctgraph_rl.params import make_params, of_rows, shared_bank
+from ctgraph_rl.stock import Stock
 from ctgraph_rl.switch import Switch, switch_rule
 from ctgraph_rl.task import Task
 
@@ -46,9 +38,11 @@ class Rows(nn.Module):
         noise_bank: 0 draws the noise of every pixel of every observation. A number M >= 1 takes each observation's
             noise from M that were drawn in advance, which is faster; two observations then have the same noise with
             probability 1 / M, where the first way hardly ever repeats noise.
+        compiled: run steps as a C kernel, with the same bits; see `native`. It needs a CPU, a C compiler, and tasks
+            whose rewards are this package's own.
 
     Raises:
-        ValueError: for no tasks, values out of range, and observations of different shapes.
+        ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.
     """
 
     seed: Tensor
@@ -79,6 +73,7 @@ class Rows(nn.Module):
         task_pool: Iterable[Task] | None = None,
         device: torch.device | str | None = "cpu",
         noise_bank: int = 0,
+        compiled: bool = False,
     ) -> None:
         tasks = require_all(Task, "tasks", tasks)
         pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
@@ -87,8 +82,12 @@ class Rows(nn.Module):
             seed_rule(seed),
             (is_int(first_row, 0, 2**32 - self.num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
             (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
+            (isinstance(compiled, bool), f"compiled must be true or false, got {compiled!r}"),
         )
+        if compiled:
+            require_native((task.reward_fn for task in pool), device)
         super().__init__()
+        self.compiled, self.native = compiled, Native()
         self.pool = pool
         self._number = {task: number for number, task in enumerate(pool)}
         self.max_branching = max(task.graph.branching_factor for task in pool)
@@ -105,11 +104,11 @@ class Rows(nn.Module):
         self.register_buffer("noises", noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
-        for field in RowState._fields:
-            self.register_buffer(field, zeros.to(_STATE_DTYPES.get(field, torch.int64), copy=True))
+        for field, dtype in dynamics.STATE_DTYPES.items():
+            self.register_buffer(field, zeros.to(dtype, copy=True))
         for field in _PLACES:
             self.register_buffer(field, zeros.clone())
-        self._stock: _Stock | None = None
+        self._stock: Stock | None = None
         self._now: Words | None = None
         self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
         self.set_tasks(tasks)
@@ -206,16 +205,21 @@ class Rows(nn.Module):
         def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=self.device)
 
-        *tables, self.uses = make_params(different, each, self._bank, self._noise_bank)
-        self._tables = tuple(tables)
+        tree, x, g, self.uses = make_params(different, each, self._bank, self._noise_bank)
+        self._tables = tree, x, g
         self._goals = each([task.goal_leaf for task in different])
         self._take_params()
 
     def _take_params(self) -> None:
         """Each row's parameters, from those of its task."""
-        index = torch.searchsorted(self._in_use, self.task)
-        self.params = self._row_params(*(of_rows(part, index) for part in self._tables))
+        tables, index = self.tables
+        self.params = self._row_params(*(of_rows(part, index) for part in tables))
         self._task_goals = self._goals.index_select(0, index)
+
+    @property
+    def tables(self) -> tuple[tuple[TreeParams, ObservationParams, RewardParams], Tensor]:
+        """The parameters of the different tasks in use, and which of these each row has, int64 [N]."""
+        return self._tables, torch.searchsorted(self._in_use, self.task)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
         """Before the rows of a mask, or all, start an episode: go over to the tasks that are planned for them.
@@ -297,11 +301,15 @@ class Rows(nn.Module):
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
+        if self.compiled:
+            return self._keep(*self.native.show(self, mask=mask), None)
         words = self._draw(self.tick + mask)
         return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
+        if self.compiled:
+            return self._keep(*self.native.show(self, action), None)
         words = self._draw_next()
         return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
 
@@ -310,6 +318,9 @@ class Rows(nn.Module):
 
         `result` tells more.
         """
+        if self.compiled:
+            shown = self.step(action)
+            return shown.observation, shown.done
         now, then = self._draw_next()
         state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
         observation = dynamics.observe(state, then, self.params, self.uses)
@@ -318,6 +329,8 @@ class Rows(nn.Module):
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         self._start_episodes(mask)
+        if self.compiled:
+            return self._keep(*self.native.show(self, action, mask), None)
         words = self._draw_next()
         return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
 
@@ -325,14 +338,20 @@ class Rows(nn.Module):
         """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
         return dynamics.outcome(self.state, done, self.params)
 
-    def restart(self, mask: Tensor | None = None) -> Tensor:
-        """`reset` of all rows, or of all finished ones, the mask: what all rows observe."""
+    def restart(self, mask: Tensor | None = None, shown: Tensor | None = None) -> Tensor:
+        """`reset` of all rows, or of all finished ones, the mask: what all rows observe.
+
+        ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
+        """
         self._start_episodes(mask)
+        if self.compiled:
+            mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
+            return self._keep(*self.native.show(self, None, mask, shown), None).observation
         words = self._draw(self.tick + (1 if mask is None else mask))
         return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
 
-    def _keep(self, state: RowState, result: T, words: Words) -> T:
-        """Go over to a state and the draws of its ticks; the result is passed on."""
+    def _keep(self, state: RowState, result: T, words: Words | None) -> T:
+        """Go over to a state and the draws of its ticks, if there are any; the result is passed on."""
         self._buffers.update(zip(RowState._fields, state, strict=True))
         self._now = words
         return result
@@ -347,7 +366,7 @@ class Rows(nn.Module):
         if self._stock_ticks < 2 or not (self.uses.draws or self.uses.reward_noise):
             return dynamics.words_of(tick, self.params, self.uses)
         if self._stock is None or self._stock.left == 0:
-            self._stock = _Stock(self.params, self.uses, self.tick, self._stock_ticks)
+            self._stock = Stock(self.params, self.uses, self.tick, self._stock_ticks)
         return self._stock.at(tick)
 
     def show(self) -> Shown:
@@ -439,45 +458,6 @@ class Rows(nn.Module):
         return RowParams(self.seed, self.row, tree, x, g, self.bank, self.noises, self.normal_table)
 
 
-class _Stock:
-    """The small draws of all rows for many ticks, drawn in one call: many small calls would cost more."""
-
-    def __init__(self, params: RowParams, uses: Uses, tick: Tensor, num_ticks: int) -> None:
-        num_rows = len(tick)
-        self.left = num_ticks - 1
-        self._tick = tick
-        self._place = torch.arange(num_rows, device=tick.device)
-        ticks = tick + torch.arange(num_ticks, device=tick.device).unsqueeze(-1)
-        self._words = [word.flatten() for word in dynamics.words_of(ticks, params, uses)]
-        self._used = (uses.waits, uses.waits, uses.drawn_ids, uses.views, uses.reward_noise)
-
-    def at(self, tick: Tensor) -> Words:
-        """The draws of ticks that are at most one ahead of those of the last call."""
-        self.left -= 1
-        index = (tick - self._tick) * len(tick) + self._place
-        pairs = zip(self._words, self._used, strict=False)
-        return tuple(word.take(index) if used else index for word, used in pairs)  # what has no use is any tensor
-
-
-def of_rows(part: Any, index: Tensor) -> Any:
-    """Parameters of rows from those of their tasks; what is a table of all tasks stays one."""
-    rows = {}
-    for name, value in part._asdict().items():
-        if isinstance(value, LegacyIndex):
-            rows[name] = of_rows(value, index)
-        elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
-            rows[name] = value.index_select(0, index)
-    return part._replace(**rows)
-
-
-_TABLES: dict[type, tuple[str, ...]] = {
-    TreeParams: ("next_kind", "decides"),
-    ObservationParams: ("first_view", "views_per_node", "num_ids"),
-    LegacyIndex: ("num_ids",),
-    RewardParams: (),
-}
-"""What has not one entry for each task."""
-
 _PLACES = ("task", "choice", "episodes")
 """Where each row is among the tasks: its task's number in the pool, the place of the task that it is to have next among
 those that it changes between (without a switch, the pool), and the episodes that it has begun since the last change of
@@ -485,13 +465,6 @@ plan; int64."""
 
 MAX_STOCK = 2**14
 MAX_STOCK_TICKS = 256
-
-_STATE_DTYPES = {
-    "state_type": torch.uint8,
-    "episode_reward": torch.float32,
-    "reward": torch.float32,
-    "paid": torch.float32,
-}
 
 
 def seed_rule(seed: object) -> tuple[bool, str]:

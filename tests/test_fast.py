@@ -9,7 +9,7 @@ import torch
 from oracles import confounding, fully_observable, one_hot, record, scripts, surjective
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, philox, rollout
+from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, fast, philox, rollout
 
 FILE = {
     "general_seed": 3,
@@ -88,11 +88,12 @@ def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_rows", [1, 3, 8, 37])
-@pytest.mark.parametrize("tasks", [FAMILIES[name] for name in ("surjective", "confounding", "noise", "mixed")])
-def test_the_fast_path_compiled_gives_the_same_bits(tasks, num_rows):
+@pytest.mark.parametrize("num_rows", [1, 8, 37])
+@pytest.mark.parametrize("tasks", [FAMILIES["noise"], FAMILIES["mixed"]])
+def test_what_compiles_the_fast_path_elsewhere_gives_the_same_bits(tasks, num_rows, monkeypatch):
     rows, twin = (Rows((tasks * num_rows)[:num_rows]) for _ in range(2))
     actions = scripts(NUM_STEPS, num_rows)
+    monkeypatch.setattr(fast, "_native", lambda rows, policy, steps: fast._tensors(rows, policy, steps, True))
 
     eager = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
     compiled = rollout(twin, actions, Steps.empty(rows, NUM_STEPS), compiled=True)
@@ -143,14 +144,15 @@ def test_a_rollout_goes_on_where_the_last_one_ended():
         assert torch.equal(getattr(parts[-1], field)[-1], getattr(whole, field)[-1])
 
 
-def test_a_policy_gets_what_it_shall_act_on_and_where_episodes_begin():
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_policy_gets_what_it_shall_act_on_and_where_episodes_begin(compiled):
     rows, seen = Rows([surjective(goal=(1, 2))] * 2), []
 
     def policy(observation: torch.Tensor, is_init: torch.Tensor) -> torch.Tensor:
         seen.append((observation.clone(), is_init.tolist()))
         return torch.tensor([[0, 0, 1, 0, 2, 0][(len(seen) - 1) % 6], 1])
 
-    steps = rollout(rows, policy, Steps.empty(rows, 7))
+    steps = rollout(rows, policy, Steps.empty(rows, 7), compiled)
 
     assert torch.equal(torch.stack([observation for observation, _ in seen]), steps.observation[:-1])
     assert [is_init for _, is_init in seen] == steps.is_init[:-1].tolist()

@@ -36,7 +36,7 @@ def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(whe
 
     code = {
         str(path.relative_to(checkout))
-        for package in ("ctgraph_rl", "curricula", "baselines")
+        for package in ("ctgraph_rl", "curricula", "baselines", "hydra_plugins")
         for path in (checkout / package).rglob("*.py")
     }
     conf = {f"ctgraph_rl/{path.relative_to(checkout)}" for path in (checkout / "conf").rglob("*.yaml")}
@@ -44,7 +44,8 @@ def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(whe
     assert code | conf | {"ctgraph_rl/py.typed"} <= found
     rest = {name for name in found - code - conf if ".dist-info/" not in name}
     typed = {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
-    assert rest <= {*typed, "curricula/fingerprints.json"}
+    report = {f"ctgraph_rl/report/{name}" for name in ("report.html.j2", "report.md.j2", "style.mplstyle")}
+    assert report <= rest <= {*typed, *report, "curricula/fingerprints.json", "ctgraph_rl/native.c"}
 
 
 def test_the_wheel_declares_version_licence_and_console_script(wheel):
