@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from inspect import Parameter, signature
 from itertools import takewhile
 from pathlib import Path
@@ -22,6 +23,7 @@ from ctgraph_rl.log import RunLog, write_metrics, write_performance
 from ctgraph_rl.provenance import provenance
 from ctgraph_rl.scores import scores
 from ctgraph_rl.tables import write_tables
+from ctgraph_rl.train import CURRICULUM
 
 
 class Recorder:
@@ -156,6 +158,8 @@ class Recorder:
         """Write tables and metrics, and close the log."""
         self.log.close()
         if self.run_dir is not None:
+            with suppress(ValueError):  # parts of a user's own classes have no JSON
+                self.curriculum.to_json(self.run_dir / CURRICULUM)
             write_tables(self.log, self.run_dir, parquet=False)
             write_performance(self.run_dir / "performance.csv", self.log, self.curriculum.labels)
             write_metrics(self.run_dir / "metrics.json", self.metrics)

@@ -2,38 +2,32 @@
 
 ``python -m ctgraph_rl.results runs/multirun [--all | --metrics forgetting,regret] [--format latex] [--csv FILE]``
 
-Runs of one configuration but for the seed belong together; one that names no agent stands alone, under its directory.
 Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
-undefined metric is counted, as in n = 9/10.
+undefined metric is counted, as in n = 9/10. What `ctgraph_rl.runs` cannot read is named and left out, and the exit code
+is then 1.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import json
+import html
 import math
+import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.experts import EXPERT
-from ctgraph_rl.log import RunLog
+from ctgraph_rl.runs import BySeed, Run, find_runs, grouped
 from ctgraph_rl.statistics import Comparison, Estimate, compare, interquartile_mean, mean, seeds_needed, solved_rate
 
 SOLVED = 0.9
 """Success rate from which on a task counts as solved."""
-
-MODIFIED = " (modified)"
-"""What the name of a curriculum ends with that is not what is published under the name."""
-
-OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
-"""Settings that a curriculum's fingerprint covers."""
 
 AGAINST_EXPERTS = (
     *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
@@ -44,46 +38,32 @@ AGAINST_EXPERTS = (
 SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "mean_final_return", "solved_rate")
 """Measures that are always shown."""
 
+_HERE = metrics.record.HERE
+AT_END = {
+    "mean_final_return": metrics.Definition(
+        f"{_HERE}/mean-return-at-end", "mean over tasks of the mean return at their last evaluation", _HERE
+    ),
+    "solved_rate": metrics.Definition(
+        f"{_HERE}/share-solved-at-end>={SOLVED}", f"share of tasks with a last success rate >= {SOLVED}", _HERE
+    ),
+    "interquartile_return": metrics.Definition(
+        "agarwal2021/iqm",
+        "mean of the middle half of the mean returns at the last evaluations of all tasks and seeds",
+        "Agarwal et al. 2021, Deep RL at the edge of the statistical precipice (arXiv 2108.13264)",
+    ),
+    "solved": metrics.Definition(
+        f"{_HERE}/solved-at-end>={SOLVED}", f"share of seeds whose last success rate on the task is >= {SOLVED}", _HERE
+    ),
+}
+"""Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
+
 NO_RUN_FINISHED = "every_metric"
 """The measure of the only row of an agent none of whose runs finished."""
 
-LEGEND = "mean [Student's 95 % interval], share of solved seeds [exact one]"
+MEANS = "mean [Student's 95 % interval]"
+LEGEND = f"{MEANS}, share of solved seeds [exact one]"
 
 HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a run directory says.
-
-    Args:
-        path: the directory.
-        curriculum: name and fingerprint.
-        agent: class or name of who learned; None if the configuration does not say.
-        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
-            with them if there is no agent.
-        seed: the seed.
-        metrics: `Metric` fields by name; empty for an unfinished run.
-        success: success rate on each task by its label, at the end; empty for an unfinished run.
-        returns: mean return on each task in the same way.
-        tasks: labels of the tasks that are not held out.
-    """
-
-    path: Path
-    curriculum: tuple[str, str]
-    agent: str | None
-    settings: Mapping[str, Any]
-    seed: int
-    metrics: Mapping[str, Mapping[str, Any]]
-    success: Mapping[str, float]
-    returns: Mapping[str, float]
-    tasks: Sequence[str]
-
-    @property
-    def group(self) -> tuple[str, str]:
-        """The curriculum by its published name and its fingerprint."""
-        name, fingerprint = self.curriculum
-        return name.removesuffix(MODIFIED), fingerprint
 
 
 @dataclass(frozen=True)
@@ -105,50 +85,6 @@ class Row:
     estimate: Estimate
     definition: str
     note: str
-
-
-BySeed = Mapping[int, Run | None]
-
-
-def find_runs(paths: Iterable[Path | str]) -> list[Run]:
-    """Every run in or below the directories; single-task experts are left out where there are other runs.
-
-    Raises:
-        ValueError: for a directory without a run, and for one run that is there twice.
-    """
-    found: list[Run] = []
-    for path in paths:
-        logs = sorted(Path(path).rglob("run.jsonl"))
-        require((bool(logs), f"{path} holds no run: no run.jsonl in or below it"))
-        found += [read_run(log.parent) for log in logs]
-    runs: dict[tuple[Any, ...], Run] = {}
-    for run in [run for run in found if run.group[0] != EXPERT] or found:
-        twin = runs.setdefault((*_group(run), run.seed), run)
-        same = twin.path.resolve() == run.path.resolve()
-        require((same, f"{twin.path} and {run.path} are one run twice; leave one out"))
-    return list(runs.values())
-
-
-def read_run(path: Path) -> Run:
-    """A run directory, finished or not.
-
-    Raises:
-        ValueError: if its log does not start with what was run.
-    """
-    log = RunLog.read(path / "run.jsonl")
-    about = log.of_kind("run")
-    require((bool(about), f"{path / 'run.jsonl'} does not say what was run: its first line is missing"))
-    config = {key: value for key, value in about[0]["config"].items() if key not in OF_THE_CURRICULUM}
-    require(("seed" in config, f"{path / 'run.jsonl'} has no seed in its config; add it to the first line"))
-    seed, agent = config.pop("seed"), _agent(config)
-    settings = {**dict(_flat(config)), **({"directory": str(path.resolve())} if agent is None else {})}
-    finished = (path / "metrics.json").exists()
-    scores = json.loads((path / "metrics.json").read_text(encoding="utf-8")) if finished else {}
-    ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if finished else []
-    success, returns = ({m["label"]: m[name] for m in ends} for name in ("success_rate", "return_mean"))  # the last
-    tasks = list(dict.fromkeys(m["label"] for m in ends if not m.get("held_out")))
-    curriculum = (about[0]["curriculum"], about[0]["fingerprint"])
-    return Run(path, curriculum, agent, settings, seed, scores, success, returns, tasks)
 
 
 def table(runs: Sequence[Run]) -> list[Row]:
@@ -174,21 +110,6 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
         if first[0] == second[0] and list(one) == list(other):
             values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
             found[first[0], first[1], second[1]] = compare(values, others)
-    return found
-
-
-def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]:
-    """Runs by seed, for each (curriculum, agent); None for a seed that only other agents have."""
-    groups: dict[tuple[Any, ...], dict[int, Run]] = {}
-    for run in runs:
-        groups.setdefault(_group(run), {})[run.seed] = run
-    one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
-    found: dict[tuple[str, str], dict[int, Run | None]] = {}
-    for one, by_seed in zip(one_each, groups.values(), strict=True):
-        expected = {run.seed for run in runs if run.group == one.group and run.agent is not None}
-        seeds = sorted(by_seed if one.agent is None else expected)
-        name = _curriculum_name(one, runs), _agent_name(one, one_each)
-        found[name] = {seed: by_seed.get(seed) for seed in seeds}
     return found
 
 
@@ -229,23 +150,23 @@ def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
 
 def text(rows: Sequence[Row]) -> str:
     """The table for a terminal: under each curriculum and agent a line for each measure."""
-    return "\n\n".join([LEGEND, *map(_text, _pages(rows))])
+    return "\n\n".join([LEGEND, *map(_text, pages(rows))])
 
 
 def markdown(rows: Sequence[Row]) -> str:
     """A table in Markdown for each curriculum."""
-    return "\n\n".join(map(_markdown, _pages(rows)))
+    return "\n\n".join(map(_markdown, pages(rows)))
 
 
 def latex(rows: Sequence[Row]) -> str:
     """A table in LaTeX for each curriculum, for the package ``booktabs``."""
-    return "\n\n".join(map(_latex, _pages(rows)))
+    return "\n\n".join(map(_latex, pages(rows)))
 
 
 FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """A row as it is shown."""
 
     agent: str
@@ -255,28 +176,29 @@ class _Line(NamedTuple):
     mark: str  # number of its note, or nothing
 
 
-class _Page(NamedTuple):
+class Page(NamedTuple):
     """The lines of a curriculum, and their notes in the order of their numbers."""
 
     curriculum: str
-    lines: list[_Line]
+    lines: list[Line]
     notes: list[str]
 
 
-def _pages(rows: Sequence[Row]) -> Iterator[_Page]:
+def pages(rows: Sequence[Row]) -> Iterator[Page]:
+    """The rows as they are shown, for each curriculum."""
     for curriculum in dict.fromkeys(row.curriculum for row in rows):
         its = [row for row in rows if row.curriculum == curriculum]
         notes = list(dict.fromkeys(row.note for row in its if row.note))
-        yield _Page(curriculum, [_line(row, notes) for row in its], notes)
+        yield Page(curriculum, [_line(row, notes) for row in its], notes)
 
 
-def _line(row: Row, notes: list[str]) -> _Line:
+def _line(row: Row, notes: list[str]) -> Line:
     value, _, n = str(row.estimate).partition(" n = ")
     mark = str(notes.index(row.note) + 1) if row.note else ""
-    return _Line(row.agent, row.measure.replace("_", " "), value, n, mark)
+    return Line(row.agent, row.measure.replace("_", " "), value, n, mark)
 
 
-def _text(page: _Page) -> str:
+def _text(page: Page) -> str:
     measures, values, counts = (max(len(line[i]) for line in page.lines) for i in (1, 2, 3))
     shown, agent = [page.curriculum], None
     for line in page.lines:
@@ -290,36 +212,45 @@ def _text(page: _Page) -> str:
     return "\n".join(shown)
 
 
-def _markdown(page: _Page) -> str:
+def _markdown(page: Page) -> str:
     head = [
-        f"### {page.curriculum}",
+        f"### {markdown_text(page.curriculum)}",
         "",
         LEGEND,
         "",
         "| agent | measure | over seeds | n | note |",
         "|---|---|---|---|---|",
     ]
-    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in page.lines]
-    notes = [f"{number}. {note}" for number, note in enumerate(page.notes, 1)]
+    lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
+    notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
     return "\n".join([*head, *lines, *([""] if notes else []), *notes])
 
 
-def _latex(page: _Page) -> str:
-    caption = rf"\caption{{{_escaped(page.curriculum)}: {_escaped(LEGEND)}}}"
+def markdown_text(plain: str) -> str:
+    """Text of one line without meaning to HTML or to a table in Markdown."""
+    return html.escape(" ".join(plain.split()), quote=False).replace("|", "\\|")
+
+
+def _latex(page: Page) -> str:
+    caption = rf"\caption{{{latex_text(page.curriculum)}: {latex_text(LEGEND)}}}"
     columns = r"agent & measure & over seeds & $n$ \\"
     head = [r"\begin{table}", caption, r"\begin{tabular}{llll}", r"\toprule", columns, r"\midrule"]
-    notes = [rf"\par\footnotesize $^{{{number}}}$ {_escaped(note)}" for number, note in enumerate(page.notes, 1)]
+    notes = [rf"\par\footnotesize $^{{{number}}}$ {latex_text(note)}" for number, note in enumerate(page.notes, 1)]
     lines = map(_latex_line, page.lines)
     return "\n".join([*head, *lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])
 
 
-def _latex_line(line: _Line) -> str:
-    value = "--" if line.value == "-" else line.value.replace("-", "$-$")
+def _latex_line(line: Line) -> str:
     mark = rf"$^{{{line.mark}}}$" if line.mark else ""
-    return rf"{_escaped(line.agent)} & {_escaped(line.measure)} & {value}{mark} & {line.n} \\"
+    return rf"{latex_text(line.agent)} & {latex_text(line.measure)} & {latex_value(line.value)}{mark} & {line.n} \\"
 
 
-def _escaped(plain: str) -> str:
+def latex_value(value: str) -> str:
+    """A number and its interval with signs, or a dash for none."""
+    return "--" if value == "-" else value.replace("-", "$-$")
+
+
+def latex_text(plain: str) -> str:
     """Text without meaning to LaTeX; a bracket after a line's end would be an argument."""
     commands = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "[": "{[}"}
     return "".join(rf"\{each}" if each in "&%$#_{}" else commands.get(each, each) for each in plain)
@@ -345,10 +276,10 @@ def _at_the_end(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
     if tasks:
         returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
         estimate = interquartile_mean(returns)
-        yield "interquartile_return", estimate, "agarwal2021/iqm", _note(by_seed, None, estimate)
+        yield _ended("interquartile_return", estimate, by_seed)
     for task in tasks:
         estimate = solved_rate([_solved(run, task) for run in by_seed.values()])
-        yield f"solved {task}", estimate, f"ctgraph_rl/solved-at-end>={SOLVED}", _note(by_seed, None, estimate)
+        yield _ended(f"solved {task}", estimate, by_seed)
 
 
 def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
@@ -356,11 +287,15 @@ def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
     returns = mean(
         [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in by_seed.values()]
     )
-    yield "mean_final_return", returns, "ctgraph_rl/mean-return-at-end", _note(by_seed, None, returns)
+    yield _ended("mean_final_return", returns, by_seed)
     solved = mean(
         [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in by_seed.values()]
     )
-    yield "solved_rate", solved, f"ctgraph_rl/share-solved-at-end>={SOLVED}", _note(by_seed, None, solved)
+    yield _ended("solved_rate", solved, by_seed)
+
+
+def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
+    return measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -372,47 +307,6 @@ def _mean(values: Iterable[float | None]) -> float | None:
 def _solved(run: Run | None, task: str) -> bool | None:
     rate = None if run is None else run.success.get(task)
     return None if rate is None else rate >= SOLVED
-
-
-def _group(run: Run) -> tuple[tuple[str, str], str]:
-    return run.group, json.dumps(run.settings, sort_keys=True)
-
-
-def _curriculum_name(run: Run, runs: Sequence[Run]) -> str:
-    """The curriculum's shortest name, with its fingerprint where another one has the same name."""
-    named: dict[tuple[str, str], str] = {}
-    for other in runs:
-        named[other.group] = min(named.get(other.group, other.curriculum[0]), other.curriculum[0], key=len)
-    name = named[run.group]
-    return name if list(named.values()).count(name) == 1 else f"{name} {run.curriculum[1]}"
-
-
-def _agent_name(run: Run, runs: Sequence[Run]) -> str:
-    """The agent, with the settings in which it differs from others of the name on the curriculum."""
-    alike = [other for other in runs if other.group == run.group and _name(other) == _name(run)]
-    keys = sorted({key for other in alike for key in other.settings})
-    differing = [key for key in keys if len({json.dumps(other.settings.get(key)) for other in alike}) > 1]
-    return " ".join([_name(run), *(f"{key.removeprefix('agent.')}={run.settings.get(key)}" for key in differing)])
-
-
-def _name(run: Run) -> str:
-    return run.path.resolve().name if run.agent is None else run.agent
-
-
-def _agent(config: Mapping[str, Any]) -> str | None:
-    """The class of the agent that was built, or the name that whoever recorded the run gave."""
-    agent = config.get("agent")
-    if isinstance(agent, Mapping) and "_target_" in agent:
-        return str(agent["_target_"]).rpartition(".")[2]
-    return next((name for name in (agent, config.get("learner")) if isinstance(name, str) and name), None)
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _value(run: Run | None, metric: str) -> float | None:
@@ -433,8 +327,8 @@ def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
 def _missing(run: Run | None, metric: str | None) -> str | None:
     if run is None:
         return "no run"
-    if not run.metrics:
-        return "unfinished"
+    if run.reason is not None:
+        return run.reason
     if metric is None or _value(run, metric) is not None:
         return None
     return run.metrics[metric]["undefined"] if metric in run.metrics else "another version, without this metric"
@@ -448,7 +342,8 @@ def main() -> None:
         parser.error("--difference is of the metric that --compare names; give both")
     try:
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
-        runs = find_runs(arguments.runs)
+        runs, problems = find_runs(arguments.runs)
+        require((bool(runs), "; ".join(problem.reason for problem in problems)))
         rows = table(runs)
         names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
         print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names)))
@@ -460,6 +355,10 @@ def main() -> None:
                 print(f"\n{comment}{_sentence(*pair, found, arguments.difference)}")
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(str(error))
+    for problem in problems:
+        print(f"left out: {problem.reason}", file=sys.stderr)
+    if problems:
+        sys.exit(1)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -93,7 +94,7 @@ def mean(values: Values, level: float = LEVEL) -> Estimate:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
     """
-    stats = _scipy_stats()
+    _scipy_stats()
     require(*fraction(level=level))
     known, missing = _known(values)
     method = f"mean, Student t {level:.0%}"
@@ -103,7 +104,7 @@ def mean(values: Values, level: float = LEVEL) -> Estimate:
     if len(known) == 1 or min(known) == max(known):
         reason = "one seed has no interval" if len(known) == 1 else "all seeds are equal: no spread to estimate"
         return Estimate(centre, None, None, len(known), missing, method, reason)
-    half = stats.t.ppf((1 + level) / 2, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known))
+    half = _student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known))
     return Estimate(centre, float(centre - half), float(centre + half), len(known), missing, method)
 
 
@@ -203,6 +204,12 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
         middle = (low + high) // 2
         low, high = (low, middle) if finds(middle) else (middle, high)
     return high
+
+
+@cache
+def _student(level: float, freedom: int) -> float:
+    """Half the width of Student's interval in standard errors; a report asks for it thousands of times."""
+    return float(_scipy_stats().t.ppf((1 + level) / 2, freedom))
 
 
 def _sign_flip(differences: Sequence[float]) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import sys
+import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +14,8 @@ import torch
 from ctgraph_rl import RunLog, metrics, results
 from ctgraph_rl.experts import EXPERT
 from ctgraph_rl.log import write_metrics
-from ctgraph_rl.results import comparisons, find_runs, selected, table
+from ctgraph_rl.results import comparisons, selected, table
+from ctgraph_rl.runs import Problem, find_runs, grouped
 
 pytest.importorskip("scipy")
 
@@ -37,6 +40,13 @@ def make_run(folder, seed: int, returns=(1.0, 0.5), finished: bool = True, curri
     return path
 
 
+def all_runs(paths):
+    """All runs of folders that hold nothing else."""
+    runs, problems = find_runs(paths)
+    assert problems == []
+    return runs
+
+
 def line(rows, measure: str, agent: str = "PPO"):
     (found,) = [row for row in rows if (row.measure, row.agent) == (measure, agent)]
     return found
@@ -46,7 +56,7 @@ def test_runs_of_one_configuration_become_one_line_a_metric(tmp_path):
     for seed, value in enumerate((0.25, 0.5, 0.75)):
         make_run(tmp_path, seed, (value, 1.0))
 
-    rows = table(find_runs([tmp_path]))
+    rows = table(all_runs([tmp_path]))
 
     row = line(rows, "backward_transfer")
     assert (row.curriculum, row.definition, row.note) == ("two", "lopez-paz2017/bwt", "")
@@ -60,7 +70,7 @@ def test_solved_tasks_are_counted_at_the_end(tmp_path):
     for seed, value in enumerate((0.25, 0.9, 1.0)):
         make_run(tmp_path, seed, (value, 1.0))
 
-    rows = table(find_runs([tmp_path]))
+    rows = table(all_runs([tmp_path]))
 
     assert line(rows, "solved goal1").estimate.value == 2 / 3
     assert line(rows, "solved goal2").estimate.value == 1.0
@@ -75,7 +85,7 @@ def test_an_unfinished_run_and_a_missing_one_are_shown(tmp_path):
     make_run(tmp_path, 0, gamma=0.5)
     make_run(tmp_path, 1, gamma=0.5, finished=False)
 
-    row = line(table(find_runs([tmp_path])), "average_performance", "PPO gamma=0.5")
+    row = line(table(all_runs([tmp_path])), "average_performance", "PPO gamma=0.5")
 
     assert str(row.estimate) == "0.75 n = 1/3"
     assert row.note == "seed 1: unfinished; seed 2: no run; one seed has no interval"
@@ -87,7 +97,7 @@ def test_an_undefined_metric_is_counted_with_its_reason(tmp_path):
         single = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
         write_metrics(path / "metrics.json", metrics.summary(single, [(0,)]))
 
-    row = line(table(find_runs([tmp_path])), "forgetting")
+    row = line(table(all_runs([tmp_path])), "forgetting")
 
     assert (row.estimate.value, row.estimate.n, row.estimate.n_undefined) == (None, 0, 2)
     assert row.note == "seed 0, 1: the definition needs at least two tasks; no seed has a value"
@@ -98,7 +108,7 @@ def test_agents_are_told_apart_by_class_and_by_the_settings_that_differ(tmp_path
     make_run(tmp_path, 0, gamma=0.9, rate=1)
     make_run(tmp_path, 0, curriculum="other", rate=1)
 
-    rows = table(find_runs([tmp_path]))
+    rows = table(all_runs([tmp_path]))
 
     assert {(row.curriculum, row.agent) for row in rows} == {
         ("two", "PPO gamma=0.5"),
@@ -112,7 +122,7 @@ def test_agents_are_compared_seed_by_seed(tmp_path):
         make_run(tmp_path, seed, (1.0, 1.0), gamma=0.9)
         make_run(tmp_path, seed, (0.25 * seed, 1.0), gamma=0.5)
 
-    (found,) = comparisons(find_runs([tmp_path]), "average_performance").items()
+    (found,) = comparisons(all_runs([tmp_path]), "average_performance").items()
 
     names, comparison = found
     assert names == ("two", "PPO gamma=0.9", "PPO gamma=0.5")
@@ -125,35 +135,32 @@ def test_runs_of_different_curricula_are_not_compared(tmp_path):
         make_run(tmp_path, seed)
         make_run(tmp_path, seed, curriculum="other")
 
-    assert comparisons(find_runs([tmp_path]), "average_performance") == {}
+    assert comparisons(all_runs([tmp_path]), "average_performance") == {}
 
 
 def test_an_unknown_metric_lists_those_that_there_are(tmp_path):
     make_run(tmp_path, 0)
 
     with pytest.raises(ValueError, match="no run has a metric 'accuracy'; there are: average_performance, "):
-        comparisons(find_runs([tmp_path]), "accuracy")
+        comparisons(all_runs([tmp_path]), "accuracy")
 
 
-def test_one_run_twice_is_refused_and_one_folder_twice_is_not(tmp_path):
-    make_run(tmp_path, 0)
-    assert len(find_runs([tmp_path, tmp_path])) == 1
-    make_run(tmp_path, 0)
+def test_one_run_twice_is_left_out_once_and_one_folder_twice_is_no_problem(tmp_path):
+    first = make_run(tmp_path, 0)
+    assert len(all_runs([tmp_path, tmp_path])) == 1
+    second = make_run(tmp_path, 0)
 
-    with pytest.raises(ValueError, match="are one run twice; leave one out"):
-        find_runs([tmp_path])
+    runs, problems = find_runs([tmp_path])
 
-
-def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"holds no run: no run\.jsonl in or below it"):
-        find_runs([tmp_path])
+    assert [run.path for run in runs] == [first]
+    assert problems == [Problem(second, f"{first} and {second} are one run twice; the second is left out")]
 
 
-def test_a_log_without_its_first_line_is_refused(tmp_path):
-    (tmp_path / "run.jsonl").write_text(json.dumps({"kind": "training"}) + "\n")
-
-    with pytest.raises(ValueError, match="does not say what was run"):
-        find_runs([tmp_path])
+def test_a_folder_without_runs_is_a_problem(tmp_path):
+    assert find_runs([tmp_path]) == (
+        [],
+        [Problem(tmp_path, f"{tmp_path} holds no run: no run.jsonl in or below it")],
+    )
 
 
 def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
@@ -200,8 +207,8 @@ def test_single_task_experts_are_no_rows_beside_other_runs(tmp_path, name):
     for _ in range(2):  # of two versions of a package: one configuration, twice
         expert = make_run(tmp_path / "runs" / "experts", 0, curriculum=name)
 
-    assert [run.curriculum[0] for run in find_runs([tmp_path])] == ["two"]
-    assert [run.curriculum[0] for run in find_runs([expert])] == [name]
+    assert [run.curriculum[0] for run in all_runs([tmp_path])] == ["two"]
+    assert [run.curriculum[0] for run in all_runs([expert])] == [name]
 
 
 def record(path, **config):
@@ -219,7 +226,7 @@ def test_runs_that_name_no_agent_are_one_row_each_under_their_directory(tmp_path
     for name, seed in zip(("mine", "yours"), seeds, strict=True):
         record(tmp_path / name, seed=seed)
 
-    rows = [row for row in table(find_runs([tmp_path])) if row.measure == "average_performance"]
+    rows = [row for row in table(all_runs([tmp_path])) if row.measure == "average_performance"]
 
     assert {row.agent: (row.estimate.n, row.estimate.n_undefined) for row in rows} == {
         "PPO": (1, 0),
@@ -233,7 +240,7 @@ def test_directories_of_one_name_are_told_apart(tmp_path):
         (tmp_path / folder).mkdir()
         record(tmp_path / folder / "run", seed=0)
 
-    agents = {row.agent for row in table(find_runs([tmp_path]))}
+    agents = {row.agent for row in table(all_runs([tmp_path]))}
 
     assert agents == {f"run directory={(tmp_path / folder / 'run').resolve()}" for folder in ("a", "b")}
 
@@ -243,7 +250,7 @@ def test_a_plain_name_of_the_agent_is_the_name_of_its_runs(tmp_path, key):
     for seed in range(3):
         record(tmp_path / f"run{seed}", seed=seed, **{key: "sac"})
 
-    row = line(table(find_runs([tmp_path])), "average_performance", "sac")
+    row = line(table(all_runs([tmp_path])), "average_performance", "sac")
 
     assert str(row.estimate) == "0.75 n = 3"
 
@@ -251,7 +258,7 @@ def test_a_plain_name_of_the_agent_is_the_name_of_its_runs(tmp_path, key):
 def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
     make_run(tmp_path, 0, finished=False)
 
-    rows = table(find_runs([tmp_path]))
+    rows = table(all_runs([tmp_path]))
 
     assert [(row.measure, str(row.estimate), row.note) for row in rows] == [
         ("every_metric", "- n = 0/1", "seed 0: unfinished; no seed has a value")
@@ -267,7 +274,7 @@ def test_a_log_of_one_line_is_an_unfinished_run_beside_a_finished_one(tmp_path):
     crashed = make_run(tmp_path, 0, gamma=0.5, finished=False) / "run.jsonl"
     crashed.write_text(crashed.read_text().splitlines()[0] + "\n")
 
-    rows = selected(table(find_runs([tmp_path])), ["forgetting"])
+    rows = selected(table(all_runs([tmp_path])), ["forgetting"])
 
     assert [(row.agent, row.measure, str(row.estimate)) for row in rows] == [
         ("PPO gamma=0.9", "forgetting", "0.00 n = 1"),
@@ -279,7 +286,7 @@ def test_one_fingerprint_is_one_curriculum_though_one_name_says_modified(tmp_pat
     make_run(tmp_path, 0)
     make_run(tmp_path, 1, curriculum="two (modified)")
 
-    row = line(table(find_runs([tmp_path])), "average_performance")
+    row = line(table(all_runs([tmp_path])), "average_performance")
 
     assert (row.curriculum, row.estimate.n) == ("two", 2)
 
@@ -288,7 +295,7 @@ def test_six_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_
     path = make_run(tmp_path, 0)
     always = ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
     at_the_end = ["mean_final_return", "solved_rate"]
-    first = [row.measure for row in selected(table(find_runs([path])))]
+    first = [row.measure for row in selected(table(all_runs([path])))]
     scores = json.loads((path / "metrics.json").read_text())
     for name, value in (("relative_performance", 1.5), ("sample_efficiency", None), ("regret", 2.0)):
         scores[name] = {"value": value, "definition": name, "undefined": None if value else "no experts were given"}
@@ -296,8 +303,8 @@ def test_six_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_
 
     make_run(tmp_path, 0, curriculum="other")
 
-    rows = table(find_runs([path]))
-    both = selected(table(find_runs([tmp_path])))
+    rows = table(all_runs([path]))
+    both = selected(table(all_runs([tmp_path])))
 
     assert first == [*always, *at_the_end]
     assert [row.measure for row in selected(rows)] == [*always, "relative_performance", *at_the_end]
@@ -311,13 +318,13 @@ def test_an_unknown_measure_lists_those_that_there_are(tmp_path):
     with pytest.raises(
         ValueError, match=r"no run has a measure 'accuracy'; there are: average_performance, .*, solved$"
     ):
-        selected(table(find_runs([tmp_path])), ["accuracy", "forgetting"])
+        selected(table(all_runs([tmp_path])), ["accuracy", "forgetting"])
 
 
 def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
     for seed in range(2):
         make_run(tmp_path, seed, (seed / 2, 1.0), curriculum="a_b", name="ppo|x")
-    rows = selected(table(find_runs([tmp_path])), ["backward_transfer", "forward_transfer"])
+    rows = selected(table(all_runs([tmp_path])), ["backward_transfer", "forward_transfer"])
 
     page = results.markdown(rows).splitlines()
     paper = results.latex(rows).splitlines()
@@ -352,3 +359,38 @@ def test_a_difference_that_means_nothing_is_refused_before_the_table(tmp_path, m
     said = capsys.readouterr()
     assert message in said.err
     assert said.out == ""
+
+
+def test_what_is_left_out_is_named_after_the_table_with_exit_code_1(tmp_path, monkeypatch, capsys):
+    make_run(tmp_path, 0)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "run.jsonl").write_text("step,reward\n")
+    monkeypatch.setattr(sys, "argv", ["results", str(tmp_path)])
+
+    with pytest.raises(SystemExit) as end:
+        results.main()
+
+    said = capsys.readouterr()
+    assert end.value.code == 1
+    assert "average performance  0.75  n = 1" in said.out
+    assert said.err.startswith(f"left out: {tmp_path / 'foreign' / 'run.jsonl'} does not say what was run")
+
+
+def test_html_and_pipes_of_a_name_are_text_in_a_markdown_table(tmp_path):
+    path = make_run(tmp_path, 0, curriculum="<b>x|y")
+
+    page = results.markdown(table(all_runs([path])))
+
+    assert page.startswith("### &lt;b&gt;x\\|y\n")
+    assert "<b>" not in page
+
+
+def test_many_configurations_are_named_in_a_time_that_grows_with_their_number(tmp_path):
+    first = all_runs([make_run(tmp_path, 0, gamma=0)])[0]
+    runs = [replace(first, settings={**first.settings, "agent.gamma": number}) for number in range(2000)]
+    start = time.process_time()
+
+    groups = grouped(runs)
+
+    assert time.process_time() - start < 2
+    assert list(groups)[1999] == ("two", "PPO gamma=1999")

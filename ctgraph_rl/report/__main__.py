@@ -1,0 +1,33 @@
+"""``ctgraph-rl report RUN_OR_FOLDER... [--out FOLDER]`` writes a page of figures and tables of all runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from ctgraph_rl.report.page import write_report
+from ctgraph_rl.report.terminal import print_summary
+
+
+def main() -> None:
+    """Write the report, and say what is in it; the exit code is 1 if something was left out."""
+    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.report", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
+    parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
+    arguments = parser.parse_args()
+    try:
+        if len(arguments.runs) == 1 and (arguments.runs[0] / "metrics.json").is_file():
+            print_summary(arguments.runs[0])
+        report = write_report(arguments.runs, arguments.out)
+    except (OSError, ValueError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+    for problem in report.problems:
+        print(f"left out: {problem.reason}", file=sys.stderr)
+    print(f"report of {len(report.runs)} runs: {report.page}")
+    if report.problems:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

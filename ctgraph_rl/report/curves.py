@@ -1,0 +1,129 @@
+"""Learning curves: what each task was worth over the run, and the return while training, as means over seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from ctgraph_rl.report.sections import Point, Result, Section, evaluation_curve, training_curve
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, short
+from ctgraph_rl.runs import Curve
+
+MOST_TASKS = 32
+"""Tasks that have a panel."""
+
+MANY_BLOCKS = 12
+"""Blocks from which on the lines at their ends are thinner."""
+
+MOST_SEEDS = 20
+"""Seeds up to which each has a thin line."""
+
+COLUMNS = 4
+PLACES = 160
+"""Means over stretches of frames that the return while training is shown as, in all blocks together."""
+
+
+def draw_tasks(section: Section) -> Any:
+    """A panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
+    labels = section.labels[:MOST_TASKS]
+    rows = math.ceil(len(labels) / COLUMNS)
+    columns = min(COLUMNS, len(labels))
+    figure = _figure(max(0.5 * WIDTH, WIDTH * columns / COLUMNS), 1.45 * rows + 0.5)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for panel in grid.ravel()[len(labels) :]:
+        panel.axis("off")
+    for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
+        _mark_blocks(axes, section, task)
+        for position, result in enumerate(section.results[:MOST_AGENTS]):
+            seeds = [run.history.evaluations.get(label, []) for run in result.finished if run.history]
+            _draw(axes, position, [evaluation_curve(result.finished, label)], seeds)
+        axes.set_title(short(label))
+    _finish(figure, grid, section, "mean return")
+    return figure
+
+
+def draw_training(section: Section) -> Any:
+    """Return while training over all blocks, a curve for each agent."""
+    figure = _figure(WIDTH, 2.3)
+    axes = figure.subplots()
+    _mark_blocks(axes, section, None)
+    blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
+    places = max(4, PLACES // max(len(blocks), 1))
+    for position, result in enumerate(section.results[:MOST_AGENTS]):
+        stretches = [training_curve(result.finished, block, *ends, places) for block, ends in blocks]
+        _draw(axes, position, stretches, ())
+    _finish(figure, [[axes]], section, "return while training")
+    return figure
+
+
+def has_training(section: Section) -> bool:
+    """Whether any run says what it was worth while training."""
+    finished = [run for result in section.results for run in result.finished]
+    return any(run.history is not None and run.history.training for run in finished)
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height))
+
+
+def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
+    """Dashed lines where blocks end, and grey behind those that train the task."""
+    many = len(section.ends) > MANY_BLOCKS
+    for end in section.ends[1:-1]:
+        axes.axvline(end, color="0.55", linestyle=(0, (3, 2)), linewidth=0.25 if many else 0.6, zorder=0)
+    for start, end, tasks in zip(section.ends, section.ends[1:], section.trained, strict=False):
+        if task in tasks:
+            axes.axvspan(start, end, color="0.9", zorder=-1, linewidth=0)
+
+
+def _draw(axes: Any, position: int, stretches: Sequence[list[Point]], seeds: Sequence[Curve]) -> None:
+    """A mean with its band, piece by piece, and thin lines for seeds."""
+    look = agent_style(position)
+    if 1 < len(seeds) <= MOST_SEEDS:
+        for curve in seeds:
+            axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
+    for points in stretches:
+        if points:
+            frames = [point.frames for point in points]
+            axes.plot(frames, [point.estimate.value for point in points], markevery=_every(points), zorder=3, **look)
+            lows, highs = zip(*map(_band, points), strict=True)
+            axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
+
+
+def _band(point: Point) -> tuple[float | None, float | None]:
+    """The interval; without width where there is none."""
+    estimate = point.estimate
+    return (estimate.value, estimate.value) if estimate.low is None else (estimate.low, estimate.high)
+
+
+def _every(points: Sequence[Point]) -> int:
+    """Marks on one of so many points."""
+    return 1 + len(points) // 8
+
+
+def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
+    """One scale for all panels, from the curves' means, names of axes, and a legend of the agents."""
+    from matplotlib.lines import Line2D
+
+    panels = [axes for row in grid for axes in row]
+    heights = [y for axes in panels for line in axes.lines if len(line.get_xdata()) > 2 for y in line.get_ydata()]
+    known = [y for y in heights if y is not None and not math.isnan(y)]
+    low, high = min([0.0, *known]), max([1.0, *known])
+    room = 0.05 * (high - low)
+    panels[0].set_ylim(low - room, high + room)
+    panels[0].set_xlim(0, max(section.ends[-1], 1))
+    for row in grid:
+        row[0].set_ylabel(ylabel)
+    for axes in panels:
+        frames_axis(axes)
+    figure.supxlabel("frames", fontsize=8)
+    shown = section.results[:MOST_AGENTS]
+    marks = [Line2D([], [], label=_named(result), **agent_style(i)) for i, result in enumerate(shown)]
+    figure.legend(handles=marks, loc="outside upper left", ncols=min(3, len(marks)))
+
+
+def _named(result: Result) -> str:
+    return f"{result.agent if len(result.agent) <= 60 else result.agent[:59] + '…'} (n = {result.n})"

@@ -1,0 +1,116 @@
+"""Heat maps of an agent: the performance matrix, and what each block's training did to each task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ctgraph_rl.report.sections import Matrix, Result, Section
+from ctgraph_rl.report.style import WIDTH, short
+
+MOST_NUMBERS = 10
+"""Tasks up to which cells have numbers."""
+
+MOST_INTERVALS = 5
+"""Tasks up to which cells have intervals, too."""
+
+MOST_NAMES = 32
+"""Tasks up to which each has its name."""
+
+NEGATIVE = -0.05
+"""Share of the scale from which on a cell without number is marked as negative."""
+
+Values = list[list[float]]
+
+
+def draw_matrices(section: Section, result: Result) -> Any:
+    """Performance and transfer side by side; below each other where there are many tasks."""
+    from matplotlib.figure import Figure
+
+    performance, transfer = result.performance(), result.transfer()
+    tasks, rows = len(performance[0]), len(performance)
+    beside = tasks <= MOST_NUMBERS
+    height = min(1.3 + 0.34 * rows, 6.0) if beside else min(1.2 + 0.22 * rows, 6.5)
+    figure = Figure(figsize=(WIDTH, height if beside else 2 * height))
+    left, right = figure.subplots(1, 2) if beside else figure.subplots(2, 1)
+    draw_performance(left, performance, section.labels, section.trained)
+    draw_transfer(right, transfer, section.labels, section.trained)
+    return figure
+
+
+def draw_performance(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
+    """The performance matrix on a scale from 0, or the lowest value, to 1, or the highest; row 0 is untrained."""
+    values = _values(matrix)
+    known = [value for row in values for value in row if not math.isnan(value)]
+    low, high = min([0.0, *known]), max([1.0, *known])
+    _show(axes, values, "viridis", low, high)
+    _name(axes, labels, len(values), 0)
+    _write(axes, matrix, lambda value: "white" if value < low + 0.6 * (high - low) else "black", "")
+    _box(axes, trained, 1)
+    axes.set(ylabel="after block", title="mean return on each task")
+
+
+def draw_transfer(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
+    """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
+    values = _values(matrix)
+    largest = max([abs(value) for row in values for value in row if not math.isnan(value)], default=0.0) or 1.0
+    _show(axes, values, "PuOr", -largest, largest)
+    _name(axes, labels, len(values), 1)
+    _write(axes, matrix, lambda value: "white" if abs(value) > 0.7 * largest else "black", "+")
+    if len(labels) > MOST_NUMBERS:
+        cells = [(j, i) for i, row in enumerate(values) for j, value in enumerate(row) if value < NEGATIVE * largest]
+        axes.plot(*(zip(*cells, strict=True) if cells else ((), ())), marker="_", linestyle="", color="black")
+    _box(axes, trained, 0)
+    axes.set(ylabel="training in block", title="change of return by the block's training")
+
+
+def _values(matrix: Matrix) -> Values:
+    return [[math.nan if cell.value is None else cell.value for cell in row] for row in matrix]
+
+
+def _show(axes: Any, values: Values, colours: str, low: float, high: float) -> None:
+    """The cells, with a scale beside them; what has no value is grey."""
+    axes.set_facecolor("0.85")
+    image = axes.imshow(values or [[math.nan]], cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
+    axes.figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
+    axes.spines[:].set_visible(False)
+
+
+def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
+    """Names of tasks below, numbers of blocks beside."""
+    if len(labels) <= MOST_NAMES:
+        upright = 90 if len(labels) > MOST_NUMBERS else 30
+        place = {"rotation": upright, "ha": "center" if upright == 90 else "right", "rotation_mode": "default"}
+        axes.set_xticks(range(len(labels)), map(short, labels), **place)
+    else:
+        axes.set_xlabel("task, counted from 0")
+    step = 1 + rows // 20
+    axes.set_yticks(range(0, rows, step), range(first, first + rows, step))
+    axes.tick_params(length=0)
+
+
+def _write(axes: Any, matrix: Matrix, ink: Callable[[float], str], sign: str) -> None:
+    """Each mean in its cell, with its interval where there is room."""
+    tasks = len(matrix[0]) if matrix else 0
+    if tasks > MOST_NUMBERS:
+        return
+    for i, row in enumerate(matrix):
+        for j, cell in enumerate(row):
+            colour = "black" if cell.value is None else ink(cell.value)
+            words = "-" if cell.value is None else f"{cell.value:{sign}.2f}" if cell.value else "0"
+            if cell.low is not None and cell.high is not None and tasks <= MOST_INTERVALS:
+                words += f"\n[{cell.low:.2f}, {cell.high:.2f}]"
+            axes.text(j, i, words, ha="center", va="center", color=colour, fontsize=7 if "\n" not in words else 6)
+
+
+def _box(axes: Any, trained: Sequence[Sequence[int]], first: int) -> None:
+    """A frame around the tasks that a block trains."""
+    from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2.6, foreground="white")]
+    for row, tasks in enumerate(trained, first):
+        for task in tasks:
+            corner = task - 0.5, row - 0.5
+            axes.add_patch(Rectangle(corner, 1, 1, fill=False, linewidth=1.2, clip_on=False, path_effects=halo))

@@ -1,0 +1,247 @@
+"""The report itself: one page of HTML that needs nothing else, the same in Markdown, and tables in LaTeX."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl import __version__
+from ctgraph_rl.checks import require
+from ctgraph_rl.report import pictures
+from ctgraph_rl.report.heatmaps import MOST_NAMES
+from ctgraph_rl.report.pictures import Gallery, Written
+from ctgraph_rl.report.sections import Matrix, Result, Section, sections
+from ctgraph_rl.report.style import MOST_AGENTS, require_packages
+from ctgraph_rl.report.trees import Trees, find_trees
+from ctgraph_rl.results import LEGEND, MEANS, Page, Row, latex, latex_text, latex_value, markdown_text, pages, selected
+from ctgraph_rl.runs import Problem, Run, find_runs, flat
+from ctgraph_rl.statistics import Estimate
+
+MOST_ROWS = 2000
+"""Rows up to which the table of every measure is shown."""
+
+MOST_SENTENCES = 10
+"""Seeds without results that are told one by one."""
+
+MOST_COLUMNS = 10
+"""Tasks up to which a performance matrix is a table in LaTeX."""
+
+
+class Report(NamedTuple):
+    """What was made."""
+
+    page: Path
+    runs: list[Run]
+    problems: list[Problem]
+
+
+class Numbers(NamedTuple):
+    """A matrix as a table."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+class AgentPart(NamedTuple):
+    """What the page says of an agent."""
+
+    result: Result
+    figures: list[Written]
+    numbers: list[Numbers]
+    settings: list[tuple[str, Any]]
+    sentences: list[str]
+
+
+class Part(NamedTuple):
+    """What the page says of a curriculum."""
+
+    section: Section
+    facts: list[tuple[str, Any]]
+    figures: list[Written]
+    table: Page
+    everything: Page | None  # the table of every measure
+    agents: list[AgentPart]
+    unshown: int  # agents without figures
+    runs: list[tuple[str, ...]]
+    systems: list[tuple[str, int]]  # where the runs ran, and how many
+
+
+def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) -> Report:
+    """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
+
+    Args:
+        paths: run directories, or folders that hold them.
+        folder: where the report goes; None: ``report`` within the one path, or within the working directory.
+
+    Raises:
+        ModuleNotFoundError: before any work, without what the extra ``report`` installs.
+        ValueError: if there is no run that can be read.
+    """
+    require_packages()
+    runs, problems = find_runs(paths)
+    require((bool(runs), "; ".join(problem.reason for problem in problems)))
+    if folder is None:
+        folder = Path(paths[0]) / "report" if len(paths) == 1 else Path("report")
+    gallery = Gallery(Path(folder))
+    parts = [_part(section, gallery) for section in sections(runs)]
+    about = {
+        "title": _title(parts),
+        "parts": parts,
+        "problems": problems,
+        "legend": LEGEND,
+        "legend_of_means": MEANS,
+        "definitions": _definitions(parts),
+        "version": __version__,
+        "missing": [run for part in parts for run in part.section.runs if run.reason is not None],
+        "num_runs": len(runs),
+    }
+    page = Path(folder) / "report.html"
+    for name in ("report.html", "report.md"):
+        (Path(folder) / name).write_text(_rendered(name, about), encoding="utf-8")
+    (Path(folder) / "tables.tex").write_text(_latex(parts), encoding="utf-8")
+    return Report(page, runs, problems)
+
+
+def _rendered(name: str, about: Mapping[str, Any]) -> str:
+    from jinja2 import FileSystemLoader, StrictUndefined
+    from jinja2.sandbox import SandboxedEnvironment
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = SandboxedEnvironment(
+        loader=loader,
+        autoescape=name.endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["line"] = lambda value: markdown_text(str(value))
+    return environment.get_template(f"{name}.j2").render(about)
+
+
+def _title(parts: Sequence[Part]) -> str:
+    """The curriculum and the agents as far as they fit, else how many there are."""
+    agents = list(dict.fromkeys(agent.result.agent for part in parts for agent in part.agents))
+    who = ", ".join(agents) if len(agents) <= 3 else f"{len(agents)} agents"
+    where = parts[0].section.name if len(parts) == 1 else f"{len(parts)} curricula"
+    return f"{where}: {who}"
+
+
+def _part(section: Section, gallery: Gallery) -> Part:
+    names = (section.name,)
+    shown = selected(section.rows)
+    everything = next(pages(section.rows)) if len(section.rows) <= MOST_ROWS else None
+    return Part(
+        section,
+        list(_facts(section)),
+        gallery.write(names, pictures.of_section(section)),
+        next(pages(shown)),
+        everything,
+        [_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
+        max(0, len(section.results) - MOST_AGENTS),
+        [row for result in section.results for row in _runs(result)],
+        Counter(_system(run) for run in section.runs).most_common(),
+    )
+
+
+def _facts(section: Section) -> Iterator[tuple[str, Any]]:
+    """What was learned."""
+    about = section.one.about
+    yield "curriculum", about["curriculum"]
+    for name in ("version", "fingerprint", "source"):
+        yield name, about.get(name, "not said")
+    yield "tasks", len(section.labels)
+    yield "blocks", len(section.trained)
+    yield "frames", f"{section.ends[-1]:,}"
+    for group in ("curriculum", "evaluation", "protocol"):
+        given = about["config"].get(group)
+        for key, value in flat(given if isinstance(given, Mapping) else {}, f"{group}."):
+            if value is not None and not key.endswith("_target_"):
+                yield key, value
+
+
+def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
+    trees = find_trees(result.finished[0]) if result.finished else None
+    figures = gallery.write((section.name, result.agent), pictures.of_result(section, result, trees))
+    settings = list(result.runs[0].settings.items())
+    return AgentPart(result, figures, list(_numbers(section, result)), settings, list(_sentences(result, trees)))
+
+
+def _sentences(result: Result, trees: Trees | None) -> Iterator[str]:
+    """What is missing, and why."""
+    missing = [f"Seed {seed} has no run." for seed, run in result.by_seed.items() if run is None]
+    missing += [f"Seed {run.seed} has no results: {run.reason}." for run in result.runs if run.reason is not None]
+    yield from missing[:MOST_SENTENCES]
+    if len(missing) > MOST_SENTENCES:
+        yield f"{len(missing) - MOST_SENTENCES} more seeds have no results; the list of runs says why."
+    if trees is not None and trees.reason:
+        what = "Trees are" if trees.curriculum is None else "The policy on the trees is"
+        yield f"{what} missing: {trees.reason}."
+
+
+def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
+    """Both matrices with all intervals, where there are not too many tasks for a table."""
+    if not result.finished or len(section.labels) > MOST_NAMES:
+        return
+    tables = (("Mean return after each block", result.performance(), 0), ("Change by each block", result.transfer(), 1))
+    for title, matrix, first in tables:
+        yield Numbers(title, ("block", *section.labels), list(_cells(matrix, first, len(result.finished))))
+
+
+def _cells(matrix: Matrix, first: int, n: int) -> Iterator[tuple[str, ...]]:
+    for block, row in enumerate(matrix, first):
+        yield (str(block), *(_cell(estimate, n) for estimate in row))
+
+
+def _cell(estimate: Estimate, n: int) -> str:
+    """Value and interval, and n where it is not that of all cells."""
+    value, _, _ = str(estimate).partition(" n = ")
+    return value if estimate.n in (0, n) else f"{value} n = {estimate.n}"
+
+
+def _runs(result: Result) -> Iterator[tuple[str, ...]]:
+    """Agent, seed, state, frames, minutes and directory of each run."""
+    for seed, run in result.by_seed.items():
+        if run is None:
+            yield result.agent, str(seed), "no run", "", "", ""
+        else:
+            history = run.history
+            progress = (f"{history.ends[-1]:,}", f"{history.seconds / 60:.1f}") if history else ("", "")
+            yield result.agent, str(seed), run.reason or "finished", *progress, str(run.path)
+
+
+def _system(run: Run) -> str:
+    """Versions and hardware."""
+    versions = ", ".join(f"{name} {version}" for name, version in (run.about.get("versions") or {}).items())
+    threads, device = run.about.get("num_threads", "?"), run.about["config"].get("device", "not said")
+    machine = run.about.get("machine", "not said")
+    return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}"
+
+
+def _definitions(parts: Sequence[Part]) -> list[tuple[str, str, str, str]]:
+    """Measure, id, formula and source of every measure on the page."""
+    known = {which: meaning for part in parts for which, meaning in part.section.definitions().items()}
+    return [(name, which, formula, source) for which, (name, formula, source) in known.items()]
+
+
+def _latex(parts: Sequence[Part]) -> str:
+    """Tables for papers: the measures of each curriculum, and each agent's matrices."""
+    found = ["% needs \\usepackage{booktabs}"]
+    for part in parts:
+        rows: list[Row] = selected(part.section.rows)
+        found.append(latex(rows))
+        for agent in part.agents:
+            for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
+                caption = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n}): {numbers.title}; {MEANS}"
+                found.append(_latex_table(caption, numbers))
+    return "\n\n".join(found) + "\n"
+
+
+def _latex_table(caption: str, numbers: Numbers) -> str:
+    rows = [[*map(latex_text, numbers.head)], *([*map(latex_value, row)] for row in numbers.rows)]
+    lines = [" & ".join(row) + r" \\" for row in rows]
+    head = [r"\begin{table}", rf"\caption{{{latex_text(caption)}}}", rf"\begin{{tabular}}{{{'l' * len(numbers.head)}}}"]
+    tail = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+    return "\n".join([*head, r"\toprule", lines[0], r"\midrule", *lines[1:], *tail])

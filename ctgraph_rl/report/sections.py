@@ -1,0 +1,184 @@
+"""Runs as the sections of a report: one for each curriculum, and in it an agent with all its seeds.
+
+Numbers of different curricula are never put together. A seed without results has no value in any estimate, and counts
+as one that is missing: n = 9/10.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate, pairwise, zip_longest
+from typing import NamedTuple
+
+from ctgraph_rl.results import AT_END, Row, table
+from ctgraph_rl.runs import BySeed, Curve, History, Run, grouped
+from ctgraph_rl.statistics import Estimate, mean
+
+Matrix = list[list[Estimate]]
+"""Estimates over seeds, [blocks][tasks]."""
+
+
+class Point(NamedTuple):
+    """A place on a curve over seeds."""
+
+    frames: float
+    estimate: Estimate
+
+
+@dataclass(frozen=True)
+class Result:
+    """What an agent did on a curriculum.
+
+    Args:
+        agent: its name.
+        by_seed: its runs.
+    """
+
+    agent: str
+    by_seed: BySeed
+
+    @property
+    def runs(self) -> list[Run]:
+        """All that there are, finished or not."""
+        return [run for run in self.by_seed.values() if run is not None]
+
+    @property
+    def finished(self) -> list[Run]:
+        """Those with results, by seed."""
+        return [run for run in self.runs if run.reason is None]
+
+    @property
+    def n(self) -> str:
+        """Seeds with results, as ``9/10`` where others have none."""
+        all_there = len(self.finished) == len(self.by_seed)
+        return f"{len(self.finished)}" if all_there else f"{len(self.finished)}/{len(self.by_seed)}"
+
+    def performance(self) -> Matrix:
+        """Mean return on each task before training and after each block."""
+        return self._over_seeds([history.performance for history in _histories(self.finished)])
+
+    def transfer(self) -> Matrix:
+        """What each block's training did to each task: differences of successive rows of the performance matrix."""
+        return self._over_seeds([_differences(history.performance) for history in _histories(self.finished)])
+
+    def _over_seeds(self, matrices: Sequence[list[list[float]]]) -> Matrix:
+        missing = [None] * (len(self.by_seed) - len(matrices))
+        shape = max(map(len, matrices), default=0), max((len(row) for rows in matrices for row in rows), default=0)
+        return [
+            [mean([*(_at(rows, i, j) for rows in matrices), *missing]) for j in range(shape[1])]
+            for i in range(shape[0])
+        ]
+
+
+@dataclass(frozen=True)
+class Section:
+    """What happened on a curriculum.
+
+    Args:
+        name: the curriculum's, different from that of every other section.
+        results: an agent each.
+        rows: the table of measures.
+    """
+
+    name: str
+    results: tuple[Result, ...]
+    rows: list[Row]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All that there are, finished or not."""
+        return [run for result in self.results for run in result.runs]
+
+    @cached_property
+    def one(self) -> Run:
+        """The run that tells the section's facts: the first finished one, if there is one."""
+        return min(self.runs, key=lambda run: (run.reason is not None, run.history is None))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the tasks."""
+        return self.one.history.labels if self.one.history else ()
+
+    @property
+    def trained(self) -> tuple[tuple[int, ...], ...]:
+        """For each block the positions of its tasks."""
+        return self.one.history.trained if self.one.history else ()
+
+    @cached_property
+    def ends(self) -> tuple[int, ...]:
+        """Frames at the end of each block, 0 first; of a block that a run does not measure, as others say."""
+        every = [run.history.ends for run in self.runs if run.history is not None]
+        return tuple(accumulate((max(block) for block in zip_longest(*every, fillvalue=0)), max)) or (0,)
+
+    def definitions(self) -> dict[str, tuple[str, str, str]]:
+        """Formula and source of each measure in the table, by the id of its definition."""
+        known = {each.id: (each.formula, each.source) for each in AT_END.values()}
+        for run in self.runs:
+            for metric in run.metrics.values():
+                known[metric["definition"]] = (metric.get("formula", ""), metric.get("source", ""))
+        names = {row.definition: row.measure.split(" ")[0] for row in self.rows if row.definition}
+        return {which: (names[which], *known[which]) for which in names}
+
+
+def sections(runs: Sequence[Run]) -> list[Section]:
+    """A section for each curriculum, in the order of the runs."""
+    agents: dict[str, list[Result]] = {}
+    for (curriculum, agent), by_seed in grouped(runs).items():
+        agents.setdefault(curriculum, []).append(Result(agent, by_seed))
+    rows: dict[str, list[Row]] = {}
+    for row in table(runs):
+        rows.setdefault(row.curriculum, []).append(row)
+    return [Section(name, tuple(results), rows[name]) for name, results in agents.items()]
+
+
+def evaluation_curve(runs: Iterable[Run], label: str) -> list[Point]:
+    """Mean return on a task at all evaluations at which every run has a value."""
+    return over_seeds([history.evaluations.get(label, []) for history in _histories(runs)])
+
+
+def training_curve(runs: Iterable[Run], block: int, start: int, end: int, places: int) -> list[Point]:
+    """Return while training in a block, as means over equal stretches of frames in which every run has a value.
+
+    Args:
+        runs: of one agent.
+        block: the block, from 1.
+        start: frames before it.
+        end: frames at its end.
+        places: number of stretches.
+    """
+    curves = [_in_places(history.training.get(block, []), start, end, places) for history in _histories(runs)]
+    return over_seeds(curves)
+
+
+def over_seeds(curves: Sequence[Curve]) -> list[Point]:
+    """Means over curves, with intervals, where all have a value."""
+    values: dict[int, list[float]] = {}
+    for curve in curves:
+        for frames, value in dict(curve).items():
+            if not math.isnan(value):
+                values.setdefault(frames, []).append(value)
+    return [Point(frames, mean(some)) for frames, some in sorted(values.items()) if len(some) == len(curves)]
+
+
+def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
+    """Means of a curve over equal stretches, each at its last frame."""
+    width = max((end - start) / places, 1)
+    values: dict[int, list[float]] = {}
+    for frames, value in curve:
+        values.setdefault(math.ceil((frames - start) / width), []).append(value)
+    return [(min(round(start + place * width), end), math.fsum(some) / len(some)) for place, some in values.items()]
+
+
+def _histories(runs: Iterable[Run]) -> list[History]:
+    return [run.history for run in runs if run.history is not None]
+
+
+def _differences(rows: list[list[float]]) -> list[list[float]]:
+    return [[after - before for before, after in zip(*pair, strict=True)] for pair in pairwise(rows)]
+
+
+def _at(rows: list[list[float]], i: int, j: int) -> float | None:
+    return rows[i][j] if i < len(rows) and j < len(rows[i]) else None

@@ -1,0 +1,67 @@
+"""What all figures of the report share: one style, one colour and mark for each agent, and sizes in inches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+STYLE = Path(__file__).with_name("style.mplstyle")
+
+PACKAGES = ("matplotlib", "jinja2", "scipy")
+"""What the extra ``report`` installs."""
+
+WIDTH = 7.2
+"""Of a figure: a page's text in print."""
+
+MOST_AGENTS = 6
+"""Agents of a curriculum that figures show: the style has so many colours and marks."""
+
+LONGEST_NAME = 22
+"""Characters of a name in a figure."""
+
+
+def require_packages() -> None:
+    """Refuse before any work.
+
+    Raises:
+        ModuleNotFoundError: without one of `PACKAGES`; names the extra to install.
+    """
+    for name in PACKAGES:
+        try:
+            import_module(name)
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(f"the report needs {name}: pip install 'ctgraph_rl[report]'") from error
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Figures made and saved within have the report's style."""
+    from matplotlib import rc_context
+
+    with rc_context(fname=STYLE):
+        yield
+
+
+def agent_style(position: int) -> dict[str, Any]:
+    """Colour, line and mark of an agent's curve; needs `style`."""
+    from matplotlib import rcParams
+
+    cycle = rcParams["axes.prop_cycle"].by_key()
+    return {name: values[position % len(values)] for name, values in cycle.items()}
+
+
+def short(name: str) -> str:
+    """A name that fits into a figure: its middle is left out."""
+    half = LONGEST_NAME // 2
+    return name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
+
+
+def frames_axis(axes: Any) -> None:
+    """Ticks such as 50k and 1.5M."""
+    from matplotlib.ticker import EngFormatter
+
+    axes.locator_params(axis="x", nbins=4)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -1,0 +1,125 @@
+"""A run on the terminal: its performance matrix, a curve of blocks for each task, and its main metrics."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ctgraph_rl.runs import Curve, read_run
+
+ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
+WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
+"""Metrics that are shown; the others are in the file."""
+
+MOST_COLUMNS = 6
+"""Tasks that the performance matrix is printed for; more do not fit on a terminal."""
+
+BARS, ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-:=+*#"
+"""Heights of a curve's points, from the lowest value to the highest."""
+
+MOST_POINTS = 32
+"""Characters of a curve; more evaluations share them."""
+
+
+def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
+    """Print the performance matrix, the evaluation curves and the metrics of a finished run."""
+    console = Console() if console is None else console
+    bars = BARS if console.encoding.lower().startswith("utf") else ASCII_BARS
+    history = read_run(Path(run_dir)).history
+    curves = sparklines(history.evaluations, bars) if history is not None else {}
+    with open(Path(run_dir) / "performance.csv", newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file))
+    many = len(header) > 2 + MOST_COLUMNS
+    tables = [_task_table(run_dir, header, rows, curves)] if many else [_matrix(run_dir, header, rows), _curves(curves)]
+    for table in (*tables, metrics_table(run_dir)):
+        console.print(table)
+
+
+def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS) -> dict[str, str]:
+    """A line of text for each task: its mean return at all evaluations, in time order, on one scale for all tasks.
+
+    The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond `MOST_POINTS` share a place,
+    which shows their mean; one without a value is a space.
+    """
+    known = [value for curve in evaluations.values() for _, value in curve if not math.isnan(value)]
+    low, high = min([0.0, *known]), max([1.0, *known])
+
+    def bar(values: Sequence[float]) -> str:
+        there = [value for value in values if not math.isnan(value)]
+        return bars[round((fmean(there) - low) / (high - low) * (len(bars) - 1))] if there else " "
+
+    return {label: "".join(map(bar, _shared(curve))) for label, curve in evaluations.items()}
+
+
+def _shared(curve: Curve) -> list[list[float]]:
+    """The values of a curve in at most `MOST_POINTS` parts of nearly equal length."""
+    places = min(MOST_POINTS, len(curve))
+    cuts = [len(curve) * place // places for place in range(places + 1)]
+    return [[value for _, value in curve[start:end]] for start, end in pairwise(cuts)]
+
+
+def _matrix(run_dir: Path | str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """The performance matrix: mean return on each task after each block."""
+    table = Table(title=Text(f"{Path(run_dir).name}: mean return on each task after each block"))
+    for name in header:
+        table.add_column(Text(name), justify="right")
+    for block, frames, *values in rows:
+        table.add_row(block, f"{int(frames):,}", *(_shown(float(value)) for value in values))
+    return table
+
+
+def _curves(curves: Mapping[str, str]) -> Table:
+    table = Table()
+    for name in ("task", "mean return at every evaluation"):
+        table.add_column(name)
+    for label, curve in curves.items():
+        table.add_row(Text(label), Text(curve))
+    return table
+
+
+def _task_table(
+    run_dir: Path | str, header: Sequence[str], rows: Sequence[Sequence[str]], curves: Mapping[str, str]
+) -> Table:
+    """A line for each task: its return before training, the best one after a block, the last one, and its curve.
+
+    The block of a best that is not above 0 is left out: that is of no block.
+    """
+    where = f"performance.csv has it after each of {len(rows) - 1} blocks"
+    table = Table(title=Text(f"{Path(run_dir).name}: mean return on each task; {where}"))
+    for heading in ("task", "before", "best", "after block", "at the end", "curve"):
+        table.add_column(heading, justify="left" if heading in ("task", "curve") else "right")
+    for column, label in enumerate(header[2:], 2):
+        values = [float(row[column]) for row in rows]
+        known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
+        best, block = max(known, default=(math.nan, 0))
+        after = str(-block) if best > 0 else "-"
+        cells = (_shown(values[0]), _shown(best), after, _shown(values[-1]))
+        table.add_row(Text(label), *cells, Text(curves.get(label, "")))
+    return table
+
+
+def _shown(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.2f}"
+
+
+def metrics_table(run_dir: Path | str) -> Table:
+    """The main metrics with their definitions; an undefined one shows why. Those against experts only where defined."""
+    metrics: dict[str, dict[str, Any]] = json.loads((Path(run_dir) / "metrics.json").read_text(encoding="utf-8"))
+    table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
+    for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for name in (*ALWAYS, *(name for name in WITH_EXPERTS if metrics.get(name, {}).get("value") is not None)):
+        metric = metrics[name]
+        value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
+        table.add_row(name.replace("_", " "), value, Text(metric["undefined"] or metric["formula"]))
+    return table

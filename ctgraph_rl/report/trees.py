@@ -1,0 +1,83 @@
+"""The tasks' trees of an agent: goals, where one trained seed went, and what it does there."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ctgraph_rl.report.style import WIDTH, short
+from ctgraph_rl.runs import Run
+
+if TYPE_CHECKING:
+    from ctgraph_rl.curriculum import Curriculum
+    from ctgraph_rl.trained import Trained
+    from ctgraph_rl.visits import Visits
+
+MOST_TREES = 8
+COLUMNS = 2
+EPISODES = 100
+
+
+class Trees(NamedTuple):
+    """What can be drawn of a run."""
+
+    curriculum: Curriculum | None
+    trained: Trained | None
+    reason: str  # why the curriculum or the agent is missing; empty if it is not
+
+
+def draw_trees(trees: Trees, seed: int) -> Any:
+    """A panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
+    from matplotlib.figure import Figure
+
+    from ctgraph_rl.pictures import draw_task
+    from ctgraph_rl.visits import Visits
+
+    assert trees.curriculum is not None
+    tasks = list(zip(trees.curriculum.tasks, trees.curriculum.labels, strict=True))[:MOST_TREES]
+    columns = min(COLUMNS, len(tasks))
+    rows = math.ceil(len(tasks) / columns)
+    figure = Figure(figsize=(WIDTH, rows * max(_height(task.graph.depth) for task, _ in tasks)))
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (task, label) in zip(grid, tasks, strict=False):
+        seen = Visits({}, {}) if trees.trained is None else _visits(trees.trained, task, seed)
+        draw_task(axes, task, seen.counts, seen.actions, ids=False, legend=task is tasks[-1][0])
+        axes.set_title(f"{short(label)}\n{axes.get_title()}")
+    for axes in grid[len(tasks) :]:
+        axes.axis("off")
+    return figure
+
+
+def _height(depth: int) -> float:
+    """Inches that a tree's states need below each other to hold numbers."""
+    return min(0.4 * (2 * depth + 4), 5.0)
+
+
+def find_trees(run: Run) -> Trees:
+    """The agent and the curriculum of a run as far as its directory has them."""
+    from ctgraph_rl.curriculum import Curriculum
+    from ctgraph_rl.trained import load
+    from ctgraph_rl.train import AGENT, CURRICULUM
+
+    reason = f"{run.path} has no {AGENT}, the weights of its agent"
+    try:
+        if (run.path / AGENT).exists():
+            trained = load(run.path)
+            return Trees(trained.curriculum, trained, "")
+    except Exception as error:  # files of others fail in any way, and the report goes on
+        reason = " ".join(str(error).split()).rstrip(". ") or type(error).__name__
+    try:
+        return Trees(Curriculum.from_json(run.path / CURRICULUM), None, reason)
+    except (OSError, ValueError) as error:
+        return Trees(None, None, str(error))
+
+
+def _visits(trained: Trained, task: Any, seed: int) -> Visits:
+    from ctgraph_rl.visits import visits
+
+    agent, curriculum = trained.agent, trained.curriculum
+    at_boundaries = curriculum.protocol.task_id == "at_boundaries"
+    policy = agent.policy_for(curriculum.task_ids[task]) if at_boundaries else agent.policy
+    per_row = curriculum.evaluation.episodes_per_row
+    episodes = per_row * math.ceil(EPISODES / per_row)
+    return visits(task, policy, agent.initial_state, episodes, seed, True, per_row, curriculum)

@@ -1,0 +1,58 @@
+"""Runs that nobody ran: directories with the files of a run and made-up numbers, for tests of tables and reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ctgraph_rl import RunLog, metrics
+from ctgraph_rl.log import write_metrics, write_performance
+
+LABELS = ("goal1", "goal2")
+FRAMES = 1000
+"""Of each block."""
+
+
+def write_run(
+    path: Path,
+    *,
+    curriculum: tuple[str, str] = ("two", "f"),
+    agent: str = "PPO",
+    seed: int = 0,
+    performance: Sequence[Sequence[float]] = ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)),
+    labels: Sequence[str] = LABELS,
+    intervals: int = 2,
+    finished: bool = True,
+) -> Path:
+    """A run that trains each task in a block of its own.
+
+    Args:
+        path: a directory that does not exist.
+        curriculum: name and fingerprint.
+        agent: its class.
+        seed: of the run.
+        performance: mean return [blocks + 1][tasks].
+        labels: of the tasks.
+        intervals: of training in each block.
+        finished: whether it has metrics.
+    """
+    path.mkdir(parents=True)
+    trained = [(task,) for task in range(len(labels))]
+    log = RunLog(path / "run.jsonl")
+    about = {"schema": 1, "curriculum": curriculum[0], "fingerprint": curriculum[1], "version": 1, "source": "a test"}
+    system = {"versions": {"ctgraph_rl": "0.1.0"}, "machine": "x86_64", "num_threads": 1}
+    config = {"agent": {"_target_": f"baselines.made.{agent}", "gamma": 0.9}, "seed": seed, "device": "cpu"}
+    numbers = [[task + 1 for task in block] for block in trained]
+    log.append("run", **about, **system, tasks=list(labels), trained=numbers, config=config)
+    for block, row in enumerate(performance):
+        for interval in range(intervals if block else 0):
+            frames = (block - 1) * FRAMES + FRAMES * (interval + 1) // intervals
+            log.append("training", block=block, frames=frames, episodes=8, return_mean=row[block - 1])
+        where = {"moment": "after" if block else "before", "block": block, "frames": block * FRAMES, "held_out": False}
+        for task, (label, value) in enumerate(zip(labels, row, strict=True), 1):
+            log.append("evaluation", **where, task=task, label=label, return_mean=value, success_rate=value)
+    log.close()
+    if finished:
+        write_performance(path / "performance.csv", log, labels)
+        write_metrics(path / "metrics.json", metrics.of_matrix(log.performance(), trained))
+    return path
