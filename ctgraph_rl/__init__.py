@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.images import distances as distances
     from ctgraph_rl.lifelong import evaluate as evaluate
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
-    from ctgraph_rl.load import Trained as Trained
-    from ctgraph_rl.load import load as load
+    from ctgraph_rl.trained import Trained as Trained
+    from ctgraph_rl.trained import load as load
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
     from ctgraph_rl.recorder import Recorder as Recorder
@@ -67,12 +67,12 @@ _HOMES = {
     "StateType": "graph",
     "Steps": "fast",
     "Task": "task",
-    "Trained": "load",
+    "Trained": "trained",
     "count_repeats": "images",
     "distances": "images",
     "evaluate": "lifelong",
     "learn_curriculum": "lifelong",
-    "load": "load",
+    "load": "trained",
     "rollout": "fast",
 }
 

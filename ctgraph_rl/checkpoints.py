@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ctgraph_rl.checks import is_int
 from ctgraph_rl.files import PART, write_whole
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ KEPT = 2
 
 State = Mapping[str, Any]
 """What is saved: tensors and plain Python values, nested; ``frames`` is the number of frames of the run so far."""
+
+
+NOT_PLAIN = "a run can only be saved where the agent's state_dict() holds tensors and plain Python values"
 
 
 class BrokenCheckpoint(ValueError):
@@ -53,41 +57,49 @@ class Checkpoints:
         self, folder: Path | str, seconds: float = 300.0, strict: bool = False, interrupt: Interrupt | None = None
     ) -> None:
         self.folder, self.seconds, self.strict, self.interrupt = Path(folder), seconds, strict, interrupt
-        self._last = time.monotonic()
+        self._last: float | None = None
 
     def offer(self, state: Callable[[], State], at_block_end: bool) -> None:
         """Save if it is time, called after every update.
+
+        The first one is saved at once, so that a full disk, or a state that cannot be read back, stops a run early.
 
         Args:
             state: makes what is saved.
             at_block_end: always save.
         """
         stop = self.interrupt is not None and self.interrupt.is_asked
-        if stop or at_block_end or time.monotonic() - self._last >= self.seconds:
+        if stop or at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds:
             self.save(state())
         if stop:
             self.interrupt.exit()  # type: ignore[union-attr]
 
     def save(self, state: State) -> None:
-        """Write a checkpoint, then remove the oldest.
+        """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.
 
         Raises:
             OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
+            ValueError: if the first one cannot be read back, for it holds more than tensors and plain values.
         """
+        path, content = self.folder / f"{state['frames']:012d}.pt", encoded(state)
+        if self._last is None:
+            _require_plain(content)
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
-            write_whole(self.folder / f"{state['frames']:012d}.pt", encoded(state))
+            write_whole(path, content)
         except OSError as error:
             kept = self.files()
             last = f"the checkpoint after {_frames(kept[0]):,} frames is kept" if kept else "there is none before"
             raise OSError(error.errno, f"{error.strerror}; {last}. Make room, then run the same command") from error
         self._last = time.monotonic()
-        for old in self.files()[KEPT:]:
-            old.unlink(missing_ok=True)
+        files = self.files()
+        here = files.index(path)
+        for other in (*files[:here], *files[here + KEPT :]):
+            other.unlink(missing_ok=True)
 
     def files(self) -> list[Path]:
         """The checkpoints, newest first."""
-        return sorted(self.folder.glob("*.pt"), reverse=True)
+        return sorted((file for file in self.folder.glob("*.pt") if file.stem.isdecimal()), key=_frames, reverse=True)
 
     def newest(self) -> State | None:
         """The newest sound checkpoint, None without one; a broken one is warned of and left out.
@@ -116,16 +128,23 @@ class Checkpoints:
 
 
 def encoded(state: State) -> bytes:
-    """The bytes of a checkpoint."""
+    """The bytes of a checkpoint.
+
+    Raises:
+        ValueError: for what cannot be saved at all.
+    """
     buffer = io.BytesIO()
-    torch.save(dict(state), buffer)
+    try:
+        torch.save(dict(state), buffer)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(f"{NOT_PLAIN}: {error}") from error
     content = buffer.getvalue()
     header = {"format": FORMAT, "frames": state["frames"], "bytes": len(content), "sha256": _digest(content)}
     return json.dumps(header).encode() + b"\n" + content
 
 
 def decoded(path: Path) -> State:
-    """Read a checkpoint.
+    """Read a checkpoint, its tensors on the CPU.
 
     Raises:
         BrokenCheckpoint: if it is torn, changed, of another format, or holds more than tensors and plain values.
@@ -135,17 +154,39 @@ def decoded(path: Path) -> State:
     try:
         header = json.loads(head)
         version, expected = header["format"], (header["bytes"], header["sha256"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise BrokenCheckpoint(f"{path} is no checkpoint, or torn; {advice}") from None
     if version != FORMAT:
         raise BrokenCheckpoint(f"{path} has format {version}, this version reads {FORMAT}; overwrite=true starts anew")
     if (len(content), _digest(content)) != expected:
         raise BrokenCheckpoint(f"{path} is not what was written: {len(content)} of {expected[0]} bytes; {advice}")
     try:
-        return torch.load(io.BytesIO(content), weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-        message = f"{path} holds more than tensors and plain values, and is not read; {advice}"
-        raise BrokenCheckpoint(message) from error
+        state = read_plain(content)
+    except ValueError as error:
+        raise BrokenCheckpoint(f"{path} {error}, and is not read; {advice}") from error
+    if not (isinstance(state, dict) and is_int(state.get("frames"), 0)):
+        raise BrokenCheckpoint(f"{path} does not say after how many frames it was made; {advice}")
+    return state
+
+
+def read_plain(content: bytes) -> Any:
+    """What `torch.save` made of tensors and plain values, on the CPU; nothing else is made of it, and no code runs.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    try:
+        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # what a pickle that others made may raise is without end
+        raise ValueError("holds more than tensors and plain values, or is torn") from error
+
+
+def _require_plain(checkpoint: bytes) -> None:
+    """Refuse a state that could be written and never read."""
+    try:
+        read_plain(checkpoint.partition(b"\n")[2])
+    except ValueError as error:
+        raise ValueError(f"{NOT_PLAIN}: {error.__cause__}") from error
 
 
 def _digest(content: bytes) -> str:

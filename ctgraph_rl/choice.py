@@ -125,7 +125,7 @@ def _of_curriculum(curriculum: Curriculum, number: int) -> Choice:
 
 
 def _of_run(run: Path, number: int) -> Choice:
-    from ctgraph_rl.load import load
+    from ctgraph_rl.trained import load
 
     trained = load(run)
     agent, curriculum = trained.agent, trained.curriculum

@@ -65,7 +65,12 @@ def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
 
 
 def find_or_train(
-    curriculum: Curriculum, learn: Learn, folder: Path, settings: Mapping[str, Any], tell: Callable[[str], object]
+    curriculum: Curriculum,
+    learn: Learn,
+    folder: Path,
+    settings: Mapping[str, Any],
+    tell: Callable[[str], object],
+    waiting: Callable[[], object] = lambda: None,
 ) -> list[Expert]:
     """The experts of all tasks of a curriculum; those that the folder lacks are trained first.
 
@@ -75,6 +80,7 @@ def find_or_train(
         folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
         settings: all else that an expert's numbers depend on: agent, seed, versions.
         tell: is given a line about each expert.
+        waiting: called every half second while another process trains one that is needed here.
 
     Raises:
         ValueError: before any training, for a block with several tasks.
@@ -86,14 +92,14 @@ def find_or_train(
         state = "found in" if found else "learns into"
         tell(f"expert {expert.task} of {len(experts)}, {label}: {state} {expert.run_dir}")
         if not found:
-            _train(each, learn, expert.run_dir)
+            _train(each, learn, expert.run_dir, waiting)
     return experts
 
 
-def _train(curriculum: Curriculum, learn: Learn, run_dir: Path) -> None:
+def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callable[[], object]) -> None:
     """Train into the directory, alone; go on with what was begun there, wait for a process that is at it."""
     run_dir.mkdir(parents=True, exist_ok=True)
-    with locked(run_dir, wait=True):
+    with locked(run_dir, waiting):
         if not _is_trained(run_dir):
             learn(curriculum, run_dir)
 

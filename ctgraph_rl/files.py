@@ -6,17 +6,21 @@ import json
 import os
 import shutil
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO
+from typing import BinaryIO
 
 LOCK = ".lock"
 """The file in a directory that says who works there."""
 
 PART = ".part"
 """Ending of a file that is being written."""
+
+SECONDS_BETWEEN_ATTEMPTS = 0.5
+"""To get a lock that another process has."""
 
 
 def write_whole(path: Path | str, content: bytes) -> None:
@@ -60,17 +64,18 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path, wait: bool = False) -> Iterator[None]:
+def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
     """Work in a directory alone; the lock ends with the process, however that ends.
 
     Args:
         folder: an existing directory, on a file system with POSIX locks.
-        wait: wait for another process that works there, instead of failing.
+        waiting: called every half second while another process works there; None fails at once instead.
 
     Raises:
         BlockingIOError: if another process works there; names its host, number and start.
+        OSError: if the file system has no locks.
     """
-    file = _lock(folder / LOCK, wait)
+    file = _lock(folder / LOCK, waiting)
     try:
         yield
     finally:
@@ -78,27 +83,55 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
         file.close()
 
 
-def _lock(path: Path, wait: bool) -> IO[str]:
-    """The open and locked file; one that its last holder has removed meanwhile is left."""
+def _lock(path: Path, waiting: Callable[[], object] | None) -> BinaryIO:
+    """The open and locked file."""
+    while True:
+        file = path.open("ab+", buffering=0)
+        try:
+            if _is_locked(file):
+                if _is_still_there(file, path):
+                    return _signed(file)
+            elif waiting is None:
+                file.seek(0)
+                holder = file.read().decode(errors="replace") or "another process"
+                raise BlockingIOError(f"{path.parent} is in use by {holder}; wait for it, or stop it")
+            else:
+                waiting()
+                time.sleep(SECONDS_BETWEEN_ATTEMPTS)
+        except BaseException:
+            file.close()
+            raise
+        file.close()
+
+
+def _is_locked(file: BinaryIO) -> bool:
+    """Lock the file, unless another process has done so."""
     import fcntl
 
-    while True:
-        file = path.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.read() or "another process"
-            file.close()
-            message = f"{path.parent} is in use by {holder}; wait for it, or stop it"
-            raise BlockingIOError(message) from None
-        if path.exists() and path.stat().st_ino == os.fstat(file.fileno()).st_ino:
-            break
-        file.close()
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        message = f"{error.strerror}: {file.name} cannot be locked; keep runs on a file system with locks"
+        raise OSError(error.errno, message) from error
+    return True
+
+
+def _is_still_there(file: BinaryIO, path: Path) -> bool:
+    """Whether its last holder has not removed it between our opening and locking it."""
+    try:
+        return path.stat().st_ino == os.fstat(file.fileno()).st_ino
+    except FileNotFoundError:
+        return False
+
+
+def _signed(file: BinaryIO) -> BinaryIO:
+    """The file, in which we say who we are; on a full disk without, for only messages need it."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     file.truncate(0)
-    file.write(f"process {os.getpid()} on {socket.gethostname()} since {now}")
-    file.flush()
+    with suppress(OSError):
+        file.write(f"process {os.getpid()} on {socket.gethostname()} since {now}".encode())
     return file
 
 

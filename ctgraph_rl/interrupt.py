@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 from types import FrameType, TracebackType
@@ -17,7 +18,8 @@ class Interrupt:
     """While this context is entered, a signal to stop is kept for `exit` instead of acting at once.
 
     Where another library handles SIGUSR2 to put the job into the queue again (submitit), it does so after the save.
-    Outside the main thread, where Python allows no handlers, signals act as before.
+    Signals that are ignored, as in the background of a script, stay so. Outside the main thread, where Python allows no
+    handlers, signals act as before.
     """
 
     def __init__(self) -> None:
@@ -32,15 +34,19 @@ class Interrupt:
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
             numbers = [getattr(signal, name) for name in STOPPING if hasattr(signal, name)]
-            handled = [number for number in numbers if number != _requeuing() or callable(signal.getsignal(number))]
-            self._before = {number: signal.signal(number, self._ask) for number in handled}
+            self._before = {number: signal.signal(number, self._ask) for number in numbers if _acts(number)}
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._restore()
-        if self.is_asked and kind is None:
+        if kind is None:
+            self.check()
+
+    def check(self) -> None:
+        """Leave the process if it was asked to stop."""
+        if self.is_asked:
             self.exit()
 
     def exit(self) -> None:
@@ -49,7 +55,7 @@ class Interrupt:
         print("saved, the same command goes on from there", file=sys.stderr)
         requeue = self._before.get(_requeuing())
         self._restore()
-        if callable(requeue):
+        if callable(requeue) and not _is_being_ended():
             os.kill(os.getpid(), _requeuing())
         raise SystemExit(128 + self.signal)
 
@@ -63,6 +69,22 @@ class Interrupt:
         for number, before in self._before.items():
             if signal.getsignal(number) == self._ask:
                 signal.signal(number, before)
+
+
+def _acts(number: int) -> bool:
+    """Whether a signal would stop the process, or put its job into the queue again."""
+    before = signal.getsignal(number)
+    return callable(before) if number == _requeuing() else before not in (signal.SIG_IGN, None)
+
+
+def _is_being_ended() -> bool:
+    """Whether SLURM ends this process's job already: for good, as by ``scancel``, which a requeue would undo."""
+    command = ["scontrol", "show", "job", os.environ.get("SLURM_JOB_ID", "")]
+    try:
+        shown = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
 
 
 def _requeuing() -> int:

@@ -36,7 +36,11 @@ from torch import Tensor
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.files import cannot_write, write_whole
+from ctgraph_rl.measurement import check, parsed
 from ctgraph_rl.metrics import Curves, Regime
+
+MOST_CELLS = 10**7
+"""Largest table that is made of a log."""
 
 SCHEMA = 1
 """Raised when a line means something else than before; fields may be added without."""
@@ -84,9 +88,12 @@ class RunLog:
     def position(self) -> dict[str, float]:
         """How far the file is, in bytes that have reached the disk, and the time of the run, in seconds."""
         size = 0
-        if self._file is not None:
-            os.fsync(self._file.fileno())
+        if self._file is not None and self._path is not None:
             size = self._file.tell()
+            try:
+                os.fsync(self._file.fileno())
+            except OSError as error:
+                raise cannot_write(self._path, size, error) from error
         return {"bytes": size, "seconds": round(time.perf_counter() - self._start, 3)}
 
     def append(self, kind: str, **values: Any) -> None:
@@ -123,10 +130,15 @@ class RunLog:
         lines = Path(path).read_bytes().splitlines()
         for number, line in enumerate(lines, 1):
             try:
-                log.measurements.append(_measurement(line))
+                log.measurements.append(parsed(line))
             except ValueError:
                 require((number == len(lines), f"{path}: line {number} is no measurement; restore the file"))
                 log.torn_lines = 1
+        for number, measurement in enumerate(log.measurements, 1):
+            try:
+                check(measurement)
+            except ValueError as error:
+                raise ValueError(f"{path}: line {number}: {error}") from None
         for run in log.of_kind("run"):
             newer = run.get("schema", SCHEMA) > SCHEMA
             require(
@@ -242,14 +254,10 @@ class RunLog:
         trained = [number + 1 for block in self._said() for number in block]
         evaluated = [m["task"] for m in self._evaluations(during=True)]
         tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
+        rows = list(rows)
+        size = len(rows) * len(tasks)
+        require((size <= MOST_CELLS, f"a table of {len(rows):,} x {len(tasks):,} is no run's: restore the log"))
         return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
-
-
-def _measurement(line: bytes) -> dict[str, Any]:
-    measurement = json.loads(line)
-    if not (isinstance(measurement, dict) and "kind" in measurement):
-        raise ValueError(f"a measurement is an object with a kind, got {line!r}")
-    return measurement
 
 
 def _row(values: Sequence[float | None]) -> Tensor:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent
@@ -20,6 +21,7 @@ from ctgraph_rl.experts import Expert
 from ctgraph_rl.files import append_line, write_whole
 from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
 from ctgraph_rl.log import RunLog, write_metrics, write_performance
+from ctgraph_rl.params import require_memory
 from ctgraph_rl.progress import ProgressBar
 from ctgraph_rl.provenance import machine, provenance
 from ctgraph_rl.scores import scores
@@ -43,9 +45,9 @@ MEMBERS = (
 
 LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
 
-RESULTS = (LOG, "evaluations.csv", "training.csv", "performance.csv", METRICS, AGENT, CURRICULUM)
-"""What a run writes into its directory; ``metrics.json`` is there when the run is complete, ``curriculum.json`` where
-the curriculum has only parts of this package's classes."""
+RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
+"""What a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
+``curriculum.json`` where the curriculum has only parts of this package's classes."""
 
 CHECKPOINTS = "checkpoints"
 """The folder in a run's directory with what an unfinished run goes on from."""
@@ -67,6 +69,9 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     require(
         (not missing, f"{type(agent).__name__} is no agent, it lacks {', '.join(missing)}: see ctgraph_rl.agent.Agent")
     )
+    frames = agent.num_envs * agent.num_steps
+    batch = f"batches of num_envs={agent.num_envs} x num_steps={agent.num_steps} frames"
+    require_memory(batch, 2 * frames * env.observation_spec_unbatched["observation"].shape.numel(), "of either")
     agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
     return agent
@@ -82,6 +87,7 @@ def train(
     experts: Sequence[Expert] | None = None,
     checkpoints: Checkpoints | None = None,
     listeners: Sequence[Callable[[dict[str, Any]], object]] = (),
+    console: Console | None = None,
 ) -> None:
     """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
 
@@ -97,24 +103,26 @@ def train(
         experts: for each task, who learned it alone; they are named in the log.
         checkpoints: default: those in the directory, every five minutes.
         listeners: are called with every measurement.
+        console: where progress shows; default: standard error.
 
     Raises:
         ValueError: if the directory holds a run that cannot be gone on with.
     """
     agent = new_agent(curriculum, make_agent, seed, device)
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
+    checkpoints.tidy()
     saved = checkpoints.newest()
     about = provenance(curriculum)
     log = _new_log(run_dir) if saved is None else _resumed_log(run_dir, saved, about, checkpoints.strict)
     log.listeners.extend(listeners)
     if saved is None:
+        log.append("run", **about, config=config)
         with suppress(ValueError):  # parts of a user's own classes have no JSON
             curriculum.to_json(run_dir / CURRICULUM)
-        log.append("run", **about, config=config)
         if experts is not None:
             log.append("experts", experts=[expert.about for expert in experts])
     done = 0 if saved is None else saved["frames"]
-    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, done=done) as progress:
+    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
         learn_curriculum(curriculum, agent, seed, log, progress, device, saved, checkpoints.offer)
     log.close()
     weights = io.BytesIO()
@@ -129,9 +137,14 @@ def train(
 
 def _new_log(run_dir: Path) -> RunLog:
     """A log in place of what a run left that was stopped before its first checkpoint."""
-    for name in RESULTS:
-        (run_dir / name).unlink(missing_ok=True)
+    remove_results(run_dir)
     return RunLog(run_dir / LOG)
+
+
+def remove_results(run_dir: Path) -> None:
+    """Remove what a run left: first what says that it is complete, last what says that there was one."""
+    for name in (*reversed(RESULTS[1:]), RESTARTS, LOG):
+        (run_dir / name).unlink(missing_ok=True)
 
 
 def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
@@ -140,14 +153,17 @@ def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: 
     Raises:
         ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.
     """
-    log = RunLog.resume(run_dir / LOG, saved["log"])
-    before = log.of_kind("run")[0]
-    other = {
-        key: [before[key], about[key]] for key in ("versions", "machine", "num_threads") if before[key] != about[key]
-    }
+    path = run_dir / LOG
+    runs = RunLog.read(path).of_kind("run") if path.exists() else []
+    require((bool(runs), f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"))
+    before, same = runs[0], ("versions", "machine", "num_threads")
+    changed = f"{run_dir} was begun with another curriculum of this name, whose code has changed: overwrite=true"
+    require((before.get("fingerprint") == about["fingerprint"], changed))
+    other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
     message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
     require((not (strict and other), f"{message}; resume=warn goes on"))
     if other:
         warnings.warn(message, stacklevel=2)
+    log = RunLog.resume(path, saved["log"])
     append_line(run_dir / RESTARTS, {"frames": saved["frames"], "versions": about["versions"], **machine()})
     return log

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,3 +62,15 @@ def small_agent(build_agent: Callable[..., Any]) -> Callable[..., Any]:
 def checkout() -> Path:
     """The folder with the packages."""
     return Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def console_script(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets other processes find ``ctgraph-rl``, as this checkout has it, and use one thread."""
+    script = tmp_path / "bin" / "ctgraph-rl"
+    script.parent.mkdir()
+    script.write_text(f"#!{sys.executable}\nfrom ctgraph_rl.cli import main\n\nmain()\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(script.parent), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(checkout))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
 from test_lifelong import ONE, TWO
 from test_run import command_line
 
-from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
-from ctgraph_rl.experts import expert_curriculum, find_or_train
+from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, files
+from ctgraph_rl.checkpoints import Checkpoints
+from ctgraph_rl.experts import _key, expert_curriculum, find_or_train
 from ctgraph_rl.provenance import versions
 from ctgraph_rl.run import run, train_experts
 
@@ -80,15 +82,24 @@ def test_another_seed_evaluation_or_budget_is_another_expert(tmp_path, change):
     assert len(trained) == 2
 
 
-def test_an_expert_that_fails_leaves_nothing(tmp_path):
-    def fail(alone, run_dir):
+def test_an_expert_that_was_stopped_is_gone_on_with(tmp_path):
+    begun = []
+
+    def stop(alone, run_dir):
+        begun.append(run_dir)
         (run_dir / "run.jsonl").write_text("half")
-        raise FloatingPointError("NaN")
+        raise KeyboardInterrupt
 
-    with pytest.raises(FloatingPointError):
-        find_or_train(curriculum(), fail, tmp_path, SETTINGS, print)
+    def go_on(alone, run_dir):
+        assert (run_dir / "run.jsonl").read_text() == "half"
+        (run_dir / "metrics.json").write_text("{}")
 
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(KeyboardInterrupt):
+        find_or_train(curriculum(Block(ONE, 12)), stop, tmp_path, SETTINGS, print)
+    (expert,) = find_or_train(curriculum(Block(ONE, 12)), go_on, tmp_path, SETTINGS, print)
+
+    assert begun == [expert.run_dir]
+    assert sorted(path.name for path in expert.run_dir.iterdir()) == ["metrics.json", "run.jsonl"]
 
 
 def test_a_run_trains_its_experts_and_says_which_it_used(monkeypatch, capsys, tmp_path):
@@ -114,17 +125,27 @@ def test_a_run_trains_its_experts_and_says_which_it_used(monkeypatch, capsys, tm
     assert transfer["undefined"] is None or "the expert leaves nothing" in transfer["undefined"]
 
 
-def test_another_process_that_was_faster_is_left_alone(tmp_path):
-    def learn_second(alone, run_dir):
-        first = tmp_path / run_dir.name[1:].rpartition("-")[0]
-        first.mkdir()
-        (first / "metrics.json").write_text("first")
-        (run_dir / "metrics.json").write_text("second")
+def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "SECONDS_BETWEEN_ATTEMPTS", 0.01)
+    alone = expert_curriculum(curriculum(Block(ONE, 12)), ONE)
+    run_dir = tmp_path / _key(alone, SETTINGS)
+    run_dir.mkdir()
+    waited = []
 
-    (expert,) = find_or_train(curriculum(Block(ONE, 12)), learn_second, tmp_path, SETTINGS, print)
+    with ExitStack() as other:
+        other.enter_context(files.locked(run_dir))
 
-    assert (expert.run_dir / "metrics.json").read_text() == "first"
-    assert list(tmp_path.iterdir()) == [expert.run_dir]
+        def waiting():
+            waited.append(1)
+            if len(waited) == 3:
+                (run_dir / "metrics.json").write_text("theirs")
+                other.close()
+
+        learn = lambda *_: pytest.fail("trained twice")  # noqa: E731
+        (expert,) = find_or_train(curriculum(Block(ONE, 12)), learn, tmp_path, SETTINGS, print, waiting)
+
+    assert len(waited) == 3
+    assert (expert.run_dir / "metrics.json").read_text() == "theirs"
 
 
 def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch):
@@ -132,7 +153,7 @@ def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, mo
     monkeypatch.setattr("ctgraph_rl.experts.find_or_train", lambda *arguments: asked.append(arguments[3]))
 
     cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3")
-    train_experts(cfg, curriculum())
+    train_experts(cfg, curriculum(), Checkpoints)
 
     agent = {**asked[0].pop("agent")}
     assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -65,7 +66,7 @@ def test_a_run_writes_its_results_and_nothing_else(finished):
     hydra_files = {".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"}
 
     tables = {"evaluations.csv", "training.csv", "performance.csv"}
-    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "agent.pt"}
+    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "agent.pt", "curriculum.json"}
     assert files_in(finished) == {f"out/{name}" for name in {*hydra_files, *RESULTS}}
 
 
@@ -151,31 +152,69 @@ def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, mon
     assert {name: (copy_of / name).read_bytes() for name in RESULTS} == before
 
 
+@pytest.mark.parametrize("finished_too", [True, False])
 @pytest.mark.parametrize(
-    ("override", "different"),
+    ("override", "difference"),
     [
-        ("seed=1", "seed"),
-        ("agent.gamma=0.9", "agent"),
-        ("curriculum.image_seed=2", "curriculum"),
-        ("agent=dqn", "agent"),
+        ("seed=1", "seed=0 instead of 1;"),
+        ("agent.gamma=0.9", "agent.gamma=0.99 instead of 0.9;"),
+        ("curriculum.image_seed=2", "curriculum.image_seed=1 instead of 2;"),
+        (
+            "agent=dqn",
+            "agent._target_='baselines.lstm_ppo.LSTMPPO' instead of 'baselines.dqn.DQN', agent.annealing_num_steps=",
+        ),
     ],
 )
-def test_another_configuration_is_refused_in_the_directory_of_a_run(copy_of, compose, override, different):
-    before = (copy_of / "run.jsonl").read_bytes()
+def test_another_configuration_is_refused_in_the_directory_of_a_run_and_the_difference_shown(
+    copy_of, compose, override, difference, finished_too
+):
+    if not finished_too:
+        (copy_of / "metrics.json").unlink()
+    before = {path: path.read_bytes() for path in copy_of.rglob("*") if path.is_file()}
 
-    with pytest.raises(FileExistsError, match=f"holds a run with another {different}; .*overwrite=true"):
+    with pytest.raises(FileExistsError, match=f"holds a run with {re.escape(difference)}") as error:
         run(compose(override, *SHORT), copy_of)
 
-    assert (copy_of / "run.jsonl").read_bytes() == before
+    assert str(error.value).endswith("; choose another hydra.run.dir, or overwrite=true to replace it")
+    assert {path: path.read_bytes() for path in copy_of.rglob("*") if path.is_file()} == before
 
 
-def test_an_unfinished_run_is_refused_and_kept(copy_of, compose):
+@pytest.mark.parametrize("override", ["resume=strict", "checkpoint_seconds=7", "experts_dir=elsewhere"])
+def test_settings_that_change_no_results_are_no_other_configuration(copy_of, compose, override, capsys):
+    run(compose(override, *SHORT), copy_of)
+
+    assert "this configuration was run before" in capsys.readouterr().out
+
+
+def test_a_run_that_was_stopped_before_its_first_checkpoint_starts_anew(copy_of, compose, finished):
     (copy_of / "metrics.json").unlink()
+    (copy_of / "run.jsonl").write_bytes((copy_of / "run.jsonl").read_bytes()[:-40])
+    for name in ("restarts.jsonl", "failed.txt"):
+        (copy_of / name).write_text("{}")
 
-    with pytest.raises(FileExistsError, match=r"holds an unfinished run; .*overwrite=true"):
-        run(compose(*SHORT), copy_of)
+    run(compose(*SHORT), copy_of)
 
-    assert (copy_of / "run.jsonl").exists()
+    assert measured(copy_of) == measured(finished / "out")
+    assert not (copy_of / "restarts.jsonl").exists() and not (copy_of / "failed.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["agent.pt", "performance.csv", "run.jsonl"])
+def test_files_of_no_run_are_not_replaced(compose, tmp_path, name):
+    (tmp_path / name).write_text('{"kind": "mine"}\n')
+
+    with pytest.raises(FileExistsError, match=f"holds {name}, which are of no run; .* overwrite=true to replace them"):
+        run(compose(*SHORT), tmp_path)
+
+    assert (tmp_path / name).read_text() == '{"kind": "mine"}\n'
+
+
+def test_what_a_kill_at_the_very_end_left_is_removed(copy_of, compose):
+    (copy_of / "checkpoints").mkdir()
+    (copy_of / "checkpoints" / "000000004096.pt").write_bytes(b"half removed")
+
+    run(compose(*SHORT), copy_of)
+
+    assert not (copy_of / "checkpoints").exists()
 
 
 def test_overwrite_replaces_a_run(copy_of, compose):
@@ -286,7 +325,24 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_block_and_loss(monkey
 
     error = capsys.readouterr().err
     assert code == 1
-    assert "weight is nan in block 1 after 512 frames" in error and "Traceback" not in error
+    (said,) = re.findall(r"error: (\w+ is nan in block 1 after 512 frames; the run stops here)", error)
+    (mark,) = tmp_path.rglob("failed.txt")
+    assert mark.read_text() == f"FloatingPointError: {said}\n" and "Traceback" not in error
+
+
+def test_a_full_disk_is_one_message_with_sizes_after_the_first_update(monkeypatch, capsys, tmp_path):
+    def full(number):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("ctgraph_rl.files.os.fsync", full)
+        code = command_line(monkeypatch, *SHORT, "hydra.run.dir=out")
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert re.search(r"No space left on device: cannot write 0\.0 MB to .*run\.jsonl, [\d.]+ MB are free\n", error)
+    assert "No space left on device: cannot write" in Path("out/failed.txt").read_text()
 
 
 def test_a_refused_configuration_does_not_change_what_is_recorded_of_a_run(finished, monkeypatch, tmp_path):

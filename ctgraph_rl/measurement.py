@@ -1,0 +1,94 @@
+"""A measurement: one line of a run's log, read without trust in who wrote it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ctgraph_rl.checks import is_int, is_real, require
+
+MOST = 10**6
+"""Largest number of a block or task: tables are as long."""
+
+MOST_FRAMES = 2**63 - 1
+
+MAX_NESTING = 32
+"""Most objects and lists within each other; a configuration has 5 or so."""
+
+
+def _is_number(value: object) -> bool:
+    return value is None or is_real(value)
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, list) and all(map(_is_text, value))
+
+
+def _are_blocks(value: object) -> bool:
+    """Whether it lists for each block the numbers of its tasks."""
+    blocks = value if isinstance(value, list) else [None]
+    return all(isinstance(block, list) and block and all(is_int(task, 1, MOST) for task in block) for block in blocks)
+
+
+RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "kind": (_is_text, "a text"),
+    "schema": (is_int, "an integer"),
+    "config": (lambda value: value is None or isinstance(value, Mapping), "an object"),
+    "trained": (_are_blocks, f"lists of numbers of tasks in 1..{MOST:,}"),
+    "tasks": (_are_texts, "a list of texts"),
+    "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
+    "task": (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}"),
+    "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),
+    "held_out": (lambda value: isinstance(value, bool), "true or false"),
+    **dict.fromkeys(("moment", "label"), (_is_text, "a text")),
+    **dict.fromkeys(
+        ("seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"), (_is_number, "a number")
+    ),
+}
+"""What a field must be where it is there."""
+
+NEEDED = {"training": ("block", "frames"), "evaluation": ("block", "frames", "task", "return_mean")}
+"""Fields of the kinds that tables are made of."""
+
+
+def parsed(line: bytes) -> dict[str, Any]:
+    """The object of a line.
+
+    Raises:
+        ValueError: for what is no object with a ``kind``, as the torn last line of a run that was killed.
+    """
+    try:
+        measurement = json.loads(line)
+    except RecursionError:
+        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
+    if not (isinstance(measurement, dict) and "kind" in measurement):
+        raise ValueError(f"a measurement is an object with a kind, got {line!r:.80}")
+    return measurement
+
+
+def check(measurement: Mapping[str, Any]) -> None:
+    """Refuse a measurement that is none of ours.
+
+    Raises:
+        ValueError: for a missing field, one of another type, and a number that tables have no room for.
+    """
+    kind = measurement["kind"]
+    rules = [(RULES[name], name, value) for name, value in measurement.items() if name in RULES]
+    missing = [name for name in NEEDED.get(kind if isinstance(kind, str) else "", ()) if name not in measurement]
+    require(
+        *((holds(value), f"{name} must be {what}, got {value!r:.80}") for (holds, what), name, value in rules),
+        (not missing, f"{', '.join(missing)} must be there"),
+        (_is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
+    )
+
+
+def _is_shallow(value: Any, levels: int) -> bool:
+    if not isinstance(value, (dict, list)):
+        return True
+    items = value.values() if isinstance(value, dict) else value
+    return levels > 0 and all(_is_shallow(item, levels - 1) for item in items)

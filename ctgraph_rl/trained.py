@@ -1,0 +1,131 @@
+"""A run's trained agent, given back from its directory; no code of the directory is ever run."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checkpoints import Checkpoints, read_plain
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.log import RunLog
+from ctgraph_rl.train import AGENT, CHECKPOINTS, CURRICULUM, LOG, MakeAgent, new_agent
+
+OURS = re.compile(r"baselines\.(\w+)\.(\w+)")
+"""Names of agents that a directory may name; others are named by who loads it."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a run left.
+
+    ``evaluate(trained.agent.policy, trained.curriculum.tasks, initial_state=trained.agent.initial_state)`` of this
+    package plays it, ``learn_curriculum(another, trained.agent)`` lets it learn on.
+    """
+
+    agent: Agent
+    curriculum: Curriculum
+    seed: int
+    frames: int  # that it has learned from
+    log: RunLog
+
+
+def load(
+    run_dir: Path | str,
+    make_agent: MakeAgent | None = None,
+    curriculum: Curriculum | None = None,
+    device: torch.device | str = "cpu",
+) -> Trained:
+    """The trained agent of a run, finished or not, with all that it needs to play on or learn on.
+
+    Args:
+        run_dir: the directory.
+        make_agent: builds the agent from the environment's unbatched observation and action specs; needed where its
+            class is not one of the baselines, such as ``partial(MyAgent, **settings)``.
+        curriculum: needed where the run's has parts of classes that are not this package's.
+        device: where the agent shall live.
+
+    Raises:
+        FileNotFoundError: if there is no run, or none that has been saved.
+        ValueError: for an agent or a curriculum that must be given, and files that do not belong together.
+    """
+    run_dir = Path(run_dir)
+    if not (run_dir / LOG).exists():
+        raise FileNotFoundError(f"{run_dir} holds no run: there is no {LOG}")
+    log = RunLog.read(run_dir / LOG)
+    runs = log.of_kind("run")
+    require((bool(runs), f"{run_dir / LOG} has no first line of a run; it was stopped before it began"))
+    learned = _curriculum(run_dir, curriculum, runs[0].get("fingerprint"))
+    config = runs[0].get("config") or {}
+    seed = config.get("seed", 0)
+    require((is_int(seed, 0, 2**63 - 1), f"{run_dir / LOG} has no seed: seed must be in [0, 2**63), got {seed!r:.80}"))
+    build = _builder(run_dir, config.get("agent")) if make_agent is None else make_agent
+    weights, frames = _weights(run_dir, log)
+    try:
+        with torch.random.fork_rng():
+            agent = new_agent(learned, build, seed, device)
+        agent.load_state_dict(weights)
+    except (RuntimeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{run_dir} holds weights that are not of the agent that was built: {error}") from error
+    return Trained(agent, learned, seed, frames, log)
+
+
+def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Curriculum:
+    """The run's curriculum, from its directory if it is not given."""
+    path = run_dir / CURRICULUM
+    there = given is not None or path.exists()
+    require((there, f"{run_dir} has no {CURRICULUM}, as of classes that are not ours: give load(..., curriculum=)"))
+    found = Curriculum.from_json(path) if given is None else given
+    same = found.fingerprint == fingerprint
+    require((same, f"{run_dir} learned a curriculum with fingerprint {fingerprint}, this one has {found.fingerprint}"))
+    return found
+
+
+def _builder(run_dir: Path, settings: Any) -> MakeAgent:
+    """Builds the baseline that a configuration names; only classes that are defined in ``baselines`` are."""
+    settings = settings if isinstance(settings, Mapping) else {}
+    name = str(settings.get("_target_"))
+    ours = OURS.fullmatch(name)
+    if ours is None:
+        raise ValueError(f"{run_dir} is of the agent {name:.80}, no baseline: give load(..., make_agent=)")
+    kind = None
+    if find_spec(f"baselines.{ours[1]}") is not None:
+        module = import_module(f"baselines.{ours[1]}")
+        kind = getattr(module, ours[2], None)
+    defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == module.__name__
+    require((defined, f"{run_dir} names the agent {name}, and there is no such class; give load(..., make_agent=)"))
+    own = {key: value for key, value in settings.items() if key != "_target_"}
+    return lambda observation_spec, action_spec: kind(observation_spec, action_spec, **own)  # type: ignore[misc]
+
+
+def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
+    """The agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
+    if (run_dir / AGENT).exists():
+        return _checked(run_dir / AGENT), log.ends()[-1]
+    saved = Checkpoints(run_dir / CHECKPOINTS).newest()
+    if saved is None:
+        raise FileNotFoundError(f"{run_dir} has neither {AGENT} nor a checkpoint: the run was stopped before its first")
+    require(("agent" in saved, f"{run_dir / CHECKPOINTS} holds a checkpoint without an agent"))
+    return saved["agent"], saved["frames"]
+
+
+def _checked(path: Path) -> Any:
+    """What a file of `torch.save` holds, if its own sums agree and it is plain."""
+    content = path.read_bytes()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as records:
+            changed = records.testzip()
+        require((changed is None, f"{changed} in it is not what was written"))
+        return read_plain(content)
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read: {error}; restore it, or run again with overwrite=true") from error

@@ -1,0 +1,198 @@
+"""Files that are whole or not there, and a lock that ends with its process."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from ctgraph_rl import files
+from ctgraph_rl.files import LOCK, locked, write_whole
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from ctgraph_rl.files import locked
+with locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path, checkout):
+    """Another process that works in the folder."""
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+    process = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True, env=env)
+    assert process.stdout is not None and process.stdout.readline() == "locked\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_a_file_is_written_and_nothing_else_is_left(tmp_path):
+    write_whole(tmp_path / "file", b"old")
+    write_whole(tmp_path / "file", b"new")
+
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("file", b"new")]
+
+
+@pytest.mark.parametrize("step", ["os.fsync", "Path.replace"])
+def test_a_failure_at_any_step_keeps_the_old_content_and_removes_the_half(tmp_path, monkeypatch, step):
+    write_whole(tmp_path / "file", b"old")
+
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(f"ctgraph_rl.files.{step}", fail)
+    with pytest.raises(OSError, match=r"No space left on device: cannot write 2\.0 MB to .*file, [\d.]+ MB are free"):
+        write_whole(tmp_path / "file", bytes(2_000_000))
+
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("file", b"old")]
+
+
+def test_a_kill_between_any_two_steps_keeps_the_old_content_or_has_the_new(tmp_path, monkeypatch):
+    steps, found = ["fsync", "replace", "folder"], []
+
+    class Killed(BaseException):
+        pass
+
+    def kill(*_):
+        raise Killed
+
+    for step in steps:
+        with monkeypatch.context() as patch:
+            write_whole(tmp_path / "file", b"old")
+            names = {"fsync": "os.fsync", "replace": "Path.replace", "folder": "_sync_folder"}
+            patch.setattr(f"ctgraph_rl.files.{names[step]}", kill)
+            with pytest.raises(Killed):
+                write_whole(tmp_path / "file", b"new")
+            found.append((tmp_path / "file").read_bytes())
+
+    assert found == [b"old", b"old", b"new"]
+
+
+def test_content_and_folder_reach_the_disk_before_it_returns(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(
+        "ctgraph_rl.files.os.fsync", lambda number: synced.append(os.readlink(f"/proc/self/fd/{number}"))
+    )
+
+    write_whole(tmp_path / "file", b"new")
+
+    assert synced == [str(tmp_path / "file.part"), str(tmp_path)]
+
+
+def test_a_second_process_is_refused_at_once_and_told_who_is_there(tmp_path, holder):
+    said = rf"{tmp_path} is in use by process {holder.pid} on \S+ since 2.*; wait for it, or stop it"
+    with pytest.raises(BlockingIOError, match=said), locked(tmp_path):
+        pytest.fail("two at once")
+
+
+def test_the_lock_of_a_killed_process_is_free(tmp_path, holder):
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    assert (tmp_path / LOCK).exists()
+
+    with locked(tmp_path):
+        assert f"process {os.getpid()} on" in (tmp_path / LOCK).read_text()
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_waits_is_called_meanwhile_and_gets_the_lock(tmp_path, holder, monkeypatch):
+    monkeypatch.setattr(files, "SECONDS_BETWEEN_ATTEMPTS", 0.01)
+    calls = []
+
+    def waiting():
+        calls.append(1)
+        if len(calls) == 3:
+            holder.kill()
+            holder.wait()
+
+    with locked(tmp_path, waiting):
+        pass
+
+    assert len(calls) == 3
+
+
+def test_who_is_asked_to_stop_while_waiting_stops(tmp_path, holder):
+    def waiting():
+        raise SystemExit(143)
+
+    with pytest.raises(SystemExit), locked(tmp_path, waiting):
+        pytest.fail("two at once")
+
+
+def test_a_lock_file_that_its_holder_removed_before_we_locked_it_is_left_for_a_new_one(tmp_path, monkeypatch):
+    is_locked, opened = files._is_locked, []
+
+    def removed_first(file):
+        opened.append(file)
+        if len(opened) == 1:
+            (tmp_path / LOCK).unlink()
+        return is_locked(file)
+
+    monkeypatch.setattr(files, "_is_locked", removed_first)
+    with locked(tmp_path):
+        assert (tmp_path / LOCK).exists()
+
+    assert len(opened) == 2
+
+
+def test_of_many_threads_one_at_a_time_works_in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "SECONDS_BETWEEN_ATTEMPTS", 0.001)
+    inside, most = [], []
+
+    def work():
+        for _ in range(10):
+            with locked(tmp_path, lambda: None):
+                inside.append(1)
+                most.append(len(inside))
+                inside.pop()
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert most == [1] * 40
+
+
+def test_the_lock_ends_with_an_error(tmp_path):
+    with pytest.raises(ZeroDivisionError), locked(tmp_path):
+        _ = 1 / 0
+
+    with locked(tmp_path):
+        pass
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+
+    with (
+        pytest.raises(OSError, match=r"No locks available: .*\.lock cannot be locked; keep runs on a file system with"),
+        locked(tmp_path),
+    ):
+        pytest.fail("no lock")
+
+
+def test_a_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
+    def read_only(self, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(self))
+
+    monkeypatch.setattr(Path, "open", read_only)
+
+    with pytest.raises(OSError, match=rf"Read-only file system: '{tmp_path}"), locked(tmp_path):
+        pytest.fail("no lock")
