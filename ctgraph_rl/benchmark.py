@@ -36,7 +36,7 @@ from ctgraph_rl.paper import ct_co_b1, ct_su_b1
 from ctgraph_rl.rows import Rows
 from ctgraph_rl.task import Task
 
-MEMCPY, TRIVIAL = "memcpy", "trivial environment: "
+MEMCPY, TRIVIAL, LEAN = "memcpy", "trivial environment: ", ", info=False"
 MAX_BUFFER = 2**26
 """Bytes of observations in the buffers: beyond the caches."""
 
@@ -170,6 +170,7 @@ def _torchrl(
         trust_policy=True,
         use_buffers=False,
         track_traj_ids=False,
+        return_same_td=True,  # without buffers: the batch itself, a new one each time, instead of a copy
         auto_register_policy_transforms=True,
     )
     batches = iter(collector)
@@ -249,8 +250,9 @@ def contenders(num_rows: list[int], names: list[str], with_compiled: bool) -> li
             task = tasks[name]
             add(name, n, _fast(task, n, ways))
             for compiled in ways:
-                make = partial(CTGraphEnv, [task] * n, check_actions=False, compiled=compiled)
-                add(name, n, _torchrl(make, suffix=_suffix(compiled)))
+                for info, suffix in ((True, ""), (False, LEAN)):
+                    make = partial(CTGraphEnv, [task] * n, check_actions=False, compiled=compiled, info=info)
+                    add(name, n, _torchrl(make, suffix=suffix + _suffix(compiled)))
                 add(name, n, _gymnasium(task, n, compiled))
     add("", 1, _authors())
     return found
@@ -264,7 +266,7 @@ def table(measured: list[Contender]) -> str:
         speed = statistics.median(one.speeds)
         spread = (max(one.speeds) - min(one.speeds)) / speed / 2
         yardstick = median.get((one.num_rows, "", MEMCPY))
-        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(_suffix(True))))
+        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(_suffix(True)).removesuffix(LEAN)))
         cells = [
             f"{one.num_rows:,}",
             one.configuration,

@@ -5,19 +5,25 @@ from __future__ import annotations
 import sys
 from difflib import get_close_matches
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ctgraph_rl.curriculum import Curriculum
 
 COMMANDS = {
     "agents": "baselines.__main__",
     "curricula": "curricula.__main__",
+    "draw": "ctgraph_rl.pictures",
     "export": "ctgraph_rl.export",
-    "report": "ctgraph_rl.report",
+    "play": "ctgraph_rl.play",
+    "report": "ctgraph_rl.report.__main__",
     "results": "ctgraph_rl.results",
 }
 """Commands and the modules whose ``main`` they are; each is imported when it is called."""
 
 
 def main() -> None:
-    """``ctgraph-rl agents|curricula|export|report|results ...``; anything else is for `ctgraph_rl.run`."""
+    """``ctgraph-rl agents|curricula|draw|export|play|report|results ...``; anything else is for `ctgraph_rl.run`."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in COMMANDS:
         _require_ours(COMMANDS[word])
@@ -29,6 +35,16 @@ def main() -> None:
         sys.exit(f"error: unknown command {word!r}{''.join(near)} {choices}")
     else:
         import_module("ctgraph_rl.run").main()
+
+
+def curriculum_named(name: str) -> Curriculum:
+    """A curriculum by name; the package that has them is only known here, where names meet.
+
+    Raises:
+        ValueError: for an unknown name; lists the choices.
+    """
+    _require_ours("curricula")
+    return import_module("curricula").load(name)
 
 
 def _require_ours(module: str) -> None:

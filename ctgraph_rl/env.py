@@ -56,6 +56,8 @@ class CTGraphEnv(EnvBase):
             row's id as one-hot, zeros for a task without one.
         num_task_ids: length of ``task_id``; None: just enough.
         compiled: run steps as a C kernel, with the same bits: see `Rows`.
+        info: False leaves ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated`` out of the data, so
+            that TorchRL has less to copy; all else is the same.
 
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.
@@ -77,12 +79,14 @@ class CTGraphEnv(EnvBase):
         task_ids: Mapping[Task, int] | None = None,
         num_task_ids: int | None = None,
         compiled: bool = False,
+        info: bool = True,
     ) -> None:
-        require((isinstance(check_actions, bool), f"check_actions must be true or false, got {check_actions!r}"))
+        flags = {"check_actions": check_actions, "info": info}
+        require(*((isinstance(v, bool), f"{name} must be true or false, got {v!r}") for name, v in flags.items()))
         tasks = require_all(Task, "tasks", tasks)
         self.num_task_ids = _num_task_ids(task_ids, num_task_ids)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
-        self.check_actions = check_actions
+        self.check_actions, self.info = check_actions, info
         self.rows = Rows(tasks, seed, first_row, task_pool, self.device, noise_bank, compiled)
         ids = {} if task_ids is None else task_ids
         numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device)
@@ -97,10 +101,7 @@ class CTGraphEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Bounded(0, white, shape=(n, *shape), dtype=torch.uint8),
             is_init=Binary(1, shape=(n, 1), dtype=torch.bool),
-            step_count=Unbounded(shape=(n, 1), dtype=torch.int64),
-            episode_reward=Unbounded(shape=(n, 1), dtype=torch.float32),
-            outcome=Bounded(dynamics.OUTCOME_RUNNING, dynamics.OUTCOME_GOAL, shape=(n, 1), dtype=torch.uint8),
-            leaf=Unbounded(shape=(n, 1), dtype=torch.int64),
+            **self._info_specs(),
             shape=(n,),
             device=device,
         )
@@ -111,9 +112,19 @@ class CTGraphEnv(EnvBase):
         self.action_spec = Categorical(self.rows.max_branching + 1, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32, device=device)
         flag = Binary(1, shape=(n, 1), dtype=torch.bool, device=device)
-        self.full_done_spec = Composite(
-            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
-        )
+        truncated = {"truncated": flag.clone()} if self.info else {}
+        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), **truncated, shape=(n,), device=device)
+
+    def _info_specs(self) -> dict[str, Bounded | Unbounded]:
+        if not self.info:
+            return {}
+        shape = (self.batch_size[0], 1)
+        return {
+            "step_count": Unbounded(shape=shape, dtype=torch.int64),
+            "episode_reward": Unbounded(shape=shape, dtype=torch.float32),
+            "outcome": Bounded(dynamics.OUTCOME_RUNNING, dynamics.OUTCOME_GOAL, shape=shape, dtype=torch.uint8),
+            "leaf": Unbounded(shape=shape, dtype=torch.int64),
+        }
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -250,13 +261,12 @@ class CTGraphEnv(EnvBase):
         running = torch.zeros_like(done)
         self._with_task_id(tensordict_).set("observation", observation)
         tensordict_.set("is_init", done.clone())
-        tensordict_.set("step_count", self.rows.step_count.unsqueeze(-1).clone())
-        tensordict_.set("episode_reward", self.rows.episode_reward.unsqueeze(-1).clone())
-        tensordict_.set("outcome", running.to(torch.uint8))
-        tensordict_.set("leaf", torch.full_like(tensordict.get(("next", "leaf")), dynamics.NO_LEAF))
         tensordict_.set("done", running)
         tensordict_.set("terminated", running.clone())
-        tensordict_.set("truncated", running.clone())
+        if self.info:
+            leaf = torch.full_like(tensordict.get(("next", "leaf")), dynamics.NO_LEAF)
+            for key, value in self._info(running.to(torch.uint8), leaf).items():
+                tensordict_.set(key, value)
         return tensordict, tensordict_
 
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
@@ -298,18 +308,24 @@ class CTGraphEnv(EnvBase):
             {
                 "observation": shown.observation,
                 "is_init": is_init.unsqueeze(-1),
-                "step_count": self.rows.step_count.unsqueeze(-1).clone(),
-                "episode_reward": self.rows.episode_reward.unsqueeze(-1).clone(),
-                "outcome": shown.outcome.unsqueeze(-1),
-                "leaf": shown.leaf.unsqueeze(-1),
                 "done": done,
                 "terminated": done.clone(),
-                "truncated": torch.zeros_like(done),
-            },
+            }
+            | (self._info(shown.outcome.unsqueeze(-1), shown.leaf.unsqueeze(-1)) if self.info else {}),
             batch_size=self.batch_size,
             device=self.device,
         )
         return self._with_task_id(data)
+
+    def _info(self, outcome: Tensor, leaf: Tensor) -> dict[str, Tensor]:
+        """What ``info=False`` leaves out, each [N, 1]."""
+        return {
+            "step_count": self.rows.step_count.unsqueeze(-1).clone(),
+            "episode_reward": self.rows.episode_reward.unsqueeze(-1).clone(),
+            "outcome": outcome,
+            "leaf": leaf,
+            "truncated": torch.zeros_like(outcome, dtype=torch.bool),
+        }
 
     def render(self, size: int = 192) -> Tensor:
         """A picture of every row: the observation, and the tree with position and goal.

@@ -6,12 +6,17 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
+import io
 import json
 import logging
 import os
+import re
+import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from inspect import Parameter, signature
@@ -20,27 +25,34 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import is_int, positive, require
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.curriculum import Curriculum
     from ctgraph_rl.experts import Expert
     from ctgraph_rl.interrupt import Interrupt
+    from ctgraph_rl.trackers import Tracker
 
-SPECS = ("observation_spec", "action_spec")
-"""Arguments of agents that come from the environment."""
+SPECS = ("observation_spec", "action_spec", "folder")
+"""Arguments that the run gives itself: to agents the environment's specs, to trackers where to write."""
 
 KEYS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 """An example of each group that changes a curriculum."""
 
 RESUME = ("warn", "strict")
 
-NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds")
+LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
+"""Configurations that come with other packages, and the extras that install these."""
+
+NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report")
 """Keys of the configuration that do not change results."""
 
 
@@ -77,21 +89,30 @@ def run_name(*, _root_: DictConfig) -> str:
     """Name of a run's directory: curriculum, agent, seed and a hash of the configuration."""
     text = json.dumps(plain(_root_), sort_keys=True)
     choices = _root_.hydra.runtime.choices
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return f"{choices.curriculum}/{choices.agent}-seed{_root_.seed}-{digest}"
+    digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+    seed = re.sub(r"\W", "_", str(_root_.seed))  # one that is refused later must not lead elsewhere
+    return f"{choices.curriculum}/{choices.agent}-seed{seed}-{digest}"
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def in_sweep() -> bool:
+    """Whether this run is a cell of a sweep, which says itself how its cells go."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 @hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     try:
-        run(cfg, run_dir)
-    except BaseException:
+        with redirect_stdout(io.StringIO()) if in_sweep() else nullcontext():
+            run(cfg, run_dir)
+    except BaseException as error:
         with suppress(OSError):
             run_dir.rmdir()  # only a directory that nothing was written into
+        if in_sweep() and isinstance(error, Exception):  # not every exception can travel between processes
+            raise RuntimeError(f"{type(error).__name__}: {explain(error)}") from None
         raise
 
 
@@ -113,7 +134,7 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
-    for switch in ("overwrite", "experts"):
+    for switch in ("overwrite", "experts", "report"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     require(
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
@@ -121,16 +142,31 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     )
     from ctgraph_rl.files import locked
     from ctgraph_rl.interrupt import Interrupt
+    from ctgraph_rl.report.style import require_packages
 
+    if cfg.report:
+        require_packages()
     with locked(run_dir):
-        if not is_finished(cfg, run_dir):
+        if is_finished(cfg, run_dir):
+            shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)  # if it was killed at its very end
+        else:
             with Interrupt() as interrupt, marked_if_it_fails(run_dir):
                 learn(cfg, run_dir, interrupt)
+    if cfg.report or not in_sweep():
+        show(run_dir, cfg.report)
+
+
+def show(run_dir: Path, report: bool) -> None:
+    """Print the results of a finished run, and make its report or say how."""
+    from ctgraph_rl.report.page import write_report
     from ctgraph_rl.report.terminal import print_summary
 
     print_summary(run_dir)
     here = Path.cwd()
-    print(f"results: {run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir}")
+    shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
+    print(f"results: {shown}")
+    how = f"ctgraph-rl report {shlex.quote(str(shown))}"
+    print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
 
 
 def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
@@ -139,15 +175,12 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     Raises:
         FileExistsError: if it holds a run, finished or not, of another configuration; shows the difference.
     """
-    log_file = run_dir / "run.jsonl"
-    if cfg.overwrite or not log_file.exists():
+    begun = None if cfg.overwrite else config_of(run_dir)
+    if begun is None:
         return False
-    from ctgraph_rl.log import RunLog
+    from ctgraph_rl.runs import flat
 
-    runs = RunLog.read(log_file).of_kind("run")
-    if not runs:  # stopped while its first line was written
-        return False
-    before, now = dict(flat(runs[0].get("config") or {})), dict(flat(plain(cfg)))
+    before, now = dict(flat(begun)), dict(flat(plain(cfg)))
     changed = [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
     if changed:
         shown = ", ".join(f"{key}={before.get(key)!r} instead of {now.get(key)!r}" for key in changed)
@@ -159,13 +192,24 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     return finished
 
 
-def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of a nested configuration by dotted names."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+def config_of(run_dir: Path) -> Mapping[str, Any] | None:
+    """The configuration of the run that a directory holds; None without a run.
+
+    Raises:
+        FileExistsError: if it holds files that a run would replace, and that are of no run.
+    """
+    from ctgraph_rl.log import RunLog
+    from ctgraph_rl.train import LOG, RESULTS
+
+    there = [name for name in RESULTS if (run_dir / name).exists()]
+    log = RunLog.read(run_dir / LOG) if LOG in there else RunLog()
+    runs = log.of_kind("run")
+    if runs:
+        return runs[0].get("config") or {}
+    if not there or (there == [LOG] and not log.measurements):  # stopped while its first line was written
+        return None
+    advice = "choose another hydra.run.dir, or overwrite=true to replace them"
+    raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
 
 
 @contextmanager
@@ -188,7 +232,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
 
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.experts import expert_curriculum
-    from ctgraph_rl.train import CHECKPOINTS, RESULTS, new_agent, train
+    from ctgraph_rl.train import CHECKPOINTS, new_agent, remove_results, train
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -204,13 +248,36 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     def checkpoints(folder: Path) -> Checkpoints:
         return Checkpoints(folder / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
 
-    if cfg.overwrite:
-        checkpoints(run_dir).clear()
-        for name in RESULTS:
-            (run_dir / name).unlink(missing_ok=True)
-    write_configuration(cfg, run_dir / ".hydra")
-    experts = train_experts(cfg, curriculum, checkpoints) if cfg.experts else None
-    train(curriculum, make_agent, run_dir, cfg.seed, device, plain(cfg), experts, checkpoints(run_dir))
+    with tracking(cfg, run_dir) as listeners:
+        if cfg.overwrite:
+            checkpoints(run_dir).clear()
+            remove_results(run_dir)
+        write_configuration(cfg, run_dir / ".hydra")
+        experts = train_experts(cfg, curriculum, checkpoints) if cfg.experts else None
+        settings, saved, shown = plain(cfg), checkpoints(run_dir), progress_console()
+        train(curriculum, make_agent, run_dir, cfg.seed, device, settings, experts, saved, listeners, shown)
+
+
+def progress_console() -> Console | None:
+    """Where a run shows how far it is: on standard error, but nowhere in a sweep."""
+    from rich.console import Console
+
+    return Console(quiet=True) if in_sweep() else None
+
+
+@contextmanager
+def tracking(cfg: DictConfig, run_dir: Path) -> Iterator[list[Tracker]]:
+    """The tracker that ``logger`` names, if it does; closed at the end."""
+    from ctgraph_rl.runs import flat
+    from ctgraph_rl.trackers import FOLDER, Tracker
+
+    if "logger" not in cfg:
+        if cfg.overwrite:
+            shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
+        yield []
+        return
+    with Tracker(target(cfg, "logger"), run_dir, dict(flat(plain(cfg)))) as tracker:
+        yield [tracker]
 
 
 def train_experts(cfg: DictConfig, curriculum: Curriculum, checkpoints: Callable[[Path], Checkpoints]) -> list[Expert]:
@@ -223,10 +290,13 @@ def train_experts(cfg: DictConfig, curriculum: Curriculum, checkpoints: Callable
 
     def learn_alone(alone: Curriculum, run_dir: Path) -> None:
         device = checked_device(cfg.device)
-        train(alone, target(cfg, "agent"), run_dir, cfg.seed, device, settings, checkpoints=checkpoints(run_dir))
+        saved, shown = checkpoints(run_dir), progress_console()
+        train(alone, target(cfg, "agent"), run_dir, cfg.seed, device, settings, checkpoints=saved, console=shown)
 
     folder = Path(cfg.experts_dir)
-    return find_or_train(curriculum, learn_alone, folder, {**settings, "versions": versions()}, print)
+    stop = checkpoints(folder).interrupt
+    waiting = (lambda: None) if stop is None else stop.check
+    return find_or_train(curriculum, learn_alone, folder, {**settings, "versions": versions()}, print, waiting)
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:
@@ -305,16 +375,23 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
 
 
 def explain(error: BaseException) -> str:
-    """One message for a user's error: the first cause, and the choices where a key is unknown."""
-    causes = [error]
-    while causes[-1].__cause__ is not None:
-        causes.append(causes[-1].__cause__)
-    cause = causes[-1]
+    """One message for a user's error: its cause within Hydra's errors, and the choices where a key is unknown."""
+    cause = error
+    while cause.__cause__ is not None and not _is_told(cause):
+        cause = cause.__cause__
     message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
+    extra = LAUNCHERS.get(cause.missing_cfg_file or "") if isinstance(cause, MissingConfigException) else None
+    if extra is not None:
+        return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
     node = getattr(cause, "parent_node", None)
     if isinstance(node, DictConfig):
         message += f"\nChoices: {', '.join(sorted(map(str, node)))}"
     return message
+
+
+def _is_told(error: BaseException) -> bool:
+    """Whether an error says what to do, so that what caused it says less."""
+    return isinstance(error, (ValueError, OSError)) and not isinstance(error, OmegaConfBaseException)
 
 
 def main() -> None:
@@ -334,5 +411,5 @@ def main() -> None:
         sys.exit(130)
 
 
-if __name__ == "__main__":
-    main()
+if __name__ == "__main__":  # not this module's own: other processes of a sweep import what is in it
+    importlib.import_module("ctgraph_rl.run").main()

@@ -374,8 +374,8 @@ def test_the_name_of_a_run_holds_curriculum_agent_seed_and_what_else_changes_res
 
     plain, other, same = directory(), directory("agent.gamma=0.5"), directory("overwrite=true")
 
-    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{8}", plain)
-    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{8}", other)
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", plain)
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", other)
     assert other != plain
     assert same == plain
 

@@ -36,6 +36,8 @@ def test_the_benchmark_prints_a_row_for_every_way(capsys):
         "fast rollout",
         "TorchRL rollout",
         "TorchRL Collector",
+        "TorchRL rollout, info=False",
+        "TorchRL Collector, info=False",
         "Gymnasium VectorEnv",
     ]
 

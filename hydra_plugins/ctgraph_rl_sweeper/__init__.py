@@ -1,0 +1,171 @@
+"""Hydra's sweeper of our runs: only what is missing is launched, nothing that fails stops the rest, all is reported.
+
+``conf/hydra/sweeper/cells.yaml`` chooses it. Hydra finds sweepers only in packages below ``hydra_plugins``.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf
+
+Overrides = Sequence[str]
+"""The settings of one cell, as on the command line."""
+
+ALL_CORES = -1
+"""Of joblib's number of processes."""
+
+SUBDIR = "${run_name:}"
+"""Names a directory after the configuration; a cell can then be found before it is run."""
+
+
+class CellSweeper(BasicSweeper):
+    """Sweeps over all combinations of choices, with any launcher.
+
+    Args:
+        max_batch_size: cells that are given to the launcher at a time; None: all.
+        params: what is swept, beside the command line.
+        status: only say where each cell stands.
+    """
+
+    def __init__(self, max_batch_size: int | None, params: dict[str, str] | None, status: bool) -> None:
+        super().__init__(max_batch_size, params)
+        self.status = status
+        self._values: dict[str, tuple[str, Any] | None] = {}
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """As Hydra's; a launcher that would use all cores gets as many processes as have ``num_threads`` each."""
+        if config.hydra.launcher.get("n_jobs") == ALL_CORES:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            config.hydra.launcher.n_jobs = max(1, cores // config.num_threads)
+        super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Run the cells that are not done, then say where all of them stand.
+
+        Raises:
+            SystemExit: with code 1 if some are not done.
+        """
+        from ctgraph_rl.sweep import DONE, SweepProgress, report, standing
+
+        assert self.config is not None
+        overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
+        [batch] = self.split_arguments(overrides, None)
+        cells = self.cells(batch)
+        since = time.time() if self.config.overwrite else 0.0
+        left = [folder for folder in cells if standing(folder, since).state != DONE]
+        errors: dict[Path, str] = {}
+        try:
+            if left and not self.status:
+                with sigterm_exits(), SweepProgress(list(cells), since):
+                    self._launch({folder: cells[folder] for folder in left}, errors)
+        finally:
+            found = {folder: standing(folder, since, errors.get(folder)) for folder in cells}
+            names = shortened(list(cells.values()))
+            print(report(dict(zip(names, found.values(), strict=True)), len(batch) - len(cells)))
+        if any(state != DONE for state, _ in found.values()):
+            sys.exit(1)
+
+    def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
+        """The cells by their run directories; of equal ones only the first.
+
+        Cells that choose the same files differ in values alone, so only the first of them is composed.
+
+        Raises:
+            ValueError: if directories are not named after the configuration.
+            HydraException: for what cannot be composed.
+        """
+        from ctgraph_rl.checks import require
+
+        assert self.config is not None and self.hydra_context is not None
+        subdir = OmegaConf.to_container(self.config.hydra.sweep)["subdir"]  # type: ignore[call-overload,index]
+        require((subdir == SUBDIR, f"hydra.sweep.subdir must be {SUBDIR}, got {subdir}; change hydra.sweep.dir"))
+        composed: dict[Overrides, DictConfig] = {}
+        found: dict[Path, Overrides] = {}
+        for overrides in batch:
+            values = {setting: self._value(setting) for setting in overrides}
+            choices = tuple(setting for setting, value in values.items() if value is None)
+            if choices not in composed:
+                composed[choices] = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+            for key, value in filter(None, values.values()):
+                OmegaConf.update(composed[choices], key, value)
+            sweep = composed[choices].hydra.sweep
+            found.setdefault(Path(sweep.dir).absolute() / sweep.subdir, overrides)
+        return found
+
+    def _value(self, setting: str) -> tuple[str, Any] | None:
+        """Key and value of a setting that changes one value; None for one that chooses a file, adds or removes."""
+        if setting not in self._values:
+            [parsed] = OverridesParser.create().parse_overrides([setting])
+            self._values[setting] = (parsed.key_or_group, parsed.value()) if self._is_value(parsed) else None
+        return self._values[setting]
+
+    def _is_value(self, parsed: Override) -> bool:
+        assert self.hydra_context is not None
+        key = parsed.key_or_group
+        plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(parsed.value(), dict)
+        is_file = self.hydra_context.config_loader.get_group_options(key) or key.startswith("hydra")
+        return plain and not is_file
+
+    def _launch(self, cells: Mapping[Path, Overrides], errors: dict[Path, str]) -> None:
+        """Let the launcher run the cells; what they raise is collected by directory."""
+        assert self.config is not None and self.launcher is not None
+        folder = Path(self.config.hydra.sweep.dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, folder / "multirun.yaml")
+        folders, size = list(cells), self.max_batch_size or len(cells)
+        for first in range(0, len(folders), size):
+            batch = folders[first : first + size]
+            try:
+                jobs = self.launcher.launch([cells[cell] for cell in batch], initial_job_idx=first)
+            except Exception as error:  # such as a worker that was killed: the cells' directories know how far they are
+                print(f"the launcher stopped: {type(error).__name__}: {error}", file=sys.stderr)
+                return
+            failed = [(cell, job) for cell, job in zip(batch, jobs, strict=True) if job.status == JobStatus.FAILED]
+            errors.update({cell: why(job) for cell, job in failed})
+
+
+@contextmanager
+def sigterm_exits() -> Iterator[None]:
+    """Let SIGTERM end the sweep as Ctrl-C does, so that a launcher can end its processes."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGTERM) == leave:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def why(job: JobReturn) -> str:
+    """What a failed job raised."""
+    try:
+        with redirect_stderr(io.StringIO()):  # Hydra prints the settings
+            job.return_value  # noqa: B018 - it raises
+    except Exception as error:
+        return str(error)
+    return ""
+
+
+def shortened(cells: Sequence[Overrides]) -> list[str]:
+    """The cells' settings without those that all of them have."""
+    common = set.intersection(*map(set, cells)) if len(cells) > 1 else set()
+    return [" ".join(setting for setting in cell if setting not in common) for cell in cells]
