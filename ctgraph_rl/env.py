@@ -56,8 +56,8 @@ class CTGraphEnv(EnvBase):
             row's id as one-hot, zeros for a task without one.
         num_task_ids: length of ``task_id``; None: just enough.
         compiled: run steps as a C kernel, with the same bits: see `Rows`.
-        info: False leaves ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated`` out of the data, so
-            that TorchRL has less to copy; all else is the same.
+        info: False leaves ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated`` out of the data,
+            so that TorchRL has less to copy; all else is the same.
 
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.

@@ -110,7 +110,7 @@ def test_names_of_others_do_not_become_paths(compose, seed):
 
     name = run_name(_root_=cfg)
 
-    assert re.fullmatch(r"su_b1_4tasks/lstm_ppo-seed\w+-[0-9a-f]{8}", name)
+    assert re.fullmatch(r"su_b1_4tasks/lstm_ppo-seed\w+-[0-9a-f]{12}", name)
 
 
 LINE = {"kind": "evaluation", "moment": "after", "block": 1, "frames": 64, "task": 1, "label": "a", "return_mean": 0.5}
