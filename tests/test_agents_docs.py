@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_agents import AGENTS, OWN
+from test_agents import AGENTS
 
 from baselines.__main__ import agents, main
 from ctgraph_rl import RunLog, agent
@@ -35,12 +35,12 @@ def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys):
 def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):
     listed = dict(agents())
 
-    assert sorted(listed) == OWN
+    assert sorted(listed) == AGENTS
     for name, kind in listed.items():
         assert compose(f"agent={name}").agent._target_ == f"{kind.__module__}.{kind.__name__}"
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", AGENTS)
 def test_every_hyperparameter_has_a_comment_in_its_yaml(name):
     first, *lines = (CHECKOUT / "conf" / "agent" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
 

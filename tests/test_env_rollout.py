@@ -50,13 +50,13 @@ def is_same(stock: TensorDictBase, found: TensorDictBase) -> bool:
     )
 
 
-def waits(data: TensorDictBase) -> TensorDictBase:
-    return data.set("action", torch.zeros(data.batch_size, dtype=torch.int64))
+def waits(tensordict: TensorDictBase) -> TensorDictBase:
+    return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
 
 
-def numbered(data: TensorDictBase) -> TensorDictBase:
+def numbered(tensordict: TensorDictBase) -> TensorDictBase:
     """A policy with an output of its own."""
-    return waits(data).set("hidden", data["observation"].flatten(1).float().mean(1, keepdim=True))
+    return waits(tensordict).set("hidden", tensordict["observation"].flatten(1).float().mean(1, keepdim=True))
 
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -143,9 +143,9 @@ def test_steps_with_different_keys_or_shapes_are_stacked_as_by_the_stock_method(
     def prepare(env):
         counts = iter(range(1, 9))
 
-        def policy(data):
+        def policy(tensordict):
             count = next(counts)
-            return waits(data).set(name.format(count % 2), torch.zeros(len(TASKS), width or count))
+            return waits(tensordict).set(name.format(count % 2), torch.zeros(len(TASKS), width or count))
 
         return {"policy": policy}
 
@@ -170,7 +170,7 @@ def test_after_a_rollout_that_fails_the_stock_method_stacks_its_own_steps():
     env = CTGraphEnv(TASKS, seed=3)
 
     with pytest.raises(ValueError, match="action must be int64"):
-        env.rollout(3, lambda data: data)
+        env.rollout(3, lambda tensordict: tensordict)
 
     assert EnvBase.rollout(env, 3, waits)["observation"].shape == (8, 3, 1, 12, 12)
 
