@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from ctgraph_rl.images import distances as distances
     from ctgraph_rl.lifelong import evaluate as evaluate
     from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
-    from ctgraph_rl.trained import Trained as Trained
-    from ctgraph_rl.trained import load as load
     from ctgraph_rl.log import RunLog as RunLog
     from ctgraph_rl.observations import Observations as Observations
     from ctgraph_rl.recorder import Recorder as Recorder
@@ -40,6 +38,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
     from ctgraph_rl.rows import Rows as Rows
     from ctgraph_rl.task import Task as Task
+    from ctgraph_rl.trained import Trained as Trained
+    from ctgraph_rl.trained import load as load
 
 __version__ = "0.1.0"
 
