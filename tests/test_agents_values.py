@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hydra
 import pytest
-from test_agents import OWN, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
+from test_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
 
 from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1
@@ -83,7 +83,7 @@ def bad_values(name: str) -> list[tuple[str, str]]:
     return [bad for group, applies in groups if applies for bad in group]
 
 
-@pytest.mark.parametrize(("name", "override", "message"), [(name, *bad) for name in OWN for bad in bad_values(name)])
+@pytest.mark.parametrize(("name", "override", "message"), [(name, *bad) for name in AGENTS for bad in bad_values(name)])
 def test_a_hyperparameter_out_of_range_is_refused_by_name(name, override, message):
     given = YAML[name].copy()
     given.merge_with_dotlist([override])
@@ -93,7 +93,7 @@ def test_a_hyperparameter_out_of_range_is_refused_by_name(name, override, messag
         kind(ENV.observation_spec_unbatched, ENV.action_spec_unbatched, **given)
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", AGENTS)
 def test_every_hyperparameter_has_a_rule(name):
     given = {str(key) for key in YAML[name]} - {"_target_"}
     ruled = {override.split("=")[0] for override, _ in bad_values(name)} | {"eps_end"}

@@ -185,7 +185,7 @@ def collect_main_job(folder: Path) -> None:
 
 def page() -> str:
     """The page: the template with its tables."""
-    small = read("baselines_b1") + read("baselines_recurrent_q")
+    small = read("baselines_b1")
     tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
     tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
@@ -199,7 +199,7 @@ def draw(path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    raw = read("baselines_b1") + read("baselines_recurrent_q")
+    raw = read("baselines_b1")
     configurations = list(dict.fromkeys(line["configuration"] for line in raw))
     agents = list(dict.fromkeys(line["agent"] for line in raw))
     figure, panels = pyplot.subplots(1, len(configurations), figsize=(2.6 * len(configurations), 2.8), sharey=True)
