@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -244,6 +245,7 @@ def test_an_interrupt_ends_the_game_cleanly():
     if child == 0:
         os.environ.update(TERM="xterm-256color", COLORTERM="truecolor", OMP_NUM_THREADS="1")
         os.environ.pop("NO_COLOR", None)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # which is ignored where the tests run in the background
         os.execv(sys.executable, [sys.executable, "-c", IN_A_TERMINAL])
     told = bytearray()
 
