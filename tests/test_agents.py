@@ -27,7 +27,7 @@ Q_LEARNERS = ("dqn", "drqn", "qrdqn_lstm")
 POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "reinforce", "rl2")
 RECURRENT = ("drqn", "lstm_ppo", "qrdqn_lstm", "rl2")
 
-for _name in AGENTS:
+for _name in YAML:
     _less = ["agent.batch_size=4"] if _name in ("drqn", "qrdqn_lstm") else []
     SMALL_AGENT.setdefault(_name, ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", *_less])
 
