@@ -160,8 +160,11 @@ class QLearner(Learner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """The optimiser's state, the replay buffer and the gradient steps since the last copy to the target network."""
-        own = {"replay": self.replay.state_dict(), "target_age": self.target_update.counter}
-        return {**super().get_extra_state(), **own}
+        replay = self.replay.state_dict()
+        for items in replay["_storage"]["_storage"].values():
+            if isinstance(items, Tensor):  # places without an item hold anything; equal agents have equal states
+                items[replay["_storage"]["_len"] :] = 0
+        return {**super().get_extra_state(), "replay": replay, "target_age": self.target_update.counter}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
