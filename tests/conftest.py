@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,6 +24,16 @@ SMALL_AGENT = {
     "lstm_ppo": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8"],
     "dqn": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "agent.batch_size=32"],
 }
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs a C compiler where there is none."""
+    if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]):
+        return
+    for item in items:
+        compiled = getattr(item, "callspec", None) and item.callspec.params.get("compiled")
+        if compiled or "test_native.py" in item.nodeid or "compiled" in item.nodeid:
+            item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 
 @pytest.fixture(autouse=True, scope="session")
