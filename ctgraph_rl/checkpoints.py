@@ -16,15 +16,13 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from ctgraph_rl.checks import is_int
 from ctgraph_rl.files import PART, write_whole
-
-if TYPE_CHECKING:
-    from ctgraph_rl.interrupt import Interrupt
+from ctgraph_rl.interrupt import Interrupt
 
 FORMAT = 1
 """Raised when a checkpoint means something else than before."""
@@ -56,7 +54,8 @@ class Checkpoints:
     def __init__(
         self, folder: Path | str, seconds: float = 300.0, strict: bool = False, interrupt: Interrupt | None = None
     ) -> None:
-        self.folder, self.seconds, self.strict, self.interrupt = Path(folder), seconds, strict, interrupt
+        self.folder, self.seconds, self.strict = Path(folder), seconds, strict
+        self.interrupt = Interrupt() if interrupt is None else interrupt
         self._last: float | None = None
 
     def offer(self, state: Callable[[], State], at_block_end: bool) -> None:
@@ -68,11 +67,11 @@ class Checkpoints:
             state: makes what is saved.
             at_block_end: always save.
         """
-        stop = self.interrupt is not None and self.interrupt.is_asked
+        stop = self.interrupt.is_asked
         if stop or at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds:
             self.save(state())
         if stop:
-            self.interrupt.exit()  # type: ignore[union-attr]
+            self.interrupt.exit()
 
     def save(self, state: State) -> None:
         """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Block, Curriculum, Protocol
-from ctgraph_rl.files import locked
+from ctgraph_rl.files import LOG, METRICS, locked
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.task import Task
 
@@ -42,7 +42,7 @@ class Expert(NamedTuple):
     @property
     def log(self) -> RunLog:
         """Its measurements."""
-        return RunLog.read(self.run_dir / "run.jsonl")
+        return RunLog.read(self.run_dir / LOG)
 
 
 def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
@@ -105,7 +105,7 @@ def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callabl
 
 
 def _is_trained(run_dir: Path) -> bool:
-    return (run_dir / "metrics.json").exists()
+    return (run_dir / METRICS).exists()
 
 
 def _key(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:

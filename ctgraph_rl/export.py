@@ -17,6 +17,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.files import LOG
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.metrics import Regime
 from ctgraph_rl.tables import write_tables
@@ -100,7 +101,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
     arguments = parser.parse_args()
     try:
-        log = RunLog.read(arguments.run / "run.jsonl")
+        log = RunLog.read(arguments.run / LOG)
         if arguments.format == "parquet":
             arguments.out.mkdir(parents=True, exist_ok=True)
             write_tables(log, arguments.out, parquet=True)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside, synced and renamed; and a lock for a directory."""
+"""The files of a run: their names, written whole or not at all, and a lock for their directory."""
 
 from __future__ import annotations
 
@@ -12,6 +12,15 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
+
+LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
+"""Files of a run's directory; `METRICS` is there when the run is complete."""
+
+FAILURE = "failed.txt"
+"""Says why a run ended by an error."""
+
+CHECKPOINTS = "checkpoints"
+"""The folder with what an unfinished run goes on from."""
 
 LOCK = ".lock"
 """The file in a directory that says who works there."""

@@ -18,12 +18,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.files import CURRICULUM, LOG, METRICS
 from ctgraph_rl.lifelong import Examiner, Policy, by_slices
 from ctgraph_rl.log import RunLog, write_metrics, write_performance
 from ctgraph_rl.provenance import provenance
 from ctgraph_rl.scores import scores
 from ctgraph_rl.tables import write_tables
-from ctgraph_rl.train import CURRICULUM
 
 
 class Recorder:
@@ -75,7 +75,7 @@ class Recorder:
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
-        path = None if self.run_dir is None else self.run_dir / "run.jsonl"
+        path = None if self.run_dir is None else self.run_dir / LOG
         if path is not None:
             if path.exists():
                 raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
@@ -162,7 +162,7 @@ class Recorder:
                 self.curriculum.to_json(self.run_dir / CURRICULUM)
             write_tables(self.log, self.run_dir, parquet=False)
             write_performance(self.run_dir / "performance.csv", self.log, self.curriculum.labels)
-            write_metrics(self.run_dir / "metrics.json", self.metrics)
+            write_metrics(self.run_dir / METRICS, self.metrics)
 
     def __enter__(self) -> Recorder:
         return self

@@ -31,6 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import is_int, positive, require
+from ctgraph_rl.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -140,7 +141,6 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
-    from ctgraph_rl.files import locked
     from ctgraph_rl.interrupt import Interrupt
     from ctgraph_rl.report.style import require_packages
 
@@ -148,7 +148,7 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         require_packages()
     with locked(run_dir):
         if is_finished(cfg, run_dir):
-            shutil.rmtree(run_dir / "checkpoints", ignore_errors=True)  # if it was killed at its very end
+            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
         else:
             with Interrupt() as interrupt, marked_if_it_fails(run_dir):
                 learn(cfg, run_dir, interrupt)
@@ -186,7 +186,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
         shown = ", ".join(f"{key}={before.get(key)!r} instead of {now.get(key)!r}" for key in changed)
         advice = "choose another hydra.run.dir, or overwrite=true to replace it"
         raise FileExistsError(f"{run_dir} holds a run with {shown}; {advice}")
-    finished = (run_dir / "metrics.json").exists()
+    finished = (run_dir / METRICS).exists()
     if finished:
         print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
     return finished
@@ -199,7 +199,7 @@ def config_of(run_dir: Path) -> Mapping[str, Any] | None:
         FileExistsError: if it holds files that a run would replace, and that are of no run.
     """
     from ctgraph_rl.log import RunLog
-    from ctgraph_rl.train import LOG, RESULTS
+    from ctgraph_rl.train import RESULTS
 
     there = [name for name in RESULTS if (run_dir / name).exists()]
     log = RunLog.read(run_dir / LOG) if LOG in there else RunLog()
@@ -215,12 +215,12 @@ def config_of(run_dir: Path) -> Mapping[str, Any] | None:
 @contextmanager
 def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
     """Leave the reason in ``failed.txt`` where a run that had begun ends by an error."""
-    mark = run_dir / "failed.txt"
+    mark = run_dir / FAILURE
     mark.unlink(missing_ok=True)
     try:
         yield
     except Exception as error:
-        if (run_dir / "run.jsonl").exists():
+        if (run_dir / LOG).exists():
             with suppress(OSError):
                 mark.write_text(f"{type(error).__name__}: {explain(error)}\n", encoding="utf-8")
         raise
@@ -232,7 +232,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
 
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.experts import expert_curriculum
-    from ctgraph_rl.train import CHECKPOINTS, new_agent, remove_results, train
+    from ctgraph_rl.train import new_agent, remove_results, train
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -294,8 +294,7 @@ def train_experts(cfg: DictConfig, curriculum: Curriculum, checkpoints: Callable
         train(alone, target(cfg, "agent"), run_dir, cfg.seed, device, settings, checkpoints=saved, console=shown)
 
     folder = Path(cfg.experts_dir)
-    stop = checkpoints(folder).interrupt
-    waiting = (lambda: None) if stop is None else stop.check
+    waiting = checkpoints(folder).interrupt.check
     return find_or_train(curriculum, learn_alone, folder, {**settings, "versions": versions()}, print, waiting)
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.experts import EXPERT
+from ctgraph_rl.files import FAILURE, LOG, METRICS
 from ctgraph_rl.log import SCHEMA, RunLog
 from ctgraph_rl.measurement import check, parsed
 
@@ -109,7 +110,7 @@ def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
     """
     found, problems = [], []
     for path in paths:
-        logs = sorted(Path(path).rglob("run.jsonl"))
+        logs = sorted(Path(path).rglob(LOG))
         if not logs:
             problems.append(Problem(Path(path), f"{path} holds no run: no run.jsonl in or below it"))
         for log in logs:
@@ -132,7 +133,7 @@ def read_run(path: Path) -> Run:
         ValueError: if its log does not start with what was run, or is of a newer version.
         OSError: if its log cannot be opened.
     """
-    file = path / "run.jsonl"
+    file = path / LOG
     about = _about(file)
     config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
     seed, agent = config.pop("seed"), _agent(config)
@@ -191,7 +192,7 @@ def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
     """The metrics of a finished run, or why there are none."""
-    file = path / "metrics.json"
+    file = path / METRICS
     if not file.exists():
         torn = ", with a torn last line" if log.torn_lines else ""
         return {}, f"{_failure(path) or 'unfinished'}{torn}"
@@ -206,7 +207,7 @@ def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
 def _failure(path: Path) -> str | None:
     """Why a run failed, as it says itself."""
     try:
-        return "failed: " + " ".join((path / "failed.txt").read_text(encoding="utf-8", errors="replace").split())
+        return "failed: " + " ".join((path / FAILURE).read_text(encoding="utf-8", errors="replace").split())
     except OSError:
         return None
 

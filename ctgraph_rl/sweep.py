@@ -17,7 +17,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from ctgraph_rl.files import LOCK
+from ctgraph_rl.files import FAILURE, LOCK, LOG, METRICS
 
 DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
 
@@ -43,16 +43,16 @@ def standing(folder: Path, since: float = 0.0, error: str | None = None) -> Stan
         since: results and failures that are older do not count, in seconds since 1970.
         error: what it raised, where that is known.
     """
-    if _is_younger(folder / "metrics.json", since):
+    if _is_younger(folder / METRICS, since):
         return Standing(DONE)
     user = lock_holder(folder)
     if user is not None:
         return Standing(IN_USE, f"by {user}")
     if error is not None:
         return Standing(FAILED, error)
-    if _is_younger(folder / "failed.txt", since):
-        return Standing(FAILED, (folder / "failed.txt").read_text(encoding="utf-8", errors="replace"))
-    return Standing(MISSING, "stopped; the next start goes on" if (folder / "run.jsonl").exists() else "not begun")
+    if _is_younger(folder / FAILURE, since):
+        return Standing(FAILED, (folder / FAILURE).read_text(encoding="utf-8", errors="replace"))
+    return Standing(MISSING, "stopped; the next start goes on" if (folder / LOG).exists() else "not begun")
 
 
 def _is_younger(path: Path, since: float) -> bool:

@@ -21,6 +21,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.trackio import TrackioLogger
 
 from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.files import LOG
 from ctgraph_rl.log import RunLog
 
 FOLDER = "tracker"
@@ -63,7 +64,7 @@ class Tracker:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         self.name = getattr(make_logger, "func", make_logger).__name__
-        self._log: Path | None = run_dir / "run.jsonl"
+        self._log: Path | None = run_dir / LOG
         self._logger: Logger | None = None
         try:
             self._logger = make_logger(folder)

@@ -18,7 +18,7 @@ from ctgraph_rl.checkpoints import Checkpoints, State
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.experts import Expert
-from ctgraph_rl.files import append_line, write_whole
+from ctgraph_rl.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS, append_line, write_whole
 from ctgraph_rl.lifelong import check_rows, learn_curriculum, make_env
 from ctgraph_rl.log import RunLog, write_metrics, write_performance
 from ctgraph_rl.params import require_memory
@@ -43,14 +43,9 @@ MEMBERS = (
 )
 """What a run needs of an agent."""
 
-LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
-
 RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
 """What a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
 ``curriculum.json`` where the curriculum has only parts of this package's classes."""
-
-CHECKPOINTS = "checkpoints"
-"""The folder in a run's directory with what an unfinished run goes on from."""
 
 RESTARTS = "restarts.jsonl"
 """Says, for a run that was stopped, where it went on and on which machine."""

@@ -18,8 +18,9 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checkpoints import Checkpoints, read_plain
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log import RunLog
-from ctgraph_rl.train import AGENT, CHECKPOINTS, CURRICULUM, LOG, MakeAgent, new_agent
+from ctgraph_rl.train import MakeAgent, new_agent
 
 OURS = re.compile(r"baselines\.(\w+)\.(\w+)")
 """Names of agents that a directory may name; others are named by who loads it."""

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ctgraph_rl.files import METRICS
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_summary
 
@@ -17,7 +18,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
     arguments = parser.parse_args()
     try:
-        if len(arguments.runs) == 1 and (arguments.runs[0] / "metrics.json").is_file():
+        if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
         report = write_report(arguments.runs, arguments.out)
     except (OSError, ValueError, ModuleNotFoundError) as error:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ctgraph_rl.files import METRICS
 from ctgraph_rl.runs import Curve, read_run
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
@@ -114,7 +115,7 @@ def _shown(value: float) -> str:
 
 def metrics_table(run_dir: Path | str) -> Table:
     """The main metrics with their definitions; an undefined one shows why. Those against experts only where defined."""
-    metrics: dict[str, dict[str, Any]] = json.loads((Path(run_dir) / "metrics.json").read_text(encoding="utf-8"))
+    metrics: dict[str, dict[str, Any]] = json.loads((Path(run_dir) / METRICS).read_text(encoding="utf-8"))
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]

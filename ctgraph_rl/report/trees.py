@@ -56,7 +56,7 @@ def _height(depth: int) -> float:
 def find_trees(run: Run) -> Trees:
     """The agent and the curriculum of a run as far as its directory has them."""
     from ctgraph_rl.curriculum import Curriculum
-    from ctgraph_rl.train import AGENT, CURRICULUM
+    from ctgraph_rl.files import AGENT, CURRICULUM
     from ctgraph_rl.trained import load
 
     reason = f"{run.path} has no {AGENT}, the weights of its agent"
