@@ -6,7 +6,7 @@ The optimisers are PyTorch's own functions over PyTorch's own state, so state di
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
@@ -40,13 +40,13 @@ def compiled_step() -> Step:
 
 def whole_step(learner: Learner, batch: Data) -> dict[str, Tensor]:
     """What `Learner.gradient_step` does, without a branch on data; the optimiser must have its state."""
-    losses = learner.loss(batch)
-    parameters = learner.optimiser.param_groups[0]["params"]
-    gradients = torch.autograd.grad(total(losses), parameters)
+    losses, parameters = learner.losses(batch), learner.live
+    gradients = learner.method.gradients(torch.autograd.grad(total(losses), learner.weights))
     norm = nn.utils.get_total_norm(gradients)
     scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
     with torch.no_grad():
         _update(learner.optimiser, parameters, [gradient * scale for gradient in gradients])
+    learner.method.settle()
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
 
@@ -55,7 +55,7 @@ def total(losses: dict[str, Tensor]) -> Tensor:
     return sum((value for key, value in losses.items() if key.startswith("loss_")), start=torch.zeros(()))
 
 
-def _update(optimiser: torch.optim.Optimizer, parameters: list[Tensor], gradients: list[Tensor]) -> None:
+def _update(optimiser: torch.optim.Optimizer, parameters: Sequence[Tensor], gradients: list[Tensor]) -> None:
     """One step of the optimiser in place."""
     group = optimiser.param_groups[0]
     state: dict[str, list[Tensor]] = {
@@ -66,7 +66,9 @@ def _update(optimiser: torch.optim.Optimizer, parameters: list[Tensor], gradient
     if isinstance(optimiser, torch.optim.Adam):
         moments = state["exp_avg"], state["exp_avg_sq"]
         (beta1, beta2), amsgrad = group["betas"], group["amsgrad"]
-        adam(parameters, gradients, *moments, [], state["step"], amsgrad=amsgrad, beta1=beta1, beta2=beta2, **same)
+        adam(
+            list(parameters), gradients, *moments, [], state["step"], amsgrad=amsgrad, beta1=beta1, beta2=beta2, **same
+        )
     else:
         more = {key: group[key] for key in ("alpha", "momentum", "centered")}
-        rmsprop(parameters, gradients, state["square_avg"], [], [], state["step"], **more, **same)
+        rmsprop(list(parameters), gradients, state["square_avg"], [], [], state["step"], **more, **same)

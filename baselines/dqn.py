@@ -83,10 +83,10 @@ class DQN(QLearner):
         value of the best action where it ends.
         """
         after = {key: batch["next", key] for key in self.greedy.in_keys}
-        predicted = self._values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
+        predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             later = self._target_values(after)
-            best = (self._values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
+            best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             goes_on = (~batch["next", "terminated"]).int()
             target = (batch["next", "reward"] + gamma * goes_on * later.gather(-1, best)).squeeze(-1)
@@ -95,7 +95,7 @@ class DQN(QLearner):
         mean = loss.mean() if weight is None else (loss * weight).sum() / weight.sum()
         return {"loss_value": mean, "td_error": squared}
 
-    def _values(self, data: Data) -> Tensor:
+    def values(self, data: Data) -> Tensor:
         """The online network's action values."""
         trunk, head = self.greedy.module[0].module
         return head.module(trunk.over_time(data))

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.compiled import compiled_step, total
+from baselines.methods.method import Method
 from baselines.networks import Data
 from ctgraph_rl.checks import at_least_one, positive, require
 
@@ -41,6 +43,9 @@ class Learner(nn.Module):
     policy: TensorDictModuleBase
     optimiser: torch.optim.Optimizer
 
+    output_keys: ClassVar[tuple[str, ...]]
+    """What `outputs` gives that the network itself makes."""
+
     minibatch_size: int
     """Items that a gradient step learns from, unless a batch was shortened."""
 
@@ -53,6 +58,7 @@ class Learner(nn.Module):
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
         self.compiled_step = compiled_step() if compile else None
+        self.method = Method()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -73,16 +79,59 @@ class Learner(nn.Module):
         """The losses of a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from a batch; see `ctgraph_rl.agent.Agent`."""
+        raise NotImplementedError
+
+    def outputs(self, data: Data) -> dict[str, Tensor]:
+        """What the network says of any number of steps, [..., n] each.
+
+        ``log_probs`` of all actions; and those of `output_keys`: ``state_value`` or ``action_value``.
+        """
+        raise NotImplementedError
+
+    @cached_property
+    def weights(self) -> list[nn.Parameter]:
+        """What the losses are differentiated by."""
+        return list(self.live)
+
+    @property
+    def live(self) -> list[nn.Parameter]:
+        """What the optimiser changes: the weights, unless a method has put something else in their place."""
+        return self.optimiser.param_groups[0]["params"]
+
+    def optimise(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Let a new optimiser of the same kind change these parameters."""
+        self.optimiser = type(self.optimiser)(parameters, **self.optimiser.defaults)
+        if self.compiled_step is not None:
+            self.compiled_step = compiled_step()
+
+    def forget(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Let the optimiser forget what it knows of parameters."""
+        for parameter in parameters:
+            for value in self.optimiser.state.get(parameter, {}).values():
+                value.zero_()
+
+    def weights_changed(self) -> None:
+        """Called where the weights were changed other than by learning; nothing else depends on them."""
+
+    def losses(self, batch: Data) -> dict[str, Tensor]:
+        """The agent's losses and the method's."""
+        return {**self.loss(batch), **self.method.loss(batch)}
+
     def gradient_step(self, batch: Data) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
+        batch = self.method.mixed(batch)
         usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
         if self.compiled_step is not None and usual:
             return self.compiled_step(self, batch)
-        losses = self.loss(batch)
-        self.optimiser.zero_grad()
-        total(losses).backward()
-        norm = nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
+        losses = self.losses(batch)
+        gradients = torch.autograd.grad(total(losses), self.weights)
+        for parameter, gradient in zip(self.live, self.method.gradients(gradients), strict=True):
+            parameter.grad = gradient
+        norm = nn.utils.clip_grad_norm_(self.live, self.max_grad_norm)
         self.optimiser.step()
+        self.method.settle()
         return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
     def measured(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:

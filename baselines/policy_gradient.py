@@ -52,6 +52,7 @@ class PolicyGradient(Learner):
     """
 
     num_epochs = num_minibatches = 1
+    output_keys = ("log_probs", "state_value")
 
     def __init__(
         self,
@@ -107,10 +108,14 @@ class PolicyGradient(Learner):
 
         The trunk runs once for actor and critic.
         """
-        features = self.trunk.over_time(batch)
-        log_probs = log_probabilities(self.actor, features)
-        taken = log_probs.gather(-1, batch["action"].unsqueeze(-1))
-        return log_probs, taken, self.critic.module(features)
+        said = self.outputs(batch)
+        taken = said["log_probs"].gather(-1, batch["action"].unsqueeze(-1))
+        return said["log_probs"], taken, said["state_value"]
+
+    def outputs(self, data: Data) -> dict[str, Tensor]:
+        """Log-probabilities of all actions and the value; see `Learner`."""
+        features = self.trunk.over_time(data)
+        return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Some epochs over a batch; returns mean losses, entropy and gradient norm."""

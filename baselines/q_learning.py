@@ -15,6 +15,7 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from baselines.learner import Learner, make_optimiser, one_of
+from baselines.networks import Data
 from baselines.prioritized import PrioritySampler
 from ctgraph_rl.checks import at_least_one, fraction, positive, require
 
@@ -56,6 +57,8 @@ class QLearner(Learner):
         replay_on_task_change: ``clear`` or ``keep`` the replay buffer where a task change is announced.
         compile: run gradient steps through ``torch.compile``; only without memory.
     """
+
+    output_keys = ("action_value",)
 
     priority_alpha = priority_beta = 0.0
     """How much more often surprising items are replayed, and how much of that the loss corrects."""
@@ -128,6 +131,20 @@ class QLearner(Learner):
         self.exploration.eps.copy_(self.exploration.eps_init)
         if self.replay_on_task_change == "clear":
             self.replay.empty()
+
+    def weights_changed(self) -> None:
+        """The target network is the same again."""
+        self.target_update.counter = self.target_update.value_network_update_interval
+        self.target_update.step()
+
+    def values(self, data: Data) -> Tensor:
+        """The network's action values, [..., num_actions]."""
+        raise NotImplementedError
+
+    def outputs(self, data: Data) -> dict[str, Tensor]:
+        """The action values, and what their softmax takes for log-probabilities; see `Learner`."""
+        values = self.values(data)
+        return {"log_probs": values.log_softmax(dim=-1), "action_value": values}
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """What the replay buffer stores of a batch with multi-step rewards, [items]."""

@@ -126,6 +126,11 @@ class RecurrentQ(QLearner):
         state = (("next", key) for key in STATE_KEYS)
         self.act_with(self.greedy, self.targets, action_spec, learning_rate, *state)
 
+    def values(self, data: Data) -> Tensor:
+        """The means of the online network's quantiles."""
+        head = self.greedy.module[0].module[1]
+        return head.module(self.trunk.over_time(data))[0]
+
     def items_of(self, num_steps: int) -> int:
         """A sequence is an item."""
         return num_steps // self.num_steps

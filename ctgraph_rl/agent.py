@@ -1,4 +1,4 @@
-"""The Agent protocol: what `learn_curriculum` asks of a learner."""
+"""The Agent protocol: what `learn_curriculum` asks of a learner; and what a run asks of a method that it wears."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any, Protocol
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+
+from ctgraph_rl.curriculum import Curriculum
 
 
 class Agent(Protocol):
@@ -35,7 +37,7 @@ class Agent(Protocol):
     """
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """What acts in the task with an id, where the protocol gives ids at boundaries; mostly `policy` itself."""
+        """What acts in the task with an id, where the protocol tells ids; mostly `policy` itself."""
         ...
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -50,7 +52,7 @@ class Agent(Protocol):
         """Called before the first batch of a block whose start is announced.
 
         Args:
-            task: the task's id, where the curriculum's protocol gives it at boundaries; else None.
+            task: the task's id, where the curriculum's protocol tells ids and the block has one task; else None.
         """
         ...
 
@@ -80,4 +82,24 @@ class Agent(Protocol):
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
         """Restore what `state_dict` gave."""
+        ...
+
+
+class Method(Protocol):
+    """A lifelong-learning method: it changes how an agent learns. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
+
+    def prepare(self, curriculum: Curriculum) -> Curriculum:
+        """What is learned in place of a curriculum: mostly the same.
+
+        Raises:
+            ValueError: if the curriculum does not tell what the method needs to know.
+        """
+        ...
+
+    def worn_by(self, agent: Agent, curriculum: Curriculum) -> Agent:
+        """A new agent with the method, for what `prepare` gave.
+
+        Raises:
+            ValueError: if the two cannot go together.
+        """
         ...

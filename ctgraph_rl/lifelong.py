@@ -204,8 +204,10 @@ def _enter(env: CTGraphEnv, block: Block, at_episode_end: bool = False) -> None:
 
 
 def _given_id(curriculum: Curriculum, block: Block) -> int | None:
-    """The task id that the agent is given at the start of a block, if it is."""
-    return curriculum.task_ids[block.tasks[0]] if curriculum.protocol.task_id == "at_boundaries" else None
+    """The task id that the agent is given at the announced start of a block of one task, unless ids are hidden."""
+    how = curriculum.protocol
+    told = how.task_id != "hidden" and how.boundaries == "announced" and len(set(block.tasks)) == 1
+    return curriculum.task_ids[block.tasks[0]] if told else None
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:
@@ -439,11 +441,12 @@ class Examiner:
         return {task: name for task, name in named.items() if task in seen or task in held_out}
 
     def _policy(self, agent: Agent, tasks: Iterable[Task]) -> Policy:
-        """The agent's policy; where it is given task ids, the one for each task."""
-        if self.curriculum.protocol.task_id != "at_boundaries":
+        """The agent's policy; where task ids are told, the one for each task."""
+        if self.curriculum.protocol.task_id == "hidden":
             return agent.policy
         ids = self.curriculum.task_ids
-        return by_slices([agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
+        policies = [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
+        return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
 
 
 def by_slices(policies: Sequence[Policy]) -> Policy:

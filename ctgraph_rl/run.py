@@ -36,6 +36,7 @@ from ctgraph_rl.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ctgraph_rl.agent import Agent
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.curriculum import Curriculum
     from ctgraph_rl.experts import Expert
@@ -87,12 +88,13 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Name of a run's directory: curriculum, agent, seed and a hash of the configuration."""
+    """Name of a run's directory: curriculum, agent, method if there is one, seed and a hash of the configuration."""
     text = json.dumps(plain(_root_), sort_keys=True)
     choices = _root_.hydra.runtime.choices
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+    learner = "-".join([choices.agent, *([choices.method] if choices.method != "finetune" else [])])
     seed = re.sub(r"\W", "_", str(_root_.seed))  # one that is refused later must not lead elsewhere
-    return f"{choices.curriculum}/{choices.agent}-seed{seed}-{digest}"
+    return f"{choices.curriculum}/{learner}-seed{seed}-{digest}"
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
@@ -238,12 +240,18 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     device = checked_device(cfg.device)
     torch.set_num_threads(cfg.num_threads)
     torch.set_flush_denormal(True)
-    curriculum = with_changes(target(cfg, "curriculum")(), cfg)
+    make_method = target(cfg, "method")
+    curriculum = make_method().prepare(with_changes(target(cfg, "curriculum")(), cfg))
     if cfg.experts and not curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
-    make_agent = target(cfg, "agent")
-    for checked in (curriculum, *(expert_curriculum(curriculum, task) for task in curriculum.tasks if cfg.experts)):
-        new_agent(checked, make_agent, cfg.seed)
+    make_alone = target(cfg, "agent")
+
+    def make_agent(observation_spec: Any, action_spec: Any) -> Agent:
+        return make_method().worn_by(make_alone(observation_spec, action_spec), curriculum)
+
+    new_agent(curriculum, make_agent, cfg.seed)
+    for task in curriculum.tasks if cfg.experts else ():
+        new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
 
     def checkpoints(folder: Path) -> Checkpoints:
         return Checkpoints(folder / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)

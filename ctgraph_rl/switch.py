@@ -78,7 +78,6 @@ class AtRandom:
         holds = is_real(self.prob, 0, 1) and self.prob > 0
         require((holds, f"prob must be in (0, 1], got {self.prob!r}"), _together_rule(self.together))
         object.__setattr__(self, "prob", float(self.prob))
-        object.__setattr__(self, "prob", float(self.prob))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""

@@ -1,0 +1,1 @@
+"""Lifelong-learning methods, which any agent that derives from `baselines.learner.Learner` can wear."""

@@ -1,0 +1,137 @@
+"""CLEAR: replay of a fair sample of all that was ever seen, where policy and values are to stay as they were.
+
+Rolnick et al. 2019 (NeurIPS, arXiv 1811.11682), the cloning losses of section 3.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from baselines.methods.method import Method
+from baselines.methods.weights import Weights
+from baselines.networks import Data
+from baselines.policy_gradient import loss_weight
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+
+class Reservoir:
+    """A sample of all items that were ever offered, each of which is in it with the same chance.
+
+    Vitter 1985, Algorithm R: item number n takes a random one of n places, if there are so many.
+
+    Args:
+        capacity: items at most.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity, self.offered = capacity, 0
+        self.items: dict[Any, Tensor] = {}
+
+    def __len__(self) -> int:
+        return min(self.offered, self.capacity)
+
+    def offer(self, items: Mapping[Any, Tensor]) -> None:
+        """Take items in, [n, ...] each, where chance gives them a place; the later of two has it."""
+        if not self.items:
+            self.items = {key: value.new_zeros(self.capacity, *value.shape[1:]) for key, value in items.items()}
+        number = next(iter(items.values())).shape[0]
+        order = torch.arange(self.offered, self.offered + number)
+        drawn = (torch.rand(number, dtype=torch.float64) * (order + 1)).long()
+        place = torch.where(order < self.capacity, order, drawn)
+        taken = place < self.capacity
+        last = torch.full([self.capacity], -1).scatter_reduce(0, place[taken], taken.nonzero().squeeze(-1), "amax")
+        places = (last >= 0).nonzero().squeeze(-1)
+        for key, value in items.items():
+            self.items[key][places.to(value.device)] = value.index_select(0, last[places].to(value.device))
+        self.offered += number
+
+    def sample(self, number: int) -> dict[Any, Tensor]:
+        """So many items, with repetition."""
+        places = torch.randint(len(self), [number])
+        return {key: value.index_select(0, places.to(value.device)) for key, value in self.items.items()}
+
+
+class CLEAR(Method):
+    """Adds what is lost by leaving earlier behaviour, on as many replayed steps as there are fresh ones in a minibatch.
+
+    L = policy_coeff KL(mu || pi) + value_coeff |V_mu - V|^2, where mu and V_mu are what the network said when the step
+    was made; for a Q-learner value_coeff |Q_mu - Q|^2. The agent's own losses are on its own data: the paper's
+    off-policy policy gradient (V-trace) on replayed steps is left out. It needs no task ids and no boundaries.
+
+    Stored are ``buffer_size`` steps, each with what the network reads and says, whatever the number of tasks; with
+    memory whole rows of a batch, of which those are left out that the end of a block has shortened.
+
+    Args:
+        buffer_size: steps.
+        policy_coeff: weight of the policy's cloning.
+        value_coeff: weight of the values' cloning.
+    """
+
+    needs_boundaries = False
+
+    def __init__(self, buffer_size: int, policy_coeff: float, value_coeff: float) -> None:
+        super().__init__()
+        require(
+            *at_least_one(buffer_size=buffer_size),
+            *loss_weight(policy_coeff=policy_coeff, value_coeff=value_coeff),
+        )
+        self.buffer_size, self.policy_coeff, self.value_coeff = buffer_size, policy_coeff, value_coeff
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().put_on(agent, weights, curriculum)
+        steps = agent.num_steps if agent.memory else 1
+        message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
+        require((self.buffer_size >= steps, message))
+        self.reservoir = Reservoir(self.buffer_size // steps)
+
+    @torch.no_grad()
+    def see(self, batch: TensorDictBase) -> None:
+        """Offer the steps, or with memory the rows, of a batch to the reservoir."""
+        agent = self.agent
+        if agent.memory and batch.shape[1] != agent.num_steps:
+            return
+        seen = {key: batch[key] for key in agent.policy.in_keys if key in batch.keys()}  # noqa: SIM118, rows otherwise
+        said = agent.outputs(seen)
+        items = {**seen, **{key: said[key] for key in agent.output_keys}}
+        self.reservoir.offer(items if agent.memory else {key: value.flatten(0, 1) for key, value in items.items()})
+
+    def mixed(self, batch: Data) -> Data:
+        """The minibatch with as many replayed items."""
+        replayed = self.reservoir.sample(len(batch["action"]))
+        return {**batch, **{("replay", key): value for key, value in replayed.items()}}
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """What is lost by leaving earlier behaviour."""
+        replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
+        now, losses = self.agent.outputs(replayed), {}
+        for key in self.agent.output_keys:
+            if key == "log_probs":
+                then = replayed[key]
+                kl = (then.exp() * (then - now[key])).sum(dim=-1)
+                losses["loss_policy_cloning"] = self.policy_coeff * kl.mean()
+            else:
+                losses["loss_value_cloning"] = self.value_coeff * (replayed[key] - now[key]).square().mean()
+        return losses
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What is in the reservoir."""
+        items = {key: value[: len(self.reservoir)].clone() for key, value in self.reservoir.items.items()}
+        return {"offered": self.reservoir.offered, "items": items}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` gave."""
+        self.reservoir = Reservoir(self.reservoir.capacity)
+        self.reservoir.offered = state["offered"]
+        for key, value in state["items"].items():
+            self.reservoir.items[key] = value.new_zeros(self.reservoir.capacity, *value.shape[1:])
+            self.reservoir.items[key][: len(value)] = value

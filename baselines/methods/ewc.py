@@ -1,0 +1,72 @@
+"""EWC: elastic weight consolidation, by the diagonal of the Fisher information.
+
+Kirkpatrick et al. 2017 (PNAS, arXiv 1612.00796), eq. (3); online as Schwarz et al. 2018 (arXiv 1805.06370).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from baselines.learner import one_of, true_or_false
+from baselines.methods.importance import SampledImportance
+from baselines.methods.weights import flat
+from baselines.networks import Data
+from ctgraph_rl.checks import fraction, require
+
+
+class EWC(SampledImportance):
+    """Adds lambda/2 * sum_i F_i (w_i - a_i)^2 for what was learned; F is the diagonal of the Fisher information.
+
+    Separate: one such term for each earlier task k, with its own F_k and weights a_k. As a sum of squares is a square,
+    they are kept exactly as one: F = sum_k F_k, a = sum_k F_k a_k / F. Online: F is the running mean
+    alpha F + (1 - alpha) F_k, and a are the weights at the end of the last task.
+
+    Args:
+        coeff: lambda.
+        online: one running term; False: a term for each task.
+        alpha: share of the earlier tasks in the running mean, in [0, 1].
+        fisher: ``policy``: F_i = E[sum_action pi(action|s) (d log pi(action|s) / d w_i)^2] over the samples, in closed
+            form over actions; a Q-learner's policy is the softmax of its values. ``loss``: the mean square of the
+            gradient of the agent's losses over minibatches, as in the code of Ben-Iwhiwhu et al. 2023.
+        settings: ``num_samples`` and ``heads`` of `SampledImportance`.
+    """
+
+    def __init__(self, coeff: float, online: bool, alpha: float, fisher: str, **settings: Any) -> None:
+        require(*true_or_false(online=online), *fraction(alpha=alpha), *one_of(("policy", "loss"), fisher=fisher))
+        super().__init__(coeff=coeff, **settings)
+        self.online, self.alpha, self.fisher = online, alpha, fisher
+        self.coeff = coeff / 2
+
+    def task_importance(self) -> Tensor:
+        """The diagonal of the Fisher information."""
+        return self.mean(self._of_policy) if self.fisher == "policy" else self._of_losses()
+
+    def remember(self, new: Tensor, weights: Tensor) -> None:
+        """Online: a running mean; separate: the sum of all tasks' terms."""
+        if not self.online:
+            total = self.importance + new
+            moved = torch.where(total > 0, (self.importance * self.anchor + new * weights) / total, weights)
+            self.importance.copy_(total)
+            self.anchor.copy_(moved)
+            return
+        first = not self.importance.any()
+        self.importance.copy_(new if first else self.alpha * self.importance + (1 - self.alpha) * new)
+        self.anchor.copy_(weights)
+
+    def _of_policy(self, item: Data) -> Iterator[Tensor]:
+        log_probs = self.agent.outputs(item)["log_probs"].flatten(0, -2)
+        for of_step in log_probs:
+            for log_prob in of_step:
+                yield log_prob.exp().detach() * self.gradient(log_prob).square()
+
+    def _of_losses(self) -> Tensor:
+        total, minibatches = torch.zeros_like(self.importance), self.samples.minibatches
+        for minibatch in minibatches:
+            losses = [value for key, value in self.agent.loss(minibatch).items() if key.startswith("loss_")]
+            gradients = torch.autograd.grad(sum(losses), self.weights.parameters, materialize_grads=True)  # type: ignore[arg-type]
+            total += flat(gradients).square()
+        return total / max(len(minibatches), 1)

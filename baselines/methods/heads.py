@@ -1,0 +1,62 @@
+"""Output layers of each task's own on a trunk that all tasks share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from baselines.methods.method import TaskMethod
+from baselines.methods.weights import Weights
+from ctgraph_rl.checks import require
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+
+class Heads(TaskMethod):
+    """Each task has its own last linear layers of policy and critic; a new task's are those the agent began with.
+
+    Stored are their weights, 4 H bytes for each of the curriculum's tasks, and for the beginning.
+    """
+
+    kept: Tensor  # float32 [tasks, H]
+    first: Tensor  # float32 [H]
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().put_on(agent, weights, curriculum)
+        self.inside = weights.in_heads
+        message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
+        require((bool(self.inside.any()), f"{message}: use heads=single"))
+        first = weights.vector().detach()[self.inside]
+        self.register_buffer("first", first)
+        self.register_buffer("kept", first.repeat(self.num_tasks, 1))
+
+    @torch.no_grad()
+    def start_task(self, task: int | None) -> None:
+        """Go over to a task's output layers; the optimiser forgets what it knew of the former ones."""
+        super().start_task(task)
+        inside = self.inside.to(self.kept.device)
+        weights = self.weights.vector()
+        weights[inside] = self.kept[self.place]
+        self.weights.write(weights)
+        self.agent.forget(self.weights.in_head_parameters)
+        self.agent.weights_changed()
+
+    @torch.no_grad()
+    def end_task(self) -> None:
+        """Keep the task's."""
+        self.kept[self.place] = self.weights.vector()[self.inside.to(self.kept.device)]
+
+    @torch.no_grad()
+    def weights_of(self, task: int) -> Tensor | None:
+        """The present weights with a task's output layers."""
+        place = self.place_of(task)
+        if not self.begun or place == self.place:
+            return None
+        weights = self.weights.vector()
+        weights[self.inside.to(weights.device)] = self.kept[place]
+        return weights

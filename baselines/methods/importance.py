@@ -1,0 +1,169 @@
+"""What methods share that hold the weights near those of earlier tasks, each as firmly as it was important."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from baselines.learner import one_of
+from baselines.methods.heads import Heads
+from baselines.methods.method import Method
+from baselines.methods.weights import Weights, flat
+from baselines.networks import Data
+from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+
+class Importance(Method):
+    """Adds coeff * sum_i I_i (w_i - a_i)^2 to the losses: I is how important weights were, a where they were.
+
+    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; with ``heads="multi"``
+    also the output layers of each task, see `Heads`.
+
+    Args:
+        coeff: weight of what is added.
+        heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
+            own, which are not held.
+    """
+
+    importance: Tensor  # float32 [P]
+    anchor: Tensor  # float32 [P]
+    held: Tensor  # float32 [P]: 1 where weights are held, 0 in output layers of a task's own
+
+    def __init__(self, coeff: float, heads: str) -> None:
+        super().__init__()
+        require(*positive(coeff=coeff), *one_of(("single", "multi"), heads=heads))
+        self.coeff = coeff
+        self.heads = Heads() if heads == "multi" else None
+
+    def prepare(self, curriculum: Curriculum) -> Curriculum:
+        """See `Method`; separate output layers need task ids."""
+        super().prepare(curriculum)
+        return curriculum if self.heads is None else self.heads.prepare(curriculum)
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().put_on(agent, weights, curriculum)
+        self.register_buffer("importance", torch.zeros(len(weights)))
+        self.register_buffer("anchor", torch.zeros(len(weights)))
+        if self.heads is not None:
+            self.heads.put_on(agent, weights, curriculum)
+        self.register_buffer("held", torch.ones(len(weights)) if self.heads is None else 1.0 - weights.in_heads.float())
+
+    def start_task(self, task: int | None) -> None:
+        """Go to the task's output layers."""
+        if self.heads is not None:
+            self.heads.start_task(task)
+
+    @torch.no_grad()
+    def end_task(self) -> None:
+        """Weigh up what the task needs."""
+        with torch.enable_grad():
+            new = self.task_importance()
+        self.remember(new * self.held, self.weights.vector())
+        if self.heads is not None:
+            self.heads.end_task()
+
+    def task_importance(self) -> Tensor:
+        """How important the weights are for the task that ends, float32 [P], each >= 0."""
+        raise NotImplementedError
+
+    def remember(self, new: Tensor, weights: Tensor) -> None:
+        """Sum importances up, and hold the weights where they are now."""
+        self.importance += new
+        self.anchor.copy_(weights)
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """What is lost by moving away."""
+        gap = self.weights.vector() - self.anchor
+        return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
+
+    def weights_of(self, task: int) -> Tensor | None:
+        """The present weights with the task's own output layers."""
+        return None if self.heads is None else self.heads.weights_of(task)
+
+
+class Samples:
+    """The last minibatches that were learned from, of at least so many frames in all.
+
+    Args:
+        num_frames: frames.
+    """
+
+    def __init__(self, num_frames: int) -> None:
+        require(*at_least_one(num_samples=num_frames))
+        self.num_frames = num_frames
+        self.minibatches: deque[dict[Any, Tensor]] = deque()
+
+    def add(self, minibatch: Data) -> None:
+        """Take a minibatch in, and drop those that are not needed any more."""
+        self.minibatches.append(dict(minibatch))
+        sizes = [each["action"].numel() for each in self.minibatches]
+        while sum(sizes) - sizes[0] >= self.num_frames:
+            self.minibatches.popleft()
+            sizes.pop(0)
+
+    def items(self) -> Iterator[dict[Any, Tensor]]:
+        """The items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
+        frames = 0
+        for minibatch in reversed(self.minibatches):
+            for number in range(len(minibatch["action"])):
+                if frames >= self.num_frames:
+                    return
+                item = {key: value[number : number + 1] for key, value in minibatch.items()}
+                frames += item["action"].numel()
+                yield item
+
+    def state(self) -> list[dict[Any, Tensor]]:
+        """Plain values for a state dict."""
+        return list(self.minibatches)
+
+    def restore(self, state: Sequence[Mapping[Any, Tensor]]) -> None:
+        """Go back to what `state` gave."""
+        self.minibatches = deque(dict(minibatch) for minibatch in state)
+
+
+class SampledImportance(Importance):
+    """`Importance` that is a mean over what was learned from last.
+
+    Args:
+        num_samples: frames.
+        settings: the arguments of `Importance`.
+    """
+
+    def __init__(self, num_samples: int, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.samples = Samples(num_samples)
+
+    def mixed(self, batch: Data) -> Data:
+        """The minibatch itself, which is kept for the end of the task."""
+        self.samples.add(batch)
+        return batch
+
+    def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
+        """The sum of the terms of every sample, [P] each, over the number of frames."""
+        total, frames = torch.zeros_like(self.importance), 0
+        for item in self.samples.items():
+            for term in terms(item):
+                total += term
+            frames += item["action"].numel()
+        return total / max(frames, 1)
+
+    def gradient(self, value: Tensor) -> Tensor:
+        """The gradient of a number by the weights, [P]; the number's graph is kept."""
+        return flat(torch.autograd.grad(value, self.weights.parameters, retain_graph=True, materialize_grads=True))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The samples."""
+        return {"samples": self.samples.state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` gave."""
+        self.samples.restore(state["samples"])

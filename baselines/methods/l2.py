@@ -1,0 +1,27 @@
+"""L2: all weights are held near where they were at the end of the last task.
+
+The simplest baseline of Kirkpatrick et al. 2017 (arXiv 1612.00796), where EWC was compared with it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from baselines.methods.importance import Importance
+
+
+class L2(Importance):
+    """Adds coeff * |w - a|^2; a are the weights at the end of the last task.
+
+    The arguments are those of `Importance`.
+    """
+
+    def task_importance(self) -> Tensor:
+        """1 for all weights."""
+        return torch.ones_like(self.importance)
+
+    def remember(self, new: Tensor, weights: Tensor) -> None:
+        """All are equally important after any number of tasks."""
+        self.importance.copy_(new)
+        self.anchor.copy_(weights)

@@ -1,0 +1,32 @@
+"""MAS: memory aware synapses, important is what the network's outputs are sensitive to.
+
+Aljundi et al. 2018 (ECCV, arXiv 1711.09601), eqs. (2) to (4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from baselines.methods.importance import SampledImportance
+from baselines.networks import Data
+
+
+class MAS(SampledImportance):
+    """Adds coeff * sum_i O_i (w_i - a_i)^2, O_i = sum over tasks of the mean |d |f(s)|^2 / d w_i| over samples.
+
+    f are all of the network's outputs: log-probabilities and value, or action values; a are the weights at the end of
+    the last task. The arguments are those of `SampledImportance`.
+    """
+
+    def task_importance(self) -> Tensor:
+        """The mean sensitivity of the squared length of the outputs."""
+        return self.mean(self._sensitivity)
+
+    def _sensitivity(self, item: Data) -> Iterator[Tensor]:
+        outputs = self.agent.outputs(item)
+        shown = torch.cat([outputs[key] for key in self.agent.output_keys], dim=-1).flatten(0, -2)
+        for of_step in shown:
+            yield self.gradient(of_step.square().sum()).abs()

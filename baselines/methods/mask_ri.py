@@ -1,0 +1,12 @@
+"""Mask RI: modulating masks, each task's begins at random.
+
+Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_RI.
+"""
+
+from __future__ import annotations
+
+from baselines.methods.masks import Masks
+
+
+class MaskRI(Masks):
+    """`Masks` with random scores for each new task, so that nothing is transferred between tasks."""

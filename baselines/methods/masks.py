@@ -1,0 +1,174 @@
+"""What methods with modulating masks share: a fixed random network, and for each task which of its weights count.
+
+Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), on the supermasks of Wortsman et al. 2020 (arXiv 2006.14769).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from baselines.methods.method import TaskMethod
+from baselines.methods.weights import Weights, flat
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+
+class Masks(TaskMethod):
+    """The weights are w = c * 1[s >= 0], elementwise: c is drawn once and fixed, the scores s of each task are learned.
+
+    c has the sign of the weights that the agent was built with and the size sqrt(2 / inputs of the layer); biases are
+    0. Scores begin uniform in +-1 / sqrt(inputs), and their gradient is that of the mask (straight through):
+    dL/ds = c dL/dw. What a class adds is how a new task's scores begin.
+
+    Stored are c, the scores of each of the curriculum's tasks and those of the present one: 4 P bytes each; a mask
+    alone could be kept in P bits.
+    """
+
+    constant: Tensor  # c, float32 [P]
+    scores: Tensor  # of tasks that have ended, in the order of their beginning; float32 [tasks, P]
+    own: nn.Parameter  # the scores that are learned, float32 [P]
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`; the optimiser changes scores from now on."""
+        super().put_on(agent, weights, curriculum)
+        self.ended = 0
+        """Tasks whose scores are kept."""
+
+        constant = flat([_signed_constant(parameter) for parameter in weights.parameters])
+        self.register_buffer("constant", constant.detach())
+        self.register_buffer("scores", torch.zeros(self.num_tasks, len(weights)))
+        self.own = nn.Parameter(self.new_scores())
+        agent.optimise(self.live)
+        self._write()
+
+    @property
+    def live(self) -> list[nn.Parameter]:
+        """What the optimiser changes."""
+        return [self.own]
+
+    def new_scores(self) -> Tensor:
+        """Random scores, float32 [P]."""
+        with torch.no_grad():
+            return flat([_drawn_scores(parameter) for parameter in self.weights.parameters])
+
+    def present_scores(self) -> Tensor:
+        """The scores that make the present mask, float32 [P], as a function of what is learned."""
+        return self.own
+
+    @torch.no_grad()
+    def start_task(self, task: int | None) -> None:
+        """Begin with a new task's scores, or go back to those of a task that was here before."""
+        super().start_task(task)
+        known = self.place < self.ended
+        self.own.copy_(self.scores[self.place] if known else self.new_scores())
+        self.agent.optimise(self.live)
+        self._write()
+        self.agent.weights_changed()
+
+    @torch.no_grad()
+    def end_task(self) -> None:
+        """Keep the task's scores."""
+        self.scores[self.place] = self.present_scores()
+        self.own.copy_(self.scores[self.place])
+        self.ended = max(self.ended, self.place + 1)
+
+    def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Those of what is learned, through the scores."""
+        with torch.enable_grad():
+            scores = self.present_scores()
+        return torch.autograd.grad(scores, self.live, self.constant * flat(gradients), materialize_grads=True)
+
+    def settle(self) -> None:
+        """Give the network the weights that count now."""
+        self._write()
+
+    @torch.no_grad()
+    def weights_of(self, task: int) -> Tensor | None:
+        """The weights that count in a task."""
+        place = self.place_of(task)
+        return None if not self.begun or place == self.place else self._masked(self.scores[place])
+
+    @torch.no_grad()
+    def _write(self) -> None:
+        self.weights.write(self._masked(self.present_scores()))
+
+    def _masked(self, scores: Tensor) -> Tensor:
+        return torch.where(scores >= 0, self.constant, 0.0)
+
+    def get_extra_state(self) -> dict[str, object]:
+        """Who has which place, and how many have ended."""
+        return {**super().get_extra_state(), "ended": self.ended}
+
+    def set_extra_state(self, state: dict[str, object]) -> None:
+        """Restore what `get_extra_state` gave."""
+        super().set_extra_state(state)
+        self.ended = state["ended"]  # type: ignore[assignment]
+
+
+class CombinedMasks(Masks):
+    """`Masks` whose new scores are a linear combination of those of earlier tasks and of new ones.
+
+    In the k-th task each weight tensor l has s = sum_i a_i s_i + a_k s_k, where a is the softmax of k learned numbers
+    b_l; the earlier tasks' scores s_i stay as they are. At the task's end s is kept as its scores. The numbers b take 4
+    bytes for each task and weight tensor.
+    """
+
+    betas: nn.Parameter  # b, float32 [weight tensors, tasks]; the last one in use is the new scores'
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        self.betas = nn.Parameter(torch.zeros(len(weights.parameters), len(curriculum.tasks)))
+        super().put_on(agent, weights, curriculum)
+
+    @property
+    def live(self) -> list[nn.Parameter]:
+        """The new scores, and the weights of the combination where there is one."""
+        return [self.own, self.betas]
+
+    @property
+    def num_combined(self) -> int:
+        """Earlier tasks whose scores the present task's are made from."""
+        return self.ended if self.place >= self.ended else 0
+
+    def new_betas(self, num_earlier: int) -> Tensor:
+        """What the learned numbers of the earlier tasks, and behind them of the new scores, begin with."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def start_task(self, task: int | None) -> None:
+        """Begin with a new task's combination."""
+        new = task not in self.begun
+        if new:
+            self.betas.zero_()
+            self.betas[:, : len(self.begun) + 1] = self.new_betas(len(self.begun))
+        super().start_task(task)
+
+    def present_scores(self) -> Tensor:
+        """The combination."""
+        earlier = self.num_combined
+        if not earlier:
+            return self.own
+        shares = self.betas[:, : earlier + 1].softmax(dim=-1)
+        parts = zip(shares, self.weights.split(self.scores[:earlier]), self.weights.split(self.own), strict=True)
+        return torch.cat([(share[:-1, None] * old).sum(dim=0) + share[-1] * new for share, old, new in parts])
+
+
+def _signed_constant(parameter: Tensor) -> Tensor:
+    """The sign of weights times sqrt(2 / inputs); 0 for biases."""
+    if parameter.ndim < 2:
+        return torch.zeros_like(parameter)
+    return parameter.sign() * (2 / parameter[0].numel()) ** 0.5
+
+
+def _drawn_scores(parameter: Tensor) -> Tensor:
+    """Uniform in +-1 / sqrt(inputs); 0 for biases."""
+    if parameter.ndim < 2:
+        return torch.zeros_like(parameter)
+    most = parameter[0].numel() ** -0.5
+    return torch.empty_like(parameter).uniform_(-most, most)

@@ -1,0 +1,37 @@
+"""Multitask: all tasks at once, the upper reference of forgetting."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from baselines.methods.method import Method
+from ctgraph_rl.checks import require
+from ctgraph_rl.curriculum import Block, Curriculum
+from ctgraph_rl.switch import ByEpisode
+
+
+class Multitask(Method):
+    """In place of the blocks there is one with all their tasks and frames; each row takes them in turn by the episode.
+
+    Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look different can all be solved.
+    """
+
+    needs_boundaries = False
+
+    def prepare(self, curriculum: Curriculum) -> Curriculum:
+        """The tasks at once.
+
+        Raises:
+            ValueError: for one task alone, and ids that are given at boundaries.
+        """
+        super().prepare(curriculum)
+        tasks = curriculum.tasks
+        require(
+            (len(tasks) > 1, "Multitask needs at least two tasks, got one"),
+            (
+                curriculum.protocol.task_id != "at_boundaries",
+                "Multitask has no boundaries to give task ids at: set protocol.task_id=one_hot or hidden",
+            ),
+        )
+        at_once = Block(tasks, curriculum.num_frames, ByEpisode())
+        return replace(curriculum, blocks=(at_once,))

@@ -1,0 +1,148 @@
+"""PackNet: each task gets a share of the network's weights, which then stay as they are.
+
+Mallya and Lazebnik 2018 (CVPR, arXiv 1711.05769).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from baselines.methods.heads import Heads
+from baselines.methods.method import TaskMethod
+from baselines.methods.weights import Weights
+from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+FREE = -1
+"""Owner of a weight that no task has yet."""
+
+
+class PackNet(TaskMethod):
+    """In each block the free weights are trained; then the smallest are pruned, and the rest trained further and kept.
+
+    The k-th of K tasks keeps, of each weight matrix, the largest 1 / (K - k + 1) of the weights that are free; pruned
+    ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are the first
+    task's, output layers each task's own, see `Heads`. A task that comes again trains its output layers alone.
+
+    Stored are each weight's owner, 2 P bytes, whether it may change, P bytes, its value, 4 P bytes, and the output
+    layers.
+
+    Args:
+        retrain: share of a block's frames, at its end, that is trained after pruning, in [0, 1).
+    """
+
+    owner: Tensor  # int16 [P]: the place of the task that keeps a weight, or FREE
+    packed: Tensor  # float32 [P]: kept weights
+    live: Tensor  # bool [P]: weights that may change
+
+    def __init__(self, retrain: float) -> None:
+        super().__init__()
+        ok = is_real(retrain, 0, 1) and retrain < 1
+        require((ok, f"retrain must be a number in [0, 1), got {retrain!r}"))
+        self.retrain = retrain
+        self.heads = Heads()
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().put_on(agent, weights, curriculum)
+        self.heads.put_on(agent, weights, curriculum)
+        self.budgets = [block.num_frames for block in curriculum.blocks]
+        self.block = -1
+        self.frames = 0
+        size = len(weights)
+        self.register_buffer("owner", torch.full([size], FREE, dtype=torch.int16))
+        self.register_buffer("packed", torch.zeros(size))
+        self.register_buffer("live", torch.ones(size, dtype=torch.bool))
+        self.in_matrices = weights.in_matrices & ~weights.in_heads
+        self.in_heads = weights.in_heads
+
+    @torch.no_grad()
+    def start_task(self, task: int | None) -> None:
+        """Free weights may change; in a task that was here before, only its output layers."""
+        new = task not in self.begun
+        super().start_task(task)
+        self.heads.start_task(task)
+        self.block, self.frames = self.block + 1, 0
+        first = new and self.place == 0
+        may = (self.owner == FREE) & new & (self._within(self.in_matrices) | first) | self._within(self.in_heads)
+        self.live.copy_(may)
+        self._take(self.place, keep=self.live)
+        self.agent.forget(self.weights.parameters)
+
+    @torch.no_grad()
+    def end_task(self) -> None:
+        """Prune, if that was not done yet; from now on the task's weights stay."""
+        self._prune()
+        self.packed.copy_(torch.where(self.owner == self.place, self.weights.vector(), self.packed))
+        self.heads.end_task()
+
+    def see(self, batch: TensorDictBase) -> None:
+        """Prune when only the share of frames for retraining is left."""
+        budget = self.budgets[self.block % len(self.budgets)]
+        if self.frames >= (1 - self.retrain) * budget:
+            self._prune()
+        self.frames += batch.numel()
+
+    def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Those of weights that may change; 0 for the others."""
+        live = self.weights.split(self.live)
+        return [gradient * part.view_as(gradient) for gradient, part in zip(gradients, live, strict=True)]
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Take back what the optimiser changed in weights that may not change."""
+        self.weights.write(torch.where(self.live, self.weights.vector(), self.packed))
+
+    @torch.no_grad()
+    def weights_of(self, task: int) -> Tensor | None:
+        """The weights of the tasks up to this one, with its output layers."""
+        place = self.place_of(task)
+        if not self.begun or place == self.place:
+            return None
+        weights = torch.where((self.owner >= 0) & (self.owner <= place), self.packed, 0.0)
+        weights[self._within(self.in_heads)] = self.heads.kept[place]
+        return weights
+
+    @torch.no_grad()
+    def _prune(self) -> None:
+        """Of the free weights that were trained, keep the largest share and give the others back."""
+        trained = self.live & ~self._within(self.in_heads) & (self.owner == FREE)
+        if not trained.any():
+            return
+        weights, kept = self.weights.vector(), torch.zeros_like(self.live)
+        share = 1 / (self.num_tasks - self.place)
+        parts = zip(*(self.weights.split(each) for each in (weights, trained, kept)), strict=True)
+        for parameter, (values, free, keep) in zip(self.weights.parameters, parts, strict=True):
+            count = int(free.sum())
+            most = count if parameter.ndim < 2 else round(share * count)
+            keep[values.abs().masked_fill(~free, -1.0).topk(most).indices] = True
+        self.owner[kept] = self.place
+        self.live.copy_(kept | self._within(self.in_heads))
+        self._take(self.place, keep=self.live)
+
+    def _take(self, place: int, keep: Tensor) -> None:
+        """Give the network a task's weights: present ones where told, else those packed up to it, or 0."""
+        before = torch.where((self.owner >= 0) & (self.owner <= place), self.packed, 0.0)
+        weights = torch.where(keep, self.weights.vector(), before)
+        self.weights.write(weights)
+        self.agent.weights_changed()
+
+    def _within(self, chosen: Tensor) -> Tensor:
+        return chosen.to(self.owner.device)
+
+    def get_extra_state(self) -> dict[str, object]:
+        """Who has which place, and how far the block is."""
+        return {**super().get_extra_state(), "block": self.block, "frames": self.frames}
+
+    def set_extra_state(self, state: dict[str, object]) -> None:
+        """Restore what `get_extra_state` gave."""
+        super().set_extra_state(state)
+        self.block, self.frames = state["block"], state["frames"]  # type: ignore[assignment]

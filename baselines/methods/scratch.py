@@ -1,0 +1,55 @@
+"""Scratch: a fresh network for each task, the reference without any transfer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from baselines.methods.method import TaskMethod
+from baselines.methods.weights import Weights
+from ctgraph_rl.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from baselines.learner import Learner
+
+
+class Scratch(TaskMethod):
+    """Each task has a network of its own, drawn anew; its optimiser starts anew, too.
+
+    Stored are 4 P bytes for each of the curriculum's tasks. Nothing is forgotten and nothing is transferred.
+    """
+
+    kept: Tensor  # float32 [tasks, P]
+
+    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().put_on(agent, weights, curriculum)
+        self.register_buffer("kept", torch.zeros(self.num_tasks, len(weights)))
+
+    def start_task(self, task: int | None) -> None:
+        """Go to the task's network; that of the first is the one the agent began with."""
+        new = bool(self.begun) and task not in self.begun
+        super().start_task(task)
+        if new:
+            self.agent.policy.apply(_draw)
+        elif len(self.begun) > 1 or self.kept[self.place].any():
+            self.weights.write(self.kept[self.place])
+        self.agent.forget(self.weights.parameters)
+        self.agent.weights_changed()
+
+    def end_task(self) -> None:
+        """Keep the task's network."""
+        self.kept[self.place] = self.weights.vector().detach()
+
+    def weights_of(self, task: int) -> Tensor | None:
+        """The task's network."""
+        place = self.place_of(task)
+        return None if not self.begun or place == self.place else self.kept[place]
+
+
+def _draw(module: nn.Module) -> None:
+    """Draw the weights of a layer, as PyTorch does at its construction."""
+    if isinstance(module, (nn.Linear, nn.LSTM)):
+        module.reset_parameters()

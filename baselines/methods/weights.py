@@ -1,0 +1,89 @@
+"""The weights of an agent's network as one vector, which most methods are written in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+
+
+class Weights:
+    """The parameters that an agent learns, P numbers in all.
+
+    Args:
+        policy: what acts; it has all of the parameters.
+        parameters: what the agent's losses are differentiated by.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, parameters: Sequence[nn.Parameter]) -> None:
+        self.parameters = list(parameters)
+        self.sizes = [parameter.numel() for parameter in self.parameters]
+        names = {id(parameter): name for name, parameter in policy.named_parameters()}
+        self.names = [names[id(parameter)] for parameter in self.parameters]
+        self.head_names = head_names(policy)
+
+    def __len__(self) -> int:
+        return sum(self.sizes)
+
+    def vector(self) -> Tensor:
+        """A copy, float32 [P]; gradients reach the parameters."""
+        return flat(self.parameters)
+
+    @torch.no_grad()
+    def write(self, vector: Tensor) -> None:
+        """Give the parameters the values of a vector, [P]."""
+        for parameter, part in zip(self.parameters, self.split(vector), strict=True):
+            parameter.copy_(part.view_as(parameter))
+
+    def split(self, vector: Tensor) -> Sequence[Tensor]:
+        """The parts of a vector [..., P] that belong to each parameter."""
+        return vector.split(self.sizes, dim=-1)
+
+    def where(self, chosen: Mapping[str, bool]) -> Tensor:
+        """bool [P]: the numbers in the parameters with these names."""
+        sizes = zip(self.names, self.parameters, strict=True)
+        return flat(
+            [torch.full_like(parameter, chosen.get(name, False), dtype=torch.bool) for name, parameter in sizes]
+        )
+
+    @property
+    def in_heads(self) -> Tensor:
+        """bool [P]: the numbers of the output layers."""
+        return self.where(dict.fromkeys(self.head_names, True))
+
+    @property
+    def in_head_parameters(self) -> list[nn.Parameter]:
+        """The parameters of the output layers."""
+        named = zip(self.names, self.parameters, strict=True)
+        return [parameter for name, parameter in named if name in self.head_names]
+
+    @property
+    def in_matrices(self) -> Tensor:
+        """bool [P]: the numbers of weight matrices, which are no biases."""
+        return self.where({name: value.ndim > 1 for name, value in zip(self.names, self.parameters, strict=True)})
+
+    @torch.no_grad()
+    def give(self, policy: TensorDictModuleBase, vector: Tensor) -> None:
+        """Give a copy of the policy the weights of a vector."""
+        parameters = dict(policy.named_parameters())
+        for name, part in zip(self.names, self.split(vector), strict=True):
+            parameters[name].copy_(part.view_as(parameters[name]))
+
+
+def flat(tensors: Sequence[Tensor]) -> Tensor:
+    """Tensors as one vector."""
+    return torch.cat([tensor.flatten() for tensor in tensors])
+
+
+def head_names(policy: TensorDictModuleBase) -> list[str]:
+    """The parameters of a policy's output layers: the last linear layer of each module behind the trunk."""
+    names = []
+    for place, module in policy.named_modules():
+        behind = isinstance(module, TensorDictModule) and isinstance(module.module, nn.Module)
+        if behind and "observation" not in module.in_keys:
+            layers = [name for name, layer in module.named_modules() if isinstance(layer, nn.Linear)]
+            parts = ("weight", "bias") if layers else ()
+            names += [".".join(filter(None, (place, layers[-1], part))) for part in parts]
+    return names
