@@ -28,14 +28,9 @@ def compiled_step() -> Step:
 
     Each call gives code of its own, as the number of compilations of one is limited.
     """
+    torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
     code = whole_step.__code__.replace()
-    step = torch.compile(FunctionType(code, whole_step.__globals__), fullgraph=True, dynamic=False)
-
-    def run(learner: Learner, batch: Data) -> dict[str, Tensor]:
-        with torch._dynamo.config.patch(trace_autograd_ops=True):  # so that gradients are in the graph
-            return step(learner, batch)
-
-    return run
+    return torch.compile(FunctionType(code, whole_step.__globals__), fullgraph=True, dynamic=False)
 
 
 def whole_step(learner: Learner, batch: Data) -> dict[str, Tensor]:
