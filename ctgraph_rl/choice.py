@@ -128,8 +128,6 @@ def _of_run(run: Path, number: int) -> Choice:
     from ctgraph_rl.trained import load
 
     trained = load(run)
-    agent, curriculum = trained.agent, trained.curriculum
-    chosen = _of_curriculum(curriculum, number)
-    at_boundaries = curriculum.protocol.task_id == "at_boundaries"
-    policy = agent.policy_for(curriculum.task_ids[chosen.task]) if at_boundaries else agent.policy
-    return chosen._replace(policy=policy, initial_state=agent.initial_state, curriculum=curriculum)
+    chosen = _of_curriculum(trained.curriculum, number)
+    policy, initial_state = trained.policy_for(chosen.task), trained.agent.initial_state
+    return chosen._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

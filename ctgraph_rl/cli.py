@@ -15,6 +15,7 @@ COMMANDS = {
     "curricula": "curricula.__main__",
     "draw": "ctgraph_rl.pictures",
     "export": "ctgraph_rl.export",
+    "methods": "baselines.methods.__main__",
     "play": "ctgraph_rl.play",
     "report": "ctgraph_rl.report.__main__",
     "results": "ctgraph_rl.results",
@@ -23,7 +24,7 @@ COMMANDS = {
 
 
 def main() -> None:
-    """``ctgraph-rl agents|curricula|draw|export|play|report|results ...``; anything else is for `ctgraph_rl.run`."""
+    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; anything else is for `ctgraph_rl.run`."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in COMMANDS:
         _require_ours(COMMANDS[word])

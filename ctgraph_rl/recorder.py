@@ -104,7 +104,7 @@ class Recorder:
         Args:
             policy: who plays; see the class.
             frames: frames learned from so far, more than at the last evaluation.
-            policy_for: instead of ``policy``, where the protocol gives task ids at boundaries: the policy for an id.
+            policy_for: instead of ``policy``, where the protocol tells task ids: the policy for an id.
 
         Returns:
             The mean return on each task, by label.
@@ -177,14 +177,15 @@ class Recorder:
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
         greedy = self.curriculum.evaluation.greedy
-        if policy_for is None:
-            return adapt(policy, greedy, self.curriculum.protocol.task_id == "one_hot")
         ids, told = self.curriculum.task_ids, self.curriculum.protocol.task_id
-        given = f"policy_for is for task ids given at_boundaries, but they are {told} in this protocol: give policy"
-        require((told == "at_boundaries", given))
+        if policy_for is None:
+            return adapt(policy, greedy, told == "one_hot")
+        require((told != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
         unknown = [task for task in self._examiner.examined(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
-        return by_slices([adapt(policy_for(ids[task]), greedy) for task in self._examiner.examined(frames)])
+        return by_slices(
+            [adapt(policy_for(ids[task]), greedy, told == "one_hot") for task in self._examiner.examined(frames)]
+        )
 
 
 def _is_json(about: object) -> bool:

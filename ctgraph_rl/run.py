@@ -36,7 +36,6 @@ from ctgraph_rl.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ctgraph_rl.agent import Agent
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.curriculum import Curriculum
     from ctgraph_rl.experts import Expert
@@ -234,7 +233,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
 
     from ctgraph_rl.checkpoints import Checkpoints
     from ctgraph_rl.experts import expert_curriculum
-    from ctgraph_rl.train import new_agent, remove_results, train
+    from ctgraph_rl.train import new_agent, remove_results, train, wearing
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -246,9 +245,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
     make_alone = target(cfg, "agent")
 
-    def make_agent(observation_spec: Any, action_spec: Any) -> Agent:
-        return make_method().worn_by(make_alone(observation_spec, action_spec), curriculum)
-
+    make_agent = wearing(make_alone, make_method, curriculum)
     new_agent(curriculum, make_agent, cfg.seed)
     for task in curriculum.tasks if cfg.experts else ():
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)

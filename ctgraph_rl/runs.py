@@ -28,6 +28,9 @@ OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
 ABOUT = ("curriculum", "fingerprint", "config")
 """What the first line of a log must have."""
 
+NO_METHOD = "Finetune"
+"""The method of a run whose agent is as it is; such a run is one of a configuration without a method."""
+
 Curve = list[tuple[int, float]]
 """Mean returns after numbers of frames; NaN for one without a value."""
 
@@ -51,7 +54,7 @@ class Run:
     Args:
         path: the directory.
         about: the first line of its log.
-        agent: class or name of who learned; None if the configuration does not say.
+        agent: class or name of who learned, ``PPO + EWC`` with a method; None if the configuration does not say.
         settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
             with them if there is no agent.
         seed: the seed.
@@ -136,6 +139,8 @@ def read_run(path: Path) -> Run:
     file = path / LOG
     about = _about(file)
     config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
+    if _called(config.get("method")) == NO_METHOD:
+        del config["method"]
     seed, agent = config.pop("seed"), _agent(config)
     settings = {**dict(flat(config)), **({"directory": str(path.resolve())} if agent is None else {})}
     try:
@@ -174,11 +179,17 @@ def _about(file: Path) -> dict[str, Any]:
 
 
 def _agent(config: Mapping[str, Any]) -> str | None:
-    """The class of the agent that was built, or the name that whoever recorded the run gave."""
-    agent = config.get("agent")
-    if isinstance(agent, Mapping) and "_target_" in agent:
-        return str(agent["_target_"]).rpartition(".")[2]
-    return next((name for name in (agent, config.get("learner")) if isinstance(name, str) and name), None)
+    """The agent and its method, each by its class or by the name that whoever recorded the run gave."""
+    agent = _called(config.get("agent")) or _called(config.get("learner"))
+    method = _called(config.get("method"))
+    return f"{agent} + {method}" if agent and method else agent
+
+
+def _called(part: Any) -> str | None:
+    """The class that a part of a configuration builds, or the part itself if it is a name."""
+    if isinstance(part, Mapping) and "_target_" in part:
+        return str(part["_target_"]).rpartition(".")[2]
+    return part if isinstance(part, str) and part else None
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -295,7 +306,8 @@ def _differing(runs: Sequence[Run]) -> list[str]:
 
 
 def _named(run: Run, keys: Iterable[str]) -> str:
-    return " ".join([_name(run), *(f"{key.removeprefix('agent.')}={run.settings.get(key)}" for key in keys)])
+    short = {key: key.removeprefix("agent.").removeprefix("method.") for key in keys}
+    return " ".join([_name(run), *(f"{name}={run.settings.get(key)}" for key, name in short.items())])
 
 
 def _name(run: Run) -> str:

@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
-from ctgraph_rl.agent import Agent
+from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checkpoints import Checkpoints, State
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
@@ -34,6 +34,7 @@ MEMBERS = (
     "num_envs",
     "num_steps",
     "policy",
+    "policy_for",
     "initial_state",
     "start_task",
     "end_task",
@@ -70,6 +71,13 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
     return agent
+
+
+def wearing(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
+    """Builds agents, each with a new method for a curriculum."""
+    return lambda observation_spec, action_spec: make_method().worn_by(
+        make_agent(observation_spec, action_spec), curriculum
+    )
 
 
 def train(

@@ -5,33 +5,37 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
-from ctgraph_rl.agent import Agent
+from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checkpoints import Checkpoints, read_plain
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log import RunLog
-from ctgraph_rl.train import MakeAgent, new_agent
+from ctgraph_rl.task import Task
+from ctgraph_rl.train import MakeAgent, new_agent, wearing
 
-OURS = re.compile(r"baselines\.(\w+)\.(\w+)")
-"""Names of agents that a directory may name; others are named by who loads it."""
+OURS = {"agent": re.compile(r"(baselines\.\w+)\.(\w+)"), "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)")}
+"""Names of agents and methods that a directory may name; others are named by who loads it."""
 
 
 @dataclass(frozen=True)
 class Trained:
     """What a run left.
 
-    ``evaluate(trained.agent.policy, trained.curriculum.tasks, initial_state=trained.agent.initial_state)`` of this
-    package plays it, ``learn_curriculum(another, trained.agent)`` lets it learn on.
+    ``evaluate(trained.policy_for(task), [task], initial_state=trained.agent.initial_state,
+    curriculum=trained.curriculum)`` of this package plays a task, ``learn_curriculum(another, trained.agent)`` lets the
+    agent learn on.
     """
 
     agent: Agent
@@ -40,25 +44,32 @@ class Trained:
     frames: int  # that it has learned from
     log: RunLog
 
+    def policy_for(self, task: Task) -> TensorDictModuleBase:
+        """What acts in a task: by its id, where the curriculum has one and tells it."""
+        number = None if self.curriculum.protocol.task_id == "hidden" else self.curriculum.task_ids.get(task)
+        return self.agent.policy if number is None else self.agent.policy_for(number)
+
 
 def load(
     run_dir: Path | str,
     make_agent: MakeAgent | None = None,
     curriculum: Curriculum | None = None,
     device: torch.device | str = "cpu",
+    make_method: Callable[[], Method] | None = None,
 ) -> Trained:
-    """The trained agent of a run, finished or not, with all that it needs to play on or learn on.
+    """The trained agent of a run, finished or not, with its method and all that it needs to play on or learn on.
 
     Args:
         run_dir: the directory.
         make_agent: builds the agent from the environment's unbatched observation and action specs; needed where its
             class is not one of the baselines, such as ``partial(MyAgent, **settings)``.
-        curriculum: needed where the run's has parts of classes that are not this package's.
+        curriculum: what was learned; needed where it has parts of classes that are not this package's.
         device: where the agent shall live.
+        make_method: builds the method that the agent wears; needed where its class is not one of the baselines'.
 
     Raises:
         FileNotFoundError: if there is no run, or none that has been saved.
-        ValueError: for an agent or a curriculum that must be given, and files that do not belong together.
+        ValueError: for an agent, a method or a curriculum that must be given, and files that do not belong together.
     """
     run_dir = Path(run_dir)
     if not (run_dir / LOG).exists():
@@ -70,7 +81,7 @@ def load(
     config = runs[0].get("config") or {}
     seed = config.get("seed", 0)
     require((is_int(seed, 0, 2**63 - 1), f"{run_dir / LOG} has no seed: seed must be in [0, 2**63), got {seed!r:.80}"))
-    build = _builder(run_dir, config.get("agent")) if make_agent is None else make_agent
+    build = _builder(run_dir, config, make_agent, make_method, learned)
     weights, frames = _weights(run_dir, log)
     try:
         with torch.random.fork_rng():
@@ -92,21 +103,33 @@ def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Cu
     return found
 
 
-def _builder(run_dir: Path, settings: Any) -> MakeAgent:
-    """Builds the baseline that a configuration names; only classes that are defined in ``baselines`` are."""
+def _builder(
+    run_dir: Path,
+    config: Mapping[str, Any],
+    make_agent: MakeAgent | None,
+    make_method: Callable[[], Method] | None,
+    curriculum: Curriculum,
+) -> MakeAgent:
+    """Builds the agent with its method, if it has one; the curriculum is already prepared for that."""
+    alone = _ours(run_dir, "agent", config.get("agent")) if make_agent is None else make_agent
+    if make_method is None and config.get("method") is not None:
+        make_method = _ours(run_dir, "method", config["method"])
+    if make_method is None:
+        return alone
+    return wearing(alone, make_method, curriculum)
+
+
+def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
+    """Builds the agent or method that a configuration names; only classes that are defined in ``baselines`` are."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours = OURS.fullmatch(name)
+    ours = OURS[part].fullmatch(name)
     if ours is None:
-        raise ValueError(f"{run_dir} is of the agent {name:.80}, no baseline: give load(..., make_agent=)")
-    kind = None
-    if find_spec(f"baselines.{ours[1]}") is not None:
-        module = import_module(f"baselines.{ours[1]}")
-        kind = getattr(module, ours[2], None)
-    defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == module.__name__
-    require((defined, f"{run_dir} names the agent {name}, and there is no such class; give load(..., make_agent=)"))
-    own = {key: value for key, value in settings.items() if key != "_target_"}
-    return lambda observation_spec, action_spec: kind(observation_spec, action_spec, **own)  # type: ignore[misc]
+        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=)")
+    kind: Any = getattr(import_module(ours[1]), ours[2], None) if find_spec(ours[1]) is not None else None
+    defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == ours[1]
+    require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
+    return partial(kind, **{key: value for key, value in settings.items() if key != "_target_"})
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:

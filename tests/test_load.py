@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from kill_runs import equal
 from omegaconf import OmegaConf
 from test_checkpoints import bombs
 from test_lifelong import ONE, TWO
 
 from baselines.a2c import A2C
-from ctgraph_rl import Block, Curriculum, Evaluation, evaluate, learn_curriculum
+from baselines.methods.l2 import L2
+from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, evaluate, learn_curriculum
 from ctgraph_rl.checkpoints import Checkpoints
 from ctgraph_rl.run import conf_dir
 from ctgraph_rl.train import train
@@ -28,6 +31,8 @@ SETTINGS = {
 OWN = {key: value for key, value in SETTINGS.items() if key != "_target_"}
 
 LEARNED = Curriculum("loaded", 1, "here", (Block(ONE, 96), Block(TWO, 64)), Evaluation(4))
+
+METHODS = sorted(path.stem for path in Path(conf_dir(), "method").glob("*.yaml"))
 
 
 class Stopped(Exception):
@@ -115,6 +120,81 @@ def test_loading_leaves_the_callers_random_state_and_the_directory(runs):
     assert sorted((path, path.stat().st_mtime_ns) for path in runs.rglob("*")) == files
 
 
+def learn_with(method: dict, run_dir: Path):
+    """An agent as a run left it that wears a method and sees task ids."""
+    told = instantiate(method).prepare(replace(LEARNED, protocol=Protocol("one_hot")))
+    made = []
+
+    def make_worn(*specs):
+        made.append(instantiate(method).worn_by(make_agent(*specs), told))
+        return made[-1]
+
+    train(told, make_worn, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
+    return made[-1]
+
+
+def learned_again(agent, curriculum: Curriculum) -> list[dict]:
+    """What an agent's log says that learns a curriculum, without the time."""
+    torch.manual_seed(5)
+    return [{**m, "seconds": 0} for m in learn_curriculum(curriculum, agent).measurements]
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_agent_comes_back_with_its_method_to_play_every_task_and_to_learn_on(compose, tmp_path, name):
+    method = OmegaConf.to_container(compose(f"method={name}").method)
+    agent = learn_with(method | ({"heads": "multi"} if "heads" in method else {}), tmp_path)
+
+    trained = load(tmp_path)
+
+    ids = trained.curriculum.task_ids
+    assert equal(trained.agent.state_dict(), agent.state_dict())
+    for task, number in ids.items():
+        assert equal(trained.policy_for(task).state_dict(), agent.policy_for(number).state_dict())
+    assert learned_again(trained.agent, trained.curriculum) == learned_again(agent, trained.curriculum)
+
+
+def test_what_a_method_keeps_for_a_task_acts_in_it(tmp_path):
+    learn_with({"_target_": "baselines.methods.scratch.Scratch"}, tmp_path)
+
+    trained = load(tmp_path)
+
+    first, second = (trained.policy_for(task) for task in trained.curriculum.tasks)
+    assert second is trained.agent.policy
+    assert not equal(first.state_dict(), second.state_dict())
+    assert trained.policy_for(replace(ONE, goal_reward=2.0)) is trained.agent.policy  # of no id
+
+
+class Own(L2):
+    """A method that is no baseline's."""
+
+
+def test_a_method_of_someone_else_must_be_given(tmp_path):
+    settings = {"coeff": 0.5, "heads": "single"}
+    learn_with({"_target_": "test_load.Own", **settings}, tmp_path)
+
+    with pytest.raises(ValueError, match=r"is of the method .*, no baseline: give load\(\.\.\., make_method=\)"):
+        load(tmp_path)
+
+    assert type(load(tmp_path, make_method=partial(Own, **settings)).agent.agent.method) is Own
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("baselines.a2c.A2C", "no baseline: give load"),
+        ("baselines.methods.ewc.EWC.x", "no baseline: give load"),
+        ("baselines.methods.sarsa.SARSA", "and there is no such class"),
+        ("baselines.methods.ewc.SampledImportance", "and there is no such class"),
+        ("baselines.methods.weights.Weights", "and there is no such class"),
+    ],
+)
+def test_a_method_that_does_not_exist_is_refused(copy, name, message):
+    rewrite(copy, config={"agent": SETTINGS, "method": {"_target_": name}, "seed": 3})
+
+    with pytest.raises(ValueError, match=message):
+        load(copy)
+
+
 class Outsiders(A2C):
     """An agent that is no baseline."""
 
@@ -147,6 +227,13 @@ HOSTILE = {
     "an agent that is a text": {"config": {"agent": "a2c", "seed": 3}},
     "no seed": {"config": {"agent": {"_target_": "baselines.a2c.A2C"}, "seed": "3"}},
     "settings that are missing": {"config": {"agent": {"_target_": "baselines.a2c.A2C"}, "seed": 3}},
+    "a method that is a text": {"config": {"agent": SETTINGS, "method": "ewc", "seed": 3}},
+    "a method without settings": {
+        "config": {"agent": SETTINGS, "method": {"_target_": "baselines.methods.ewc.EWC"}, "seed": 3}
+    },
+    "a method that the weights are not of": {
+        "config": {"agent": SETTINGS, "method": {"_target_": "baselines.methods.scratch.Scratch"}, "seed": 3}
+    },
     "no fingerprint": {"fingerprint": ...},
     "a kind that is a list": {"kind": []},
     "nested deeply": {"config": json.loads("[" * 400 + "]" * 400)},

@@ -213,7 +213,7 @@ def test_a_policy_for_each_task_id_needs_a_protocol_that_gives_it_and_tasks_that
     held_out = Curriculum("held", 1, "here", (Block(ONE, 12),), Evaluation(held_out=(TWO,)), Protocol("at_boundaries"))
 
     for told, message in (
-        (TASKS, "they are hidden in this protocol"),
+        (TASKS, "task ids, which are hidden in this protocol"),
         (held_out, "held-out tasks, which have no task id"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import re
 import sys
+from types import SimpleNamespace
 
 import pytest
 from made_runs import write_run
 
+import curricula
+from ctgraph_rl import RunLog, visits
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.pictures import Gallery
 from ctgraph_rl.report.sections import evaluation_curve, sections, training_curve
+from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
 from ctgraph_rl.runs import find_runs
+from ctgraph_rl.trained import Trained
 
 for package in ("matplotlib", "jinja2", "scipy"):
     pytest.importorskip(package)
@@ -145,8 +150,6 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path):
 
 
 def test_a_run_without_weights_says_so_and_trees_are_drawn_without_a_policy(tmp_path):
-    import curricula
-
     path = write_run(tmp_path / "run")
     _, none, _ = written(tmp_path / "none", path)
     curricula.load("su_b1_4tasks").to_json(path / "curriculum.json")
@@ -156,6 +159,20 @@ def test_a_run_without_weights_says_so_and_trees_are_drawn_without_a_policy(tmp_
     assert not list((tmp_path / "none" / "figures").glob("*trees*"))
     assert f"The policy on the trees is missing: {path} has no agent.pt, the weights of its agent." in trees
     assert (tmp_path / "trees" / "figures" / "two-PPO-trees.png").exists()
+
+
+def test_on_the_trees_each_task_is_played_with_what_acts_in_it(monkeypatch):
+    learned, played = curricula.load("ct2_interfering"), []  # ids with every observation
+
+    def play(task, policy, *_):
+        played.append((task, policy))
+        return visits.Visits({}, {})
+
+    monkeypatch.setattr(visits, "visits", play)
+    agent = SimpleNamespace(policy="the present one", policy_for=lambda number: number, initial_state=None)
+    draw_trees(Trees(learned, Trained(agent, learned, 0, 0, RunLog()), ""), 0)
+
+    assert played == list(learned.task_ids.items())
 
 
 def test_curves_are_means_where_every_seed_has_a_value(tmp_path):

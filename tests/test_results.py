@@ -255,6 +255,32 @@ def test_a_plain_name_of_the_agent_is_the_name_of_its_runs(tmp_path, key):
     assert str(row.estimate) == "0.75 n = 3"
 
 
+PPO = {"_target_": "baselines.ppo.PPO"}
+
+
+def test_an_agent_has_its_method_in_its_name_and_the_settings_in_which_that_differs(tmp_path):
+    for number, (name, settings) in enumerate(
+        [("ewc.EWC", {"coeff": 1.0}), ("ewc.EWC", {"coeff": 2.0}), ("mask_ri.MaskRI", {}), ("mask_lc.MaskLC", {})]
+    ):
+        method = {"_target_": f"baselines.methods.{name}", **settings}
+        record(tmp_path / f"run{number}", seed=0, agent=PPO, method=method)
+    record(tmp_path / "named", seed=0, agent="sac", method="replay")
+
+    names = {name for _, name in grouped(all_runs([tmp_path]))}
+
+    assert names == {"PPO + EWC coeff=1.0", "PPO + EWC coeff=2.0", "PPO + MaskRI", "PPO + MaskLC", "sac + replay"}
+
+
+def test_runs_that_are_fine_tuned_and_those_that_name_no_method_are_seeds_of_one_agent(tmp_path):
+    record(tmp_path / "without", seed=0, agent=PPO)
+    record(tmp_path / "with", seed=1, agent=PPO, method={"_target_": "baselines.methods.finetune.Finetune"})
+
+    ((_, by_seed),) = grouped(all_runs([tmp_path])).items()
+
+    assert sorted(by_seed) == [0, 1]
+    assert line(table(all_runs([tmp_path])), "average_performance", "PPO").estimate.n == 2
+
+
 def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
     make_run(tmp_path, 0, finished=False)
 

@@ -80,6 +80,7 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
     assert set(first["config"]) == {
         "curriculum",
         "agent",
+        "method",
         "seed",
         "device",
         "num_threads",
@@ -373,9 +374,11 @@ def test_the_name_of_a_run_holds_curriculum_agent_seed_and_what_else_changes_res
         return compose("seed=3", *overrides, return_hydra_config=True).hydra.run.dir
 
     plain, other, same = directory(), directory("agent.gamma=0.5"), directory("overwrite=true")
+    worn = directory("method=l2")
 
     assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", plain)
     assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", other)
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-l2-seed3-[0-9a-f]{12}", worn)
     assert other != plain
     assert same == plain
 

@@ -98,6 +98,16 @@ def test_every_number_of_training_and_evaluation_arrives_at_its_frame(runs):
     assert [frames for frames, _ in found["eval/goal2_1/success_rate.csv"]] == [0, 256, 512, 768, 1024]
 
 
+def test_what_a_method_adds_to_the_losses_is_sent_too(compose, tmp_path):
+    run(compose(*SHORT, "agent.batch_size=32", "method=l2", "logger=csv"), tmp_path)
+
+    added = (tmp_path / FOLDER / "scalars" / "train" / "loss_method.csv").read_text().splitlines()
+
+    values = [float(each.split(",")[1]) for each in added]
+    assert values[:2] == [0.0, 0.0]  # nothing is held in the first block of two batches
+    assert all(value > 0 for value in values[2:])
+
+
 def test_a_tracker_is_told_the_configuration_by_dotted_names(runs, compose):
     config = dict(flat(plain(compose(*SHORT))))
 

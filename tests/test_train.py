@@ -216,7 +216,7 @@ def test_a_run_is_as_large_as_the_docs_say(stopped, whole):
 def test_batches_that_no_machine_can_hold_are_refused_before_they_are_made(size):
     class Large:
         num_envs, num_steps = 8, 4
-        policy = initial_state = start_task = end_task = learn = to = state_dict = None
+        policy = policy_for = initial_state = start_task = end_task = learn = to = state_dict = None
 
     agent = Large()
     vars(agent).update(size)

@@ -106,13 +106,17 @@ class CLEAR(Method):
         self.reservoir.offer(items if agent.memory else {key: value.flatten(0, 1) for key, value in items.items()})
 
     def mixed(self, batch: Data) -> Data:
-        """The minibatch with as many replayed items."""
+        """The minibatch with as many replayed items, if there are any yet."""
+        if not len(self.reservoir):
+            return batch
         replayed = self.reservoir.sample(len(batch["action"]))
         return {**batch, **{("replay", key): value for key, value in replayed.items()}}
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
         """What is lost by leaving earlier behaviour."""
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
+        if not replayed:
+            return {}
         now, losses = self.agent.outputs(replayed), {}
         for key in self.agent.output_keys:
             if key == "log_probs":

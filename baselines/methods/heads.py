@@ -19,11 +19,10 @@ if TYPE_CHECKING:
 class Heads(TaskMethod):
     """Each task has its own last linear layers of policy and critic; a new task's are those the agent began with.
 
-    Stored are their weights, 4 H bytes for each of the curriculum's tasks, and for the beginning.
+    Stored are their weights, 4 H bytes for each of the curriculum's tasks.
     """
 
     kept: Tensor  # float32 [tasks, H]
-    first: Tensor  # float32 [H]
 
     def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
@@ -31,9 +30,7 @@ class Heads(TaskMethod):
         self.inside = weights.in_heads
         message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
         require((bool(self.inside.any()), f"{message}: use heads=single"))
-        first = weights.vector().detach()[self.inside]
-        self.register_buffer("first", first)
-        self.register_buffer("kept", first.repeat(self.num_tasks, 1))
+        self.register_buffer("kept", weights.vector().detach()[self.inside].repeat(self.num_tasks, 1))
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:

@@ -133,6 +133,8 @@ class Samples:
 class SampledImportance(Importance):
     """`Importance` that is a mean over what was learned from last.
 
+    Until a task ends, the last of its minibatches are stored, too, of at least ``num_samples`` frames in all.
+
     Args:
         num_samples: frames.
         settings: the arguments of `Importance`.
@@ -146,6 +148,11 @@ class SampledImportance(Importance):
         """The minibatch itself, which is kept for the end of the task."""
         self.samples.add(batch)
         return batch
+
+    def end_task(self) -> None:
+        """Weigh up what the task needs; a later task's is a matter of its own samples."""
+        super().end_task()
+        self.samples.minibatches.clear()
 
     def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
         """The sum of the terms of every sample, [P] each, over the number of frames."""

@@ -65,11 +65,17 @@ class Masks(TaskMethod):
     def start_task(self, task: int | None) -> None:
         """Begin with a new task's scores, or go back to those of a task that was here before."""
         super().start_task(task)
-        known = self.place < self.ended
-        self.own.copy_(self.scores[self.place] if known else self.new_scores())
+        if self.place < self.ended:
+            self.own.copy_(self.scores[self.place])
+        else:
+            self.begin()
         self.agent.optimise(self.live)
         self._write()
         self.agent.weights_changed()
+
+    def begin(self) -> None:
+        """Draw a new task's scores."""
+        self.own.copy_(self.new_scores())
 
     @torch.no_grad()
     def end_task(self) -> None:
@@ -140,14 +146,11 @@ class CombinedMasks(Masks):
         """What the learned numbers of the earlier tasks, and behind them of the new scores, begin with."""
         raise NotImplementedError
 
-    @torch.no_grad()
-    def start_task(self, task: int | None) -> None:
-        """Begin with a new task's combination."""
-        new = task not in self.begun
-        if new:
-            self.betas.zero_()
-            self.betas[:, : len(self.begun) + 1] = self.new_betas(len(self.begun))
-        super().start_task(task)
+    def begin(self) -> None:
+        """Draw a new task's scores, and begin with its combination."""
+        super().begin()
+        self.betas.zero_()
+        self.betas[:, : self.place + 1] = self.new_betas(self.place)
 
     def present_scores(self) -> Tensor:
         """The combination."""

@@ -32,8 +32,8 @@ class PackNet(TaskMethod):
     ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are the first
     task's, output layers each task's own, see `Heads`. A task that comes again trains its output layers alone.
 
-    Stored are each weight's owner, 2 P bytes, whether it may change, P bytes, its value, 4 P bytes, and the output
-    layers.
+    Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task has it, 2 P bytes, its
+    value, 4 P bytes, and the output layers.
 
     Args:
         retrain: share of a block's frames, at its end, that is trained after pruning, in [0, 1).
@@ -42,6 +42,7 @@ class PackNet(TaskMethod):
     owner: Tensor  # int16 [P]: the place of the task that keeps a weight, or FREE
     packed: Tensor  # float32 [P]: kept weights
     live: Tensor  # bool [P]: weights that may change
+    mine: Tensor  # bool [P]: kept weights that the present task acts with
 
     def __init__(self, retrain: float) -> None:
         super().__init__()
@@ -61,6 +62,7 @@ class PackNet(TaskMethod):
         self.register_buffer("owner", torch.full([size], FREE, dtype=torch.int16))
         self.register_buffer("packed", torch.zeros(size))
         self.register_buffer("live", torch.ones(size, dtype=torch.bool))
+        self.register_buffer("mine", torch.zeros(size, dtype=torch.bool))
         self.in_matrices = weights.in_matrices & ~weights.in_heads
         self.in_heads = weights.in_heads
 
@@ -74,7 +76,8 @@ class PackNet(TaskMethod):
         first = new and self.place == 0
         may = (self.owner == FREE) & new & (self._within(self.in_matrices) | first) | self._within(self.in_heads)
         self.live.copy_(may)
-        self._take(self.place, keep=self.live)
+        self.mine.copy_(self._kept_up_to(self.place))
+        self._take()
         self.agent.forget(self.weights.parameters)
 
     @torch.no_grad()
@@ -99,7 +102,7 @@ class PackNet(TaskMethod):
     @torch.no_grad()
     def settle(self) -> None:
         """Take back what the optimiser changed in weights that may not change."""
-        self.weights.write(torch.where(self.live, self.weights.vector(), self.packed))
+        self.weights.write(torch.where(self.live, self.weights.vector(), torch.where(self.mine, self.packed, 0.0)))
 
     @torch.no_grad()
     def weights_of(self, task: int) -> Tensor | None:
@@ -107,7 +110,7 @@ class PackNet(TaskMethod):
         place = self.place_of(task)
         if not self.begun or place == self.place:
             return None
-        weights = torch.where((self.owner >= 0) & (self.owner <= place), self.packed, 0.0)
+        weights = torch.where(self._kept_up_to(place), self.packed, 0.0)
         weights[self._within(self.in_heads)] = self.heads.kept[place]
         return weights
 
@@ -126,14 +129,16 @@ class PackNet(TaskMethod):
             keep[values.abs().masked_fill(~free, -1.0).topk(most).indices] = True
         self.owner[kept] = self.place
         self.live.copy_(kept | self._within(self.in_heads))
-        self._take(self.place, keep=self.live)
+        self._take()
 
-    def _take(self, place: int, keep: Tensor) -> None:
-        """Give the network a task's weights: present ones where told, else those packed up to it, or 0."""
-        before = torch.where((self.owner >= 0) & (self.owner <= place), self.packed, 0.0)
-        weights = torch.where(keep, self.weights.vector(), before)
-        self.weights.write(weights)
+    def _take(self) -> None:
+        """Give the network the present task's weights, where they may not change."""
+        self.settle()
         self.agent.weights_changed()
+
+    def _kept_up_to(self, place: int) -> Tensor:
+        """bool [P]: the weights that the tasks up to this place keep."""
+        return (self.owner >= 0) & (self.owner <= place)
 
     def _within(self, chosen: Tensor) -> Tensor:
         return chosen.to(self.owner.device)

@@ -37,7 +37,7 @@ class Wearing(nn.Module):
         method.put_on(agent, Weights(agent.policy, agent.weights), curriculum)
         agent.method = method
         self.num_envs, self.num_steps = agent.num_envs, agent.num_steps
-        self.memory, self.solves = agent.memory, agent.solves
+        self.memory = agent.memory
         self.policy: TensorDictModuleBase = agent.policy
         self._copies: dict[int, TensorDictModuleBase] = {}
 

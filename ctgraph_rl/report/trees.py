@@ -75,9 +75,7 @@ def find_trees(run: Run) -> Trees:
 def _visits(trained: Trained, task: Any, seed: int) -> Visits:
     from ctgraph_rl.visits import visits
 
-    agent, curriculum = trained.agent, trained.curriculum
-    at_boundaries = curriculum.protocol.task_id == "at_boundaries"
-    policy = agent.policy_for(curriculum.task_ids[task]) if at_boundaries else agent.policy
+    curriculum, state = trained.curriculum, trained.agent.initial_state
     per_row = curriculum.evaluation.episodes_per_row
     episodes = per_row * math.ceil(EPISODES / per_row)
-    return visits(task, policy, agent.initial_state, episodes, seed, True, per_row, curriculum)
+    return visits(task, trained.policy_for(task), state, episodes, seed, True, per_row, curriculum)

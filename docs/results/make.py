@@ -1,6 +1,6 @@
-"""Makes docs/results.md and its figures from the raw results beside this file; and raw results from runs.
+"""Makes docs/results.md, docs/lifelong.md and figures from the raw results beside this file; and raw results from runs.
 
-``python docs/results/make.py`` makes the page. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
+``python docs/results/make.py`` makes the pages. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
 each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes.
 """
 
@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
 
-HERE = Path(__file__).resolve().parent
+import comparison
+from raw import HERE, Raw, groups, mean_of, read, table, write
+
 PAGE = HERE.parent / "results.md"
+LIFELONG = HERE.parent / "lifelong.md"
 EPISODES = 1000
 SEED = 2023
 """Of the episodes, the same for all agents."""
-
-Raw = list[dict[str, str]]
 
 
 def collect(name: str, folder: Path) -> None:
@@ -32,14 +32,6 @@ def collect(name: str, folder: Path) -> None:
         key=lambda line: [str(line[key]) for key in ("configuration", "depth", "task", "agent")] + [line["seed"]]
     )
     write(name, lines)
-
-
-def write(name: str, lines: Sequence[dict[str, Any]]) -> None:
-    """Write the raw results of a table."""
-    with open(HERE / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
-        writer.writeheader()
-        writer.writerows(lines)
 
 
 def measured(run_dir: Path) -> dict[str, Any]:
@@ -61,7 +53,7 @@ def measured(run_dir: Path) -> dict[str, Any]:
     }
     for way, greedy in (("greedy", True), ("sampled", False)):
         state = trained.agent.initial_state
-        ends = evaluate(trained.agent.policy, [task], EPISODES, SEED, greedy, state, curriculum=trained.curriculum)
+        ends = evaluate(trained.policy_for(task), [task], EPISODES, SEED, greedy, state, curriculum=trained.curriculum)
         line[f"{way}_return"] = round(ends["episode_reward"].double().mean().item(), 6)
         line[f"{way}_success"] = (ends["outcome"] == 3).double().mean().item()
     finished = (run_dir / "metrics.json").exists()
@@ -69,40 +61,9 @@ def measured(run_dir: Path) -> dict[str, Any]:
     return {**line, "failed": "" if finished else reason}
 
 
-def read(name: str) -> Raw:
-    """The raw results of a table; none if it was not run."""
-    path = HERE / f"{name}.csv"
-    if not path.exists():
-        return []
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def cell(lines: Raw, column: str) -> str:
     """Mean over seeds with its interval; seeds that failed are counted, not averaged."""
-    from ctgraph_rl import statistics
-
-    values = [None if line.get("failed") else float(line[column]) for line in lines]
-    found = statistics.mean(values)
-    if found.value is None:
-        return "-"
-    interval = "" if found.low is None else f" ± {(found.high - found.low) / 2:.2f}"  # type: ignore[operator]
-    missing = f" (n={found.n}/{len(values)})" if found.n_undefined else ""
-    return f"{found.value:.2f}{interval}{missing}".replace("-0.00", "0.00")
-
-
-def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
-    """Lines with the same values under some keys, in order of appearance."""
-    found: dict[tuple[str, ...], Raw] = {}
-    for line in raw:
-        found.setdefault(tuple(line[key] for key in keys), []).append(line)
-    return found
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return mean_of([None if line.get("failed") else float(line[column]) for line in lines])
 
 
 def by_goal(raw: Raw, configuration: str) -> str:
@@ -192,6 +153,12 @@ def page() -> str:
     return template.substitute(tables, main_job=main_job(read("main_job")))
 
 
+def lifelong_page() -> str:
+    """The page of the methods: its template with its tables."""
+    template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
+    return template.substitute(comparison.tables())
+
+
 def draw(path: Path) -> None:
     """Every seed of every agent on every goal of the four small configurations, beside the ceilings without memory."""
     import matplotlib
@@ -227,10 +194,18 @@ def main() -> None:
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()
     if options.command == "collect":
-        (collect_main_job(options.runs) if options.name == "main_job" else collect(options.name, options.runs))
+        of = {
+            "main_job": lambda name, runs: collect_main_job(runs),
+            **dict.fromkeys(comparison.EXPERIMENTS, comparison.collect),
+        }
+        of.get(options.name, collect)(options.name, options.runs)
         return
     PAGE.write_text(page(), encoding="utf-8")
     draw(HERE / "baselines_b1.png")
+    LIFELONG.write_text(lifelong_page(), encoding="utf-8")
+    for name in comparison.MASKS:
+        if read(name):
+            comparison.draw(name, HERE / f"{name}.png")
 
 
 if __name__ == "__main__":

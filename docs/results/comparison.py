@@ -1,0 +1,224 @@
+"""Raw results of runs with methods, and the tables and figures that are made of them.
+
+A line holds one evaluation: who learned what, by which method and seed, the block and the frames learned so far, and
+the mean return on each task in the order of the curriculum. The single-task experts of a seed are one ``expert``: its
+line after so many frames has what each of them gets on its own task after as many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from raw import HERE, Raw, groups, mean_of, read, table, write
+
+from ctgraph_rl import metrics
+from ctgraph_rl.log import RunLog
+from ctgraph_rl.metrics import Curves
+
+EXPERT = "expert"
+CELL = ("curriculum", "agent", "method", "seed")
+"""What tells runs apart."""
+
+MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
+"""The published comparison on its three curricula."""
+
+EXPERIMENTS = (*MASKS, "methods")
+CONF = HERE.parent.parent / "conf" / "experiment"
+SOLVED = 0.9
+
+
+def collect(name: str, folder: Path) -> None:
+    """Put what the finished runs under a folder say in place of what the raw results have of them; keep the rest."""
+    found = groups(read(name), *CELL)
+    for metrics_file in sorted(folder.rglob("metrics.json")):
+        lines = evaluations(metrics_file.parent)
+        found |= groups(lines, *CELL)
+    ordered = [line for cell in sorted(found) for line in found[cell]]
+    width = max(sum(key.isdigit() for key in line) for line in ordered)
+    write(name, [{**line, **{str(j): line.get(str(j), "") for j in range(1, width + 1)}} for line in ordered])
+
+
+def evaluations(run_dir: Path) -> Raw:
+    """The lines of a run, and of the experts that it was compared with; none for an expert's own directory."""
+    log = RunLog.read(run_dir / "run.jsonl")
+    about = log.of_kind("run")[0]
+    agent, method = run_dir.name.split("-seed")[0], "finetune"
+    if "-" in agent:
+        agent, method = agent.split("-")
+    who = {"curriculum": run_dir.parent.name, "fingerprint": about["fingerprint"], "agent": agent}
+    cell = {**who, "method": method, "seed": str(about["config"]["seed"])}
+    if run_dir.parent.name == "experts":
+        return []
+    lines = _lines(cell, log.of_kind("evaluation"))
+    experts = [expert for line in log.of_kind("experts") for expert in line["experts"]]
+    own = []
+    for expert in experts:
+        alone = RunLog.read(run_dir.parent.parent / "experts" / Path(expert["run"]).name / "run.jsonl")
+        own += [{**line, "task": expert["task"]} for line in alone.of_kind("evaluation")]
+    return lines + _lines({**cell, "method": EXPERT}, own)
+
+
+def _lines(cell: dict[str, Any], evaluated: Iterable[dict[str, Any]]) -> Raw:
+    """A line for each number of frames."""
+    by_frames: dict[int, dict[str, Any]] = {}
+    for each in evaluated:
+        line = by_frames.setdefault(each["frames"], {**cell, "block": each["block"], "frames": str(each["frames"])})
+        line[str(each["task"])] = round(each["return_mean"], 6)
+    return [{key: str(value) for key, value in by_frames[frames].items()} for frames in sorted(by_frames)]
+
+
+def curves(lines: Raw) -> Curves:
+    """The evaluations of a run after the one before training, which the published protocol does not have."""
+    used = [line for line in lines if int(line["frames"]) > 0]
+    tasks = [key for key in used[0] if key.isdigit() and used[0][key]]
+    values = torch.tensor([[float(line[task]) for task in tasks] for line in used], dtype=torch.float64)
+    blocks, frames = (tuple(int(line[key]) for line in used) for key in ("block", "frames"))
+    return Curves(values, blocks, frames, tuple((task,) for task in range(len(tasks))))
+
+
+def scores(lines: Raw, experts: Raw) -> dict[str, float | None]:
+    """The numbers of the table for one run; None where there is none."""
+    run = curves(lines)
+    found = {
+        "average performance": metrics.continual_world_performance(run),
+        "forgetting": metrics.continual_world_forgetting(run),
+        "TPOT": metrics.total_performance_over_time(run),
+        "tasks learned": metrics.tasks_learned(run, SOLVED),
+    }
+    if experts:
+        areas = [metrics.trapezoid_area(curve) for curve in curves(experts).performance.T]
+        own = metrics.stage_areas(run, trapezoids=True)
+        found["forward transfer"] = metrics.forward_transfer_from_experts(own, torch.stack(areas)[None])
+    return {name: metric.value for name, metric in found.items()}
+
+
+COLUMNS = ("average performance", "forward transfer", "forgetting", "TPOT", "tasks learned")
+
+
+def summary(name: str) -> str:
+    """A line for each method: every number's mean over seeds with its interval; then what is missing."""
+    of = groups(read(name), "method", "seed")
+    if not of:
+        return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
+    rows = []
+    for method in dict.fromkeys(expected(name)["method"]):
+        found = [scores(of[cell], of.get((EXPERT, cell[1]), [])) for cell in of if cell[0] == method]
+        values = [mean_of([each.get(column) for each in found]) for column in COLUMNS]
+        rows.append([f"`{method}`", str(len(found)), *values])
+    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{missing(name)}"
+
+
+def learned(name: str) -> str:
+    """How many seeds have each task at 0.9 or more right after learning it: methods, and the experts."""
+    of = groups(read(name), "method")
+    rows = []
+    for method in (*dict.fromkeys(expected(name)["method"]), EXPERT):
+        runs = [_solved(curves(lines), method) for lines in groups(of.get((method,), []), "seed").values()]
+        if runs:
+            counts = torch.stack(runs).sum(0).int().tolist()
+            rows.append([f"`{method}`", *(f"{count} of {len(runs)}" for count in counts)])
+    if not rows:
+        return ""
+    return table(["", *(f"task {task}" for task in range(1, len(rows[0])))], rows)
+
+
+def _solved(run: Curves, method: str) -> torch.Tensor:
+    """bool [tasks]: mastered at the end of its block, or by its expert at its end."""
+    at_end = run.performance[-1] if method == EXPERT else run.ends[1:].diagonal()
+    return at_end >= SOLVED
+
+
+def expected(name: str) -> dict[str, list[str]]:
+    """What an experiment sweeps."""
+    params = OmegaConf.load(CONF / f"{name}.yaml").hydra.sweeper.params
+    return {key: _choices(str(value)) for key, value in params.items()}
+
+
+def _choices(text: str) -> list[str]:
+    """The values of a sweep, a list or a range."""
+    if text.startswith("range("):
+        return [str(number) for number in range(int(text[len("range(") : -1]))]
+    return text.split(",")
+
+
+def missing(name: str) -> str:
+    """Which cells of an experiment have no raw results."""
+    swept = expected(name)
+    keys = ["seed" if key == "seed" else key for key in swept]
+    there = set(groups(read(name), *keys))
+    lacking = [cell for cell in product(*swept.values()) if cell not in there]
+    if not lacking:
+        return "All cells were run."
+    by_seed: dict[tuple[str, ...], list[str]] = {}
+    place = keys.index("seed")
+    for cell in lacking:
+        by_seed.setdefault(cell[:place] + cell[place + 1 :], []).append(cell[place])
+    cells = "; ".join(f"{' '.join(cell)} (seeds {', '.join(seeds)})" for cell, seeds in by_seed.items())
+    count = len(list(product(*swept.values())))
+    return f"Not run yet, {len(lacking)} of {count} cells: {cells}."
+
+
+def by_agent(curriculum: str) -> str:
+    """Average performance at the end, and forgetting, of every method (lines) and agent (columns) on a curriculum."""
+    lines = [line for line in read("methods") if line["curriculum"] == curriculum]
+    of, swept = groups(lines, "method", "agent"), expected("methods")
+    rows = []
+    for method in swept["method"]:
+        cells = [_both(of.get((method, agent), [])) for agent in swept["agent"]]
+        rows.append([f"`{method}`", *cells])
+    return table([curriculum, *swept["agent"]], rows)
+
+
+def _both(lines: Raw) -> str:
+    runs = [curves(each) for each in groups(lines, "seed").values()]
+    if not runs:
+        return ""
+    forgotten = [
+        metrics.continual_world_forgetting(run).value for run in runs
+    ]  # none where all tasks are learned at once
+    at_end = mean_of([float(run.performance[-1].mean()) for run in runs])
+    return at_end if None in forgotten else f"{at_end}; {mean_of(forgotten)}"
+
+
+def draw(name: str, path: Path) -> None:
+    """The mean return over all tasks after so many frames: a line for each method, thin ones for its seeds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    of = groups(read(name), "method")
+    figure, axes = pyplot.subplots(figsize=(6.4, 3.2))
+    for number, method in enumerate(expected(name)["method"]):
+        runs = [curves(lines) for lines in groups(of.get((method,), []), "seed").values()]
+        each = [run.performance.mean(1) for run in runs]
+        for run, values in zip(runs, each, strict=True):
+            axes.plot(_thousands(run), values, color=f"C{number}", linewidth=0.5, alpha=0.5)
+        if each:
+            label = f"{method} (n = {len(each)})"
+            axes.plot(_thousands(runs[0]), torch.stack(each).mean(0), color=f"C{number}", linewidth=1.6, label=label)
+            starts = [place for place, block in enumerate(runs[0].blocks) if block > runs[0].blocks[max(place - 1, 0)]]
+            axes.vlines(_thousands(runs[0])[starts], 0, 1, color="0.9", linewidth=0.7, zorder=0)
+    axes.set_xlabel("thousand frames")
+    axes.set_ylabel("mean return over all tasks")
+    axes.set_ylim(-0.02, 1.02)
+    axes.legend(fontsize=7, frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
+
+
+def _thousands(run: Curves) -> torch.Tensor:
+    return torch.tensor(run.frames) / 1e3
+
+
+def tables(names: Sequence[str] = MASKS) -> dict[str, str]:
+    """What the template of the page names."""
+    found = {name: summary(name) for name in names} | {f"{name}_learned": learned(name) for name in names}
+    found |= {f"methods_{curriculum}": by_agent(curriculum) for curriculum in expected("methods")["curriculum"]}
+    return found | {"methods_missing": missing("methods")}

@@ -1,0 +1,423 @@
+"""Methods that hold the weights: importances and penalties by hand, and output layers of each task's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from test_agents import batches
+from test_lifelong import ONE, TWO
+from test_methods import TASKS, stay, wearing, weights_for
+from test_resume import THREE, of
+from torch import Tensor, nn
+
+from baselines.learner import Learner
+from baselines.methods.ewc import EWC
+from baselines.methods.importance import Importance
+from baselines.methods.l2 import L2
+from baselines.methods.mas import MAS
+from baselines.methods.si import SI
+from baselines.methods.wearing import Wearing
+from ctgraph_rl import Block
+
+CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
+RATE = 0.1
+EWC_SETTINGS = {"online": False, "alpha": 0.5, "fisher": "policy", "num_samples": 100, "heads": "single"}
+
+
+class Tiny(Learner):
+    """Two inputs and three outputs, linear: logits of a policy, or action values; learns by plain gradient descent."""
+
+    output_keys = ("log_probs",)
+    minibatch_size = 0
+
+    def __init__(self) -> None:
+        super().__init__(num_envs=1, num_steps=1, max_grad_norm=1e9)
+        self.linear = nn.Linear(2, 3)
+        self.policy = TensorDictModule(self.linear, in_keys=["observation"], out_keys=["logits"])
+        self.optimiser = torch.optim.SGD(self.parameters(), RATE)
+
+    def outputs(self, data: Any) -> dict[str, Tensor]:
+        outputs = self.linear(data["observation"])
+        return {"log_probs": outputs.log_softmax(dim=-1), "action_value": outputs}
+
+    def loss(self, batch: Any) -> dict[str, Tensor]:
+        """Linear in the outputs: two parts, and something that is only measured."""
+        each = (batch["factor"] * self.linear(batch["observation"])).mean(dim=0)
+        return {"loss_first": each[0], "loss_others": each[1:].sum(), "entropy": each.sum() * 100}
+
+
+class Bowl(Tiny):
+    """Its loss is sum_i h_i (w_i - t_i)^2 / 2 of the weights as one vector."""
+
+    steepness = torch.linspace(0.5, 2.0, 9)
+
+    def loss(self, batch: Any) -> dict[str, Tensor]:
+        gap = vector(self) - batch["target"][0]
+        return {"loss_bowl": (self.steepness * gap.square()).sum() / 2}
+
+
+def vector(agent: Tiny) -> Tensor:
+    return torch.cat([agent.linear.weight.flatten(), agent.linear.bias])
+
+
+def tiny(method: Importance, kind: type[Tiny] = Tiny) -> Wearing:
+    torch.manual_seed(0)
+    return Wearing(kind(), method, CURRICULUM)
+
+
+def seen(number: int, seed: int = 0) -> dict[str, Tensor]:
+    """A minibatch."""
+    generator = torch.Generator().manual_seed(seed)
+    observation, factor = (torch.randn(number, width, generator=generator) for width in (2, 3))
+    return {"observation": observation, "factor": factor, "action": torch.zeros(number, dtype=torch.int64)}
+
+
+def task_with(worn: Wearing, number: int, *minibatches: dict[str, Tensor]) -> None:
+    """A task in which these minibatches are learned from, without a change of the weights."""
+    worn.start_task(number)
+    for minibatch in minibatches:
+        worn.agent.method.mixed(minibatch)
+    worn.end_task()
+
+
+def softmax_fisher(agent: Tiny, observation: Tensor) -> Tensor:
+    """By hand: for logits z = W x + b, E[(d log pi(a) / d z_k)^2] = p_k (1 - p_k), and d z_k / d W_kj = x_j."""
+    logits = observation @ agent.linear.weight.T + agent.linear.bias
+    chances = logits.exp() / logits.exp().sum(dim=1, keepdim=True)
+    of_bias = chances * (1 - chances)
+    of_weight = of_bias.unsqueeze(2) * observation.square().unsqueeze(1)
+    return torch.cat([of_weight.mean(dim=0).flatten(), of_bias.mean(dim=0)]).detach()
+
+
+def gradient_of_penalty(worn: Wearing) -> Tensor:
+    losses = worn.agent.method.loss({})
+    assert list(losses) == ["loss_method"]
+    parts = torch.autograd.grad(losses["loss_method"], worn.agent.weights)
+    return torch.cat([part.flatten() for part in parts])
+
+
+def move(worn: Wearing, seed: int) -> Tensor:
+    """Other weights."""
+    weights = torch.randn(9, generator=torch.Generator().manual_seed(seed))
+    worn.agent.method.weights.write(weights)
+    return weights
+
+
+# Importances
+
+
+def test_the_fisher_information_of_a_softmax_policy_is_its_closed_form():
+    worn, minibatch = tiny(EWC(coeff=1, **EWC_SETTINGS)), seen(7)
+
+    task_with(worn, 0, minibatch)
+
+    expected = softmax_fisher(worn.agent, minibatch["observation"])
+    torch.testing.assert_close(worn.agent.method.importance, expected)
+
+
+@pytest.mark.parametrize("method", [EWC, MAS])
+def test_importance_is_of_the_last_samples_alone(method):
+    settings = {**(EWC_SETTINGS if method is EWC else {"heads": "single"}), "num_samples": 7}
+    worn, other = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    last = seen(3, seed=4)
+
+    task_with(worn, 0, seen(50, seed=1), seen(4, seed=3), last)
+    task_with(other, 0, {key: torch.cat([value, last[key]]) for key, value in seen(4, seed=3).items()})
+
+    torch.testing.assert_close(worn.agent.method.importance, other.agent.method.importance)
+    assert worn.agent.method.importance.any()
+
+
+@pytest.mark.parametrize("method", [EWC, MAS])
+def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method):
+    settings = EWC_SETTINGS if method is EWC else {"heads": "single", "num_samples": 100}
+    worn, alone = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    task_with(worn, 0, seen(9, seed=1))
+    before = worn.agent.method.importance.clone()
+
+    task_with(worn, 1, seen(5, seed=2))
+    task_with(alone, 0, seen(5, seed=2))
+
+    torch.testing.assert_close(worn.agent.method.importance - before, alone.agent.method.importance)
+
+
+def test_fisher_of_the_losses_is_the_mean_square_of_the_gradient_of_their_sum():
+    worn = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
+    minibatches = [seen(4, seed=1), seen(6, seed=2)]
+
+    task_with(worn, 0, *minibatches)
+
+    # The losses sum up to mean_n sum_k f_nk z_nk, whose gradient by W_kj is mean_n f_nk x_nj.
+    gradients = [
+        torch.cat([(m["factor"].T @ m["observation"] / len(m["factor"])).flatten(), m["factor"].mean(dim=0)])
+        for m in minibatches
+    ]
+    expected = (gradients[0].square() + gradients[1].square()) / 2
+    torch.testing.assert_close(worn.agent.method.importance, expected)
+
+
+def test_mas_is_the_mean_sensitivity_of_the_squared_length_of_linear_outputs():
+    worn, first, second = tiny(MAS(coeff=1, num_samples=100, heads="single")), seen(5, seed=1), seen(8, seed=2)
+    worn.agent.output_keys = ("action_value",)
+
+    task_with(worn, 0, first)
+    once = worn.agent.method.importance.clone()
+    task_with(worn, 1, second)
+
+    def by_hand(observation: Tensor) -> Tensor:  # |W x + b|^2 has the derivatives 2 z_k x_j and 2 z_k
+        outputs = (observation @ worn.agent.linear.weight.T + worn.agent.linear.bias).detach()
+        of_weight = (2 * outputs.unsqueeze(2) * observation.unsqueeze(1)).abs().mean(dim=0)
+        return torch.cat([of_weight.flatten(), (2 * outputs).abs().mean(dim=0)])
+
+    torch.testing.assert_close(once, by_hand(first["observation"]))
+    torch.testing.assert_close(worn.agent.method.importance, once + by_hand(second["observation"]))
+
+
+def test_the_outputs_that_mas_weighs_are_log_probabilities_and_value(small_agent):
+    worn = wearing(small_agent, "a2c", MAS(coeff=1, num_samples=4, heads="single"))
+    batch = batches(worn, ONE, 1)[0]
+    worn.start_task(0)
+    minibatch = {key: batch[key].flatten(0, 1)[:4] for key in ("observation", "action")}
+    worn.agent.method.mixed(minibatch)
+    worn.end_task()
+
+    expected = torch.zeros(len(worn.agent.method.weights))
+    for observation in minibatch["observation"]:
+        said = worn.agent.outputs({"observation": observation})
+        squared = said["log_probs"].square().sum() + said["state_value"].square().sum()
+        parts = torch.autograd.grad(squared, worn.agent.weights)
+        expected += torch.cat([part.flatten() for part in parts]).abs() / 4
+    torch.testing.assert_close(worn.agent.method.importance, expected)
+
+
+@pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
+def test_every_agents_policy_has_the_fisher_information_of_its_frames(small_agent, agent):
+    """Against sum_a (d pi_a / d w)^2 / pi_a, which is the same as E[(d log pi_a / d w)^2], frame by frame."""
+    worn = wearing(small_agent, agent, EWC(coeff=1, **{**EWC_SETTINGS, "num_samples": 16}))
+    keys = [*worn.policy.in_keys, "action"]
+    rows = batches(worn, ONE, 1)[0][:2]
+    minibatch = {key: rows[key] if worn.memory else rows[key].flatten(0, 1) for key in keys}
+    worn.start_task(0)
+    worn.agent.method.mixed(minibatch)
+    worn.end_task()
+
+    expected = torch.zeros(len(worn.agent.method.weights))
+    for chances in worn.agent.outputs(minibatch)["log_probs"].exp().flatten(0, -2):
+        for chance in chances:
+            parts = torch.autograd.grad(chance, worn.agent.weights, retain_graph=True, materialize_grads=True)
+            expected += torch.cat([part.flatten() for part in parts]).square() / chance.detach() / 16
+    torch.testing.assert_close(worn.agent.method.importance, expected)
+
+
+# Penalties
+
+
+PENALTIES = {
+    "ewc": (EWC(coeff=3, **EWC_SETTINGS), 1.5),
+    "l2": (L2(coeff=3, heads="single"), 3),
+    "mas": (MAS(coeff=3, num_samples=4, heads="single"), 3),
+    "si": (SI(coeff=3, epsilon=0.1, heads="single"), 3),
+}
+"""Methods, and what they weigh sum_i I_i (w_i - a_i)^2 with: EWC has lambda / 2."""
+
+
+@pytest.mark.parametrize("name", PENALTIES)
+def test_the_penalty_and_its_gradient_are_those_by_hand(name):
+    method, factor = PENALTIES[name]
+    worn = tiny(method)
+    importance, anchor = torch.rand(9), torch.randn(9)
+    method.importance.copy_(importance)
+    method.anchor.copy_(anchor)
+    weights = move(worn, seed=1)
+
+    losses = worn.loss(seen(4))
+
+    expected = factor * (importance * (weights - anchor) ** 2).sum()
+    torch.testing.assert_close(losses["loss_method"], expected)
+    assert list(losses) == ["loss_first", "loss_others", "entropy", "loss_method"]
+    torch.testing.assert_close(gradient_of_penalty(worn), 2 * factor * importance * (weights - anchor))
+
+
+@pytest.mark.parametrize("name", PENALTIES)
+def test_a_gradient_step_goes_down_the_losses_and_the_penalty(name):
+    method, factor = PENALTIES[name]
+    worn = tiny(method)
+    method.importance.copy_(torch.rand(9))
+    method.anchor.copy_(torch.randn(9))
+    weights, batch = move(worn, seed=1), seen(4)
+    own = torch.cat([(batch["factor"].T @ batch["observation"] / 4).flatten(), batch["factor"].mean(dim=0)])
+
+    worn.agent.gradient_step(batch)
+
+    expected = weights - RATE * (own + 2 * factor * method.importance * (weights - method.anchor))
+    torch.testing.assert_close(vector(worn.agent).detach(), expected)
+
+
+def test_l2_holds_all_weights_alike_where_they_were_last_and_nothing_before():
+    worn = tiny(L2(coeff=0.5, heads="single"))
+    worn.start_task(0)
+    assert not gradient_of_penalty(worn).any()
+    worn.end_task()
+    worn.start_task(1)
+    last = move(worn, seed=3)
+    worn.end_task()
+
+    weights = move(worn, seed=4)
+
+    torch.testing.assert_close(gradient_of_penalty(worn), weights - last)
+
+
+def remembered(worn: Wearing) -> tuple[list[Tensor], list[Tensor]]:
+    """Three tasks with random importances and weights."""
+    fishers, anchors = torch.rand(3, 9), []
+    fishers[1, 2:4], fishers[:, 5] = 0, 0
+    for number, fisher in enumerate(fishers):
+        worn.start_task(number)
+        anchors.append(move(worn, seed=number))
+        worn.agent.method.task_importance = lambda fisher=fisher: fisher
+        worn.end_task()
+    return list(fishers), anchors
+
+
+def test_separate_ewc_is_the_sum_of_one_term_for_each_earlier_task():
+    worn = tiny(EWC(coeff=4, **EWC_SETTINGS))
+    fishers, anchors = remembered(worn)
+
+    def explicit(weights: Tensor) -> Tensor:
+        return 2 * sum((f * (weights - a) ** 2).sum() for f, a in zip(fishers, anchors, strict=True))
+
+    differences = []
+    for seed in (7, 8):
+        weights = move(worn, seed).requires_grad_()
+        (expected,) = torch.autograd.grad(explicit(weights), weights)
+        torch.testing.assert_close(gradient_of_penalty(worn), expected)
+        differences.append(explicit(weights) - worn.agent.method.loss({})["loss_method"])
+    torch.testing.assert_close(*differences)  # a constant, which no gradient has
+
+
+def test_online_ewc_is_one_term_with_the_running_mean_at_the_last_weights():
+    worn = tiny(EWC(coeff=4, **{**EWC_SETTINGS, "online": True, "alpha": 0.25}))
+    fishers, anchors = remembered(worn)
+
+    weights = move(worn, seed=7)
+
+    mean = 0.25 * (0.25 * fishers[0] + 0.75 * fishers[1]) + 0.75 * fishers[2]
+    torch.testing.assert_close(gradient_of_penalty(worn), 4 * mean * (weights - anchors[2]))
+
+
+# The path of synaptic intelligence
+
+
+def test_synaptic_intelligence_is_the_path_integral_of_a_quadratic_loss_by_hand():
+    """Over two tasks: in the second the penalty bends the way, but its gradient is no part of the integral."""
+    c, xi = 3.0, 0.05
+    worn = tiny(SI(coeff=c, epsilon=xi, heads="single"), Bowl)
+    weights = vector(worn.agent).detach().double()
+    steep, importance, anchor = Bowl.steepness.double(), torch.zeros(9).double(), weights.clone()
+    action = torch.zeros(1, dtype=torch.int64)
+
+    for number in range(2):
+        targets = torch.randn(5, 9, generator=torch.Generator().manual_seed(number))
+        start, path = weights.clone(), torch.zeros(9).double()
+        worn.start_task(number)
+        for target in targets:
+            worn.agent.gradient_step({"action": action, "target": target.unsqueeze(0)})
+            own = steep * (weights - target.double())
+            step = -RATE * (own + 2 * c * importance * (weights - anchor))
+            path, weights = path - own * step, weights + step
+        worn.end_task()
+        importance = importance + path.clamp(min=0) / ((weights - start) ** 2 + xi)
+        anchor = weights.clone()
+        torch.testing.assert_close(worn.agent.method.importance.double(), importance, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(worn.agent.method.anchor.double(), anchor, atol=1e-5, rtol=1e-4)
+
+    assert (path < 0).any()  # which counts as 0
+
+
+# Output layers of each task's own
+
+
+MULTI = {
+    "ewc": lambda: EWC(coeff=10, **{**EWC_SETTINGS, "num_samples": 8, "heads": "multi"}),
+    "l2": lambda: L2(coeff=0.1, heads="multi"),
+    "mas": lambda: MAS(coeff=1, num_samples=8, heads="multi"),
+    "si": lambda: SI(coeff=10, epsilon=0.1, heads="multi"),
+}
+
+
+@pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
+@pytest.mark.parametrize("name", MULTI)
+def test_output_layers_are_swapped_with_the_task_and_not_held(small_agent, agent, name):
+    worn = wearing(small_agent, agent, MULTI[name]())
+    method, inside = worn.agent.method, worn.agent.method.weights.in_heads
+    begun_with = method.weights.vector().detach()[inside]
+
+    stay(worn, 0)
+    first = method.weights.vector().detach()
+    assert not torch.equal(first[inside], begun_with)
+    worn.start_task(1)
+    assert torch.equal(method.weights.vector()[inside], begun_with)
+    assert torch.equal(method.weights.vector()[~inside], first[~inside])
+    stay(worn, 1)
+    second = method.weights.vector().detach()
+
+    acted = torch.cat([weights.flatten() for weights in weights_for(worn, 0)])
+    assert method.importance[~inside].any() and not method.importance[inside].any()
+    worn.start_task(0)
+    assert torch.equal(method.weights.vector()[inside], first[inside])
+    assert torch.equal(method.weights.vector()[~inside], second[~inside])
+    assert torch.equal(acted, torch.cat([parameter.flatten() for parameter in worn.policy.parameters()]))
+
+
+def test_the_output_layers_are_the_last_layers_of_policy_and_critic(small_agent):
+    found = {}
+    for agent in ("a2c", "dqn", "lstm_ppo", "ppo"):
+        weights = wearing(small_agent, agent, L2(coeff=1, heads="multi")).agent.method.weights
+        found[agent] = sorted(tuple(parameter.shape) for parameter in weights.in_head_parameters)
+
+    heads = [(1,), (1, 8), (3,), (3, 8)]
+    assert found == {"a2c": heads, "dqn": [(3,), (3, 8)], "lstm_ppo": heads, "ppo": heads}
+
+
+def test_the_optimiser_forgets_former_output_layers_and_nothing_else(small_agent):
+    worn = wearing(small_agent, "ppo", L2(coeff=0.1, heads="multi"))
+    stay(worn, 0)
+
+    worn.start_task(1)
+
+    state, heads = worn.agent.optimiser.state, worn.agent.method.weights.in_head_parameters
+    known = {parameter: any(value.any() for value in state[parameter].values()) for parameter in worn.agent.weights}
+    assert [known[parameter] for parameter in heads] == [False] * 4
+    assert all(known[parameter] for parameter in known if not any(parameter is head for head in heads))
+
+
+def test_the_target_network_gets_the_task_s_output_layers(small_agent):
+    worn = wearing(small_agent, "dqn", L2(coeff=0.1, heads="multi"))
+    stay(worn, 0)
+
+    worn.start_task(1)
+
+    target = worn.agent.dqn.target_value_network_params.flatten_keys(".")
+    online = worn.agent.dqn.value_network_params.flatten_keys(".")
+    assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
+
+
+def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():
+    with pytest.raises(
+        ValueError, match="Tiny has no output layers behind a trunk, so tasks cannot have their own: use heads"
+    ):
+        tiny(L2(coeff=1, heads="multi"))
+
+
+def test_a_task_that_never_began_is_acted_in_with_the_output_layers_of_the_first(small_agent):
+    worn = wearing(small_agent, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
+    stay(worn, 0)
+    stay(worn, 1)
+
+    unseen, first, second = (weights_for(worn, number) for number in (2, 0, 1))
+
+    assert all(torch.equal(*pair) for pair in zip(unseen, first, strict=True))
+    assert not all(torch.equal(*pair) for pair in zip(unseen, second, strict=True))

@@ -1,0 +1,439 @@
+"""Methods that keep weights for each task: masks over a fixed network, PackNet's shares, networks from scratch."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import pytest
+import torch
+from test_agents import GREEDY, batches
+from test_lifelong import ONE, TWO
+from test_methods import TASKS, stay, wearing, weights_for
+from test_methods_held import RATE, Tiny, seen
+from test_resume import THREE, of
+from torch import Tensor
+from torchrl.envs.utils import set_exploration_type
+
+from baselines.methods.mask_blc import MaskBLC
+from baselines.methods.mask_lc import MaskLC
+from baselines.methods.mask_ri import MaskRI
+from baselines.methods.masks import Masks
+from baselines.methods.packnet import FREE, PackNet
+from baselines.methods.scratch import Scratch
+from baselines.methods.wearing import Wearing
+from ctgraph_rl import Block
+
+MASKS = (MaskRI, MaskLC, MaskBLC)
+KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {"PackNet": lambda: PackNet(retrain=0.5)}
+
+every_mask = pytest.mark.parametrize("method", MASKS)
+
+
+def said(worn: Wearing, number: int, data: Any) -> dict[Any, Tensor]:
+    """All that the policy for a task writes."""
+    with torch.no_grad(), set_exploration_type(GREEDY):
+        written = worn.policy_for(number)(data.select(*worn.policy.in_keys))
+    return dict(written.items(True, True))
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two lists or dictionaries of tensors are equal bit by bit."""
+    pairs = zip(one, other, strict=True) if isinstance(one, list) else [(one[key], other[key]) for key in one]
+    return all(torch.equal(*pair) for pair in pairs)
+
+
+def masked(method: type[Masks]) -> Wearing:
+    """A `Tiny` agent with masks."""
+    torch.manual_seed(0)
+    return Wearing(Tiny(), method(), of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries"))
+
+
+# What holds for all of them
+
+
+@pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
+@pytest.mark.parametrize("name", KEEPS)
+def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(small_agent, agent, name):
+    worn = wearing(small_agent, agent, KEEPS[name]())
+    data = batches(worn, ONE, 1)[0][:, 0].clone()
+    stay(worn, 0)
+    first = said(worn, 0, data), weights_for(worn, 0)
+    stay(worn, 1)
+    second = said(worn, 1, data), weights_for(worn, 1)
+    stay(worn, 2)
+
+    for number, (outputs, weights) in enumerate((first, second)):
+        assert same(weights_for(worn, number), weights)
+        assert same(said(worn, number, data), outputs)
+    others = [weights_for(worn, number) for number in range(3)]
+    assert not same(others[0], others[1]) and not same(others[1], others[2])
+
+
+@pytest.mark.parametrize("name", KEEPS)
+def test_a_task_that_comes_again_goes_on_with_what_it_had(small_agent, name):
+    worn = wearing(small_agent, "ppo", KEEPS[name]())
+    stay(worn, 0)
+    had = weights_for(worn, 0)
+    stay(worn, 1)
+    other = weights_for(worn, 1)
+
+    worn.start_task(0)
+    again = weights_for(worn, 0)
+    stay(worn, 0)
+
+    assert same(again, had)
+    assert not same(weights_for(worn, 0), had)
+    assert same(weights_for(worn, 1), other)
+
+
+@pytest.mark.parametrize("name", KEEPS)
+def test_a_task_that_never_began_is_acted_in_as_the_first(small_agent, name):
+    worn = wearing(small_agent, "ppo", KEEPS[name]())
+    before = weights_for(worn, 2)
+    assert same(before, weights_for(worn, 0))
+    stay(worn, 1)  # the first one that begins has the id 1
+    stay(worn, 0)
+
+    unseen, first, second = (weights_for(worn, number) for number in (2, 1, 0))
+
+    assert same(unseen, first) and not same(unseen, second)
+
+
+@pytest.mark.parametrize("name", KEEPS)
+def test_a_task_beyond_those_of_the_curriculum_is_refused(small_agent, name):
+    worn = wearing(small_agent, "ppo", KEEPS[name](), (ONE, TWO))
+    for number in (0, 1, 0):
+        stay(worn, number, (ONE, TWO), 1)
+
+    with pytest.raises(ValueError, match="there is room for 2 tasks, got another, 5"):
+        worn.start_task(5)
+
+
+@pytest.mark.parametrize("name", KEEPS)
+def test_the_target_network_follows_where_weights_are_changed(small_agent, name):
+    worn = wearing(small_agent, "dqn", KEEPS[name]())
+    stay(worn, 0)
+
+    worn.start_task(1)
+
+    loss = worn.agent.dqn
+    target, online = (part.flatten_keys(".") for part in (loss.target_value_network_params, loss.value_network_params))
+    assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
+
+
+# Masks
+
+
+@pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
+def test_the_network_is_of_signed_constants_and_zero_biases(small_agent, agent):
+    drawn = [weights.detach().clone() for weights in small_agent(agent, TASKS).policy.parameters()]
+    worn = wearing(small_agent, agent, MaskRI())
+
+    for number in range(2):
+        stay(worn, number)
+        for before, now in zip(drawn, weights_for(worn, number), strict=True):
+            constant = before.sign() * (2 / before.shape[-1]) ** 0.5 if before.ndim == 2 else torch.zeros_like(before)
+            kept = now != 0
+            torch.testing.assert_close(now, torch.where(kept, constant, 0.0), atol=0, rtol=1e-6)
+            assert before.ndim == 1 or 0 < kept.sum() < kept.numel()
+
+
+def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_inputs(build_agent):
+    method = MaskRI()
+    worn = wearing(build_agent, "ppo", method, TASKS, "agent.num_layers=2")
+
+    worn.start_task(0)
+
+    for parameter, scores in zip(method.weights.parameters, method.weights.split(method.own.detach()), strict=True):
+        if parameter.ndim == 1:
+            assert not scores.any()
+            continue
+        most, n = parameter.shape[1] ** -0.5, scores.numel()
+        assert scores.abs().max() <= most
+        # Kolmogorov-Smirnov: the empirical distribution is off by more than 2.5 / sqrt(n) with a chance below 1e-5.
+        uniform = (scores.sort().values / most + 1) / 2
+        assert (uniform - torch.linspace(0, 1, n)).abs().max() < 2.5 * n**-0.5 + 1 / n
+
+
+@every_mask
+def test_each_new_task_s_own_scores_are_drawn_anew(small_agent, method):
+    worn = wearing(small_agent, "ppo", method())
+    own = []
+    for number in range(2):
+        worn.start_task(number)
+        own.append(worn.agent.method.own.detach().clone())
+        worn.end_task()
+
+    assert (own[0] != own[1])[worn.agent.method.weights.in_matrices].float().mean() > 0.99
+
+
+def test_the_gradient_goes_straight_through_the_mask_to_all_scores():
+    worn, minibatch = masked(MaskRI), seen(6)
+    worn.start_task(0)
+    method = worn.agent.method
+    before, weights = method.own.detach().clone(), method.weights.vector().detach()
+
+    worn.agent.gradient_step(minibatch)
+
+    # dL/dW_kj = mean_n f_nk x_nj whatever the weights are; dL/ds = c dL/dw, and biases have c = 0.
+    of_weight = (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
+    expected = before[:6] - RATE * method.constant[:6] * of_weight
+    torch.testing.assert_close(method.own[:6].detach(), expected)
+    assert (weights[:6] == 0).any() and (weights[:6] != 0).any()
+    assert not method.own[6:].any() and not method.constant[6:].any()
+    assert torch.equal(method.weights.vector(), torch.where(method.own >= 0, method.constant, 0.0))
+
+
+SHARES = {MaskLC: [[1.0], [0.5] * 2, [1 / 3] * 3], MaskBLC: [[1.0], [0.5, 0.5], [0.25, 0.25, 0.5]]}
+"""With which the tasks begin; the last is that of the new scores."""
+
+
+@pytest.mark.parametrize("method", SHARES)
+def test_a_linear_combination_begins_with_its_shares(small_agent, method):
+    worn = wearing(small_agent, "ppo", method())
+    its = worn.agent.method
+
+    for number in range(3):
+        worn.start_task(number)
+        present, own = its.present_scores().detach(), its.own.detach()
+        expected = sum(
+            share * scores for share, scores in zip(SHARES[method][number], [*its.scores[:number], own], strict=True)
+        )
+        torch.testing.assert_close(present, expected)
+        assert torch.equal(its.weights.vector(), torch.where(present >= 0, its.constant, 0.0))
+        stay(worn, number)
+
+
+@pytest.mark.parametrize("method", SHARES)
+def test_a_step_moves_the_combination_of_each_weight_tensor_by_its_own_shares(method):
+    worn, minibatch = masked(method), seen(6)
+    its = worn.agent.method
+    for number in range(2):
+        worn.start_task(number)
+        worn.agent.gradient_step(minibatch)
+        worn.end_task()
+    worn.start_task(2)
+    shares, own, old = torch.tensor(SHARES[method][2]), its.own.detach().clone(), its.scores[:2].clone()
+    betas = its.betas.detach().clone()
+
+    worn.agent.gradient_step(minibatch)
+
+    of_scores = its.constant[:6] * (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
+    torch.testing.assert_close(its.own[:6].detach(), own[:6] - RATE * shares[2] * of_scores)
+    # d/d b_i of sum_k softmax(b)_k s_k is a_i (s_i - sum_k a_k s_k).
+    terms = torch.stack([*old, own])[:, :6]
+    of_betas = shares * ((terms - shares @ terms) @ of_scores)
+    torch.testing.assert_close(its.betas[0].detach(), betas[0] - RATE * of_betas)
+    assert torch.equal(its.betas[1], betas[1])  # of the biases, whose constants are 0
+    assert torch.equal(its.scores[:2], old)
+
+
+@pytest.mark.parametrize("method", SHARES)
+def test_the_combination_is_consolidated_at_the_tasks_end(small_agent, method):
+    worn = wearing(small_agent, "ppo", method())
+    its = worn.agent.method
+    stay(worn, 0)
+    worn.start_task(1)
+    for batch in batches(worn, TWO, 2):
+        worn.learn(batch)
+    combined, weights = its.present_scores().detach().clone(), weights_for(worn, 1)
+    assert not torch.equal(combined, its.own)
+
+    worn.end_task()
+
+    assert torch.equal(its.scores[1], combined)
+    assert torch.equal(its.present_scores(), combined)
+    assert same(weights_for(worn, 1), weights)
+
+
+@pytest.mark.parametrize("method", SHARES)
+def test_a_task_that_comes_again_learns_its_consolidated_scores_alone(method):
+    worn, minibatch = masked(method), seen(6)
+    its = worn.agent.method
+    for number in (0, 1, 2):
+        worn.start_task(number)
+        worn.agent.gradient_step(minibatch)
+        worn.end_task()
+    kept = its.scores.clone()
+
+    worn.start_task(1)
+    worn.agent.gradient_step(minibatch)
+    worn.end_task()
+
+    of_weight = (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
+    torch.testing.assert_close(its.scores[1, :6], kept[1, :6] - RATE * its.constant[:6] * of_weight)
+    assert torch.equal(its.scores[[0, 2]], kept[[0, 2]])
+
+
+@every_mask
+def test_the_optimiser_starts_anew_with_each_task(small_agent, method):
+    worn = wearing(small_agent, "ppo", method())
+    stay(worn, 0)
+    assert worn.agent.optimiser.state
+
+    worn.start_task(1)
+
+    assert not worn.agent.optimiser.state
+    live = worn.agent.live
+    assert live[0] is worn.agent.method.own and len(live) == (1 if method is MaskRI else 2)
+    assert worn.agent.optimiser.defaults == small_agent("ppo", TASKS).optimiser.defaults
+
+
+# PackNet
+
+
+def packed(small_agent, agent: str = "ppo", retrain: float = 0.5) -> tuple[Wearing, PackNet]:
+    method = PackNet(retrain=retrain)
+    return wearing(small_agent, agent, method), method
+
+
+@pytest.mark.parametrize("agent", ["dqn", "lstm_ppo"])
+def test_each_task_keeps_an_equal_share_of_every_weight_matrix(small_agent, agent):
+    worn, method = packed(small_agent, agent)
+    for number in range(3):
+        stay(worn, number)
+
+    of_parameters = zip(
+        method.weights.names, method.weights.parameters, method.weights.split(method.owner), strict=True
+    )
+    for name, parameter, owner in of_parameters:
+        counts = [int((owner == place).sum()) for place in (FREE, 0, 1, 2)]
+        if name in method.weights.head_names:
+            assert counts == [parameter.numel(), 0, 0, 0]
+        elif parameter.ndim == 1:
+            assert counts == [0, parameter.numel(), 0, 0]
+        else:
+            assert counts[0] == 0 and all(abs(count - parameter.numel() / 3) < 1 for count in counts[1:])
+
+
+def test_the_largest_free_weights_are_kept_and_the_others_are_zero(small_agent):
+    worn, method = packed(small_agent)
+    worn.start_task(0)
+    worn.learn(batches(worn, ONE, 1)[0])
+    trained = [parameter.detach().clone() for parameter in method.weights.parameters]
+
+    worn.end_task()
+
+    for name, before, now, owner in zip(
+        method.weights.names, trained, method.weights.parameters, method.weights.split(method.owner), strict=True
+    ):
+        kept = owner.view_as(before) == 0
+        if name in method.weights.head_names or before.ndim == 1:
+            assert torch.equal(now, before)
+        else:
+            assert before[kept].abs().min() >= before[~kept].abs().max()
+            assert torch.equal(now, torch.where(kept, before, 0.0))
+
+
+def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_zero(small_agent):
+    worn, method = packed(small_agent)
+    stay(worn, 0)
+    trunk = ~method.in_heads
+    kept, first = (method.owner == 0) & trunk, method.weights.vector().detach()
+    stay(worn, 1)
+    second = method.weights.vector().detach()
+    free = (method.owner == FREE) & trunk
+    stay(worn, 2)
+
+    last = method.weights.vector().detach()
+
+    assert torch.equal(second[kept], first[kept]) and torch.equal(last[kept], first[kept])
+    own = (method.owner == 1) & trunk
+    assert not first[own].any() and second[own].any() and torch.equal(last[own], second[own])
+    assert not first[free].any() and not second[free].any()
+
+
+@pytest.mark.parametrize(("retrain", "number_of_prunings"), [(0.5, 2), (0.0, 4), (0.75, 1)])
+def test_pruning_leaves_a_share_of_the_block_for_retraining(small_agent, retrain, number_of_prunings):
+    """Blocks of 160 frames are announced; batches have 16."""
+    method = PackNet(retrain=retrain)
+    worn = wearing(
+        small_agent, "ppo", method, TASKS, "agent.num_envs=4", "agent.num_steps=10", "agent.num_minibatches=1"
+    )
+    worn.start_task(0)
+
+    pruned = []
+    for batch in batches(worn, ONE, 4):
+        worn.learn(batch)
+        pruned.append(bool((method.owner == 0).any()))
+    before = method.weights.vector().detach()
+    worn.end_task()
+
+    assert pruned == [number >= number_of_prunings for number in range(4)]
+    zero = (method.owner == FREE) & ~method.in_heads
+    assert bool(before[zero].any()) == (retrain == 0)  # pruned at the end only
+    assert not method.weights.vector()[zero].any()
+
+
+def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(small_agent):
+    worn, method = packed(small_agent, retrain=0.999)
+    worn.start_task(0)
+    one, other, more = batches(worn, ONE, 3)
+    worn.learn(one)
+    worn.learn(other)
+    kept, free = (method.owner == 0) & ~method.in_heads, (method.owner == FREE) & ~method.in_heads
+    before = method.weights.vector().detach()
+
+    worn.learn(more)
+
+    after = method.weights.vector().detach()
+    assert kept.any() and free.any()
+    assert not before[free].any() and not after[free].any()
+    assert not torch.equal(after[kept], before[kept])
+
+
+def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_acts_with(small_agent):
+    worn, method = packed(small_agent)
+    for number in range(3):
+        stay(worn, number)
+    inside, packed_before, owner = method.in_heads, method.packed.clone(), method.owner.clone()
+    acted, others = worn.policy_for(0), [weights_for(worn, number) for number in (1, 2)]
+    had = torch.cat([dict(acted.named_parameters())[name].flatten() for name in method.weights.names]).detach().clone()
+
+    worn.start_task(0)
+    for batch in batches(worn, ONE, 2):
+        worn.learn(batch)
+    trained = method.weights.vector().detach()
+    worn.end_task()
+
+    assert torch.equal(trained[~inside], had[~inside])
+    assert not torch.equal(trained[inside], had[inside])
+    assert torch.equal(method.packed, packed_before) and torch.equal(method.owner, owner)
+    assert all(same(weights_for(worn, number), weights) for number, weights in zip((1, 2), others, strict=True))
+
+
+# From scratch
+
+
+def test_a_new_task_draws_a_new_network_and_forgets_the_optimisers_state(small_agent):
+    begun_with = [weights.detach().clone() for weights in small_agent("ppo", TASKS).policy.parameters()]
+    worn = wearing(small_agent, "ppo", Scratch())
+
+    worn.start_task(0)
+    assert same([*worn.policy.parameters()], begun_with)
+    stay(worn, 0)
+    first = weights_for(worn, 0)
+    worn.start_task(1)
+    drawn = weights_for(worn, 1)
+
+    for was, learned, now in zip(begun_with, first, drawn, strict=True):
+        assert not (now == was).any() and not (now == learned).any()
+        inputs = now.shape[1] if now.ndim == 2 else None
+        assert inputs is None or 0 < now.abs().max() <= inputs**-0.5  # as PyTorch draws linear layers
+    assert not any(value.any() for state in worn.agent.optimiser.state.values() for value in state.values())
+
+
+def test_a_task_from_scratch_is_learned_as_by_a_new_agent_with_those_weights(small_agent):
+    worn, alone = wearing(small_agent, "ppo", Scratch()), small_agent("ppo", TASKS)
+    stay(worn, 0)
+    worn.start_task(1)
+    alone.policy.load_state_dict(deepcopy(worn.policy.state_dict()))
+    given = batches(worn, THREE, 2)
+
+    for agent in (worn, alone):
+        torch.manual_seed(5)
+        for batch in given:
+            agent.learn(batch)
+
+    assert same([*worn.policy.parameters()], [*alone.policy.parameters()])

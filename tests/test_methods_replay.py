@@ -1,0 +1,333 @@
+"""Replay, all tasks at once, what methods store, and compiled steps."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from test_agents import batches
+from test_lifelong import ONE, TWO
+from test_methods import TASKS, stay, wearing
+from test_resume import THREE, of
+from torch import Tensor
+
+from baselines.compiled import whole_step
+from baselines.methods.clear import CLEAR, Reservoir
+from baselines.methods.ewc import EWC
+from baselines.methods.l2 import L2
+from baselines.methods.mas import MAS
+from baselines.methods.mask_blc import MaskBLC
+from baselines.methods.mask_lc import MaskLC
+from baselines.methods.mask_ri import MaskRI
+from baselines.methods.method import Method
+from baselines.methods.multitask import Multitask
+from baselines.methods.packnet import PackNet
+from baselines.methods.scratch import Scratch
+from baselines.methods.si import SI
+from baselines.methods.wearing import Wearing
+from ctgraph_rl import Block
+from ctgraph_rl.lifelong import collect, make_env
+from ctgraph_rl.policies import OptimalPolicy
+
+OF_EWC = {"coeff": 10.0, "online": False, "alpha": 0.5, "fisher": "policy", "num_samples": 16}
+
+# The reservoir
+
+
+OFFERS = {
+    "one by one": [1] * 40,
+    "less than there is room for, then more": [3, 20, 17],
+    "more than there is room for": [40],
+    "twice more than there is room for": [16, 24],
+    "odd sizes": [5, 1, 7, 2, 11, 14],
+}
+
+
+@pytest.mark.parametrize("offers", OFFERS.values(), ids=OFFERS)
+def test_every_item_is_kept_with_the_same_chance_and_every_pair_too(offers):
+    """40 items and 8 places: an item is kept with chance 1/5, a pair with 8/40 * 7/39."""
+    torch.manual_seed(0)
+    trials, capacity, total = min(4000, 20_000 // len(offers)), 8, sum(offers)
+    kept, early = torch.zeros(total), []
+
+    for _ in range(trials):
+        reservoir, start = Reservoir(capacity), 0
+        for number in offers:
+            reservoir.offer({"item": torch.arange(start, start + number)})
+            start += number
+        held = reservoir.items["item"]
+        assert len(held.unique()) == capacity == len(reservoir)
+        kept[held] += 1
+        early.append((held < total // 2).sum())
+
+    # Chi-square of draws without replacement, 39 degrees of freedom: above 96.2 with a chance of 1e-6.
+    chance = capacity / total
+    off = (kept - trials * chance).square().sum() / (trials * chance * (1 - chance))
+    assert off * (total - 1) / total < 96.2
+    # How many are of the first half is hypergeometric: mean 4, variance 64/39; its square has the deviation 2.22.
+    gap = torch.stack(early) - 4.0
+    assert abs(gap.mean()) < 5 * math.sqrt(64 / 39 / trials)
+    assert abs(gap.square().mean() - 64 / 39) < 5 * 2.22 / math.sqrt(trials)
+
+
+def test_a_reservoir_keeps_all_items_until_it_is_full_and_keys_together():
+    torch.manual_seed(0)
+    reservoir = Reservoir(10)
+    for start in (0, 4, 8, 12):
+        number = torch.arange(start, start + 4)
+        reservoir.offer({"number": number, ("next", "square"): (number**2).unsqueeze(-1).float()})
+        if start < 8:
+            assert reservoir.items["number"][: start + 4].tolist() == list(range(start + 4))
+        assert len(reservoir) == min(start + 4, 10)
+
+    number, square = reservoir.items.values()
+
+    assert torch.equal(square[:, 0], number.float() ** 2)
+    assert reservoir.offered == 16
+
+
+def test_samples_are_drawn_alike_from_what_is_there():
+    torch.manual_seed(0)
+    reservoir = Reservoir(50)
+    reservoir.offer({"item": torch.arange(4) + 7})
+
+    drawn = reservoir.sample(40_000)["item"]
+
+    assert drawn.bincount(minlength=12)[7:11].tolist() == pytest.approx([10_000] * 4, abs=500)  # over 5 deviations
+    assert drawn.min() == 7 and drawn.max() == 10
+
+
+# Behaviour cloning
+
+
+def cloning(small_agent, agent: str, **settings: float) -> tuple[Wearing, dict[str, Tensor], dict[Any, Tensor]]:
+    """An agent with a batch of 128 steps in its reservoir, its losses, and what was replayed."""
+    method = CLEAR(**{"buffer_size": 128, "policy_coeff": 1.0, "value_coeff": 1.0, **settings})
+    worn = wearing(small_agent, agent, method)
+    method.see(batches(worn, ONE, 1)[0])
+    torch.manual_seed(1)
+    mixed = method.mixed({"action": torch.zeros(6, dtype=torch.int64)})
+    replayed = {key[1]: value for key, value in mixed.items() if isinstance(key, tuple) and key[0] == "replay"}
+    return worn, mixed, replayed
+
+
+@pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
+def test_cloning_loses_nothing_right_after_storing(small_agent, agent):
+    worn, mixed, replayed = cloning(small_agent, agent)
+
+    losses = worn.agent.method.loss(mixed)
+
+    names = ["loss_policy_cloning", "loss_value_cloning"] if agent != "dqn" else ["loss_value_cloning"]
+    assert list(losses) == names
+    assert all(abs(loss.item()) < 1e-7 for loss in losses.values())
+    assert all(len(value) == 6 for value in replayed.values())
+
+
+def change(worn: Wearing) -> None:
+    """Other weights."""
+    weights = worn.agent.method.weights
+    weights.write(weights.vector() + 0.3 * torch.randn(len(weights), generator=torch.Generator().manual_seed(2)))
+
+
+@pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
+def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error_of_values(small_agent, agent):
+    worn, mixed, replayed = cloning(small_agent, agent, policy_coeff=0.5, value_coeff=3.0)
+    change(worn)
+
+    losses = worn.agent.method.loss(mixed)
+
+    now = worn.agent.outputs(replayed)
+    old, new = (torch.distributions.Categorical(logits=each["log_probs"]) for each in (replayed, now))
+    divergence = torch.distributions.kl_divergence(old, new)
+    assert divergence.min() > 1e-4
+    torch.testing.assert_close(losses["loss_policy_cloning"], 0.5 * divergence.mean())
+    error = (replayed["state_value"] - now["state_value"]) ** 2
+    torch.testing.assert_close(losses["loss_value_cloning"], 3 * error.mean())
+    gradients = torch.autograd.grad(sum(losses.values()), worn.agent.weights)
+    assert all(gradient.any() for gradient in gradients)
+
+
+def test_a_q_learner_clones_its_action_values(small_agent):
+    worn, mixed, replayed = cloning(small_agent, "dqn", value_coeff=3.0)
+    change(worn)
+
+    losses = worn.agent.method.loss(mixed)
+
+    error = (replayed["action_value"] - worn.agent.values(replayed)) ** 2
+    assert list(losses) == ["loss_value_cloning"] and error.shape == (6, 3)
+    torch.testing.assert_close(losses["loss_value_cloning"], 3 * error.mean())
+
+
+def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(small_agent):
+    worn, _, replayed = cloning(small_agent, "ppo")
+    batch = batches(worn, ONE, 1)[0]
+    said = worn.agent.outputs({"observation": batch["observation"].flatten(0, 1)})["log_probs"]
+
+    known = {
+        (*map(float, o), *p) for o, p in zip(batch["observation"].flatten(0, 1).tolist(), said.tolist(), strict=True)
+    }
+    found = [
+        (*map(float, o), *p)
+        for o, p in zip(replayed["observation"].tolist(), replayed["log_probs"].tolist(), strict=True)
+    ]
+
+    assert all(min(math.dist(one, other) for other in known) < 1e-6 for one in found)
+
+
+def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(small_agent):
+    worn = wearing(small_agent, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
+    sizes, loss = Counter(), worn.agent.method.loss
+    worn.agent.method.loss = lambda batch: (sizes.update([len(batch["replay", "log_probs"])]), loss(batch))[1]
+
+    worn.learn(batches(worn, ONE, 1)[0])
+
+    assert sizes == {worn.agent.minibatch_size: 16}
+
+
+# All tasks at once
+
+
+def test_multitask_is_one_block_in_which_all_tasks_are_met_equally_often():
+    curriculum = of(Block(ONE, 80), Block(THREE, 120), Block(TWO, 56), Block(ONE, 44), task_id="one_hot")
+    at_once = Multitask().prepare(curriculum)
+    env = make_env(at_once, at_once.blocks[0].rows(4), 0)
+    env.switch_tasks(at_once.blocks[0].tasks, at_once.blocks[0].switch)
+
+    batch = next(collect(env, OptimalPolicy(env), 4 * 600, 600))
+
+    assert len(at_once.blocks) == 1 and at_once.num_frames == 300
+    assert at_once.tasks == curriculum.tasks == (ONE, THREE, TWO)
+    assert at_once.task_ids == curriculum.task_ids and at_once.evaluation == curriculum.evaluation
+    began = batch["is_init"].squeeze(-1)
+    for row, first in zip(batch["task_id"], began, strict=True):
+        order = row[first].argmax(dim=-1)
+        assert order.tolist() == [number % 3 for number in range(len(order))] and len(order) > 100
+
+
+# What is stored
+
+
+def nbytes(value: Any) -> int:
+    """Of all tensors in nested plain values."""
+    if isinstance(value, Tensor):
+        return value.nbytes
+    values = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return sum(map(nbytes, values))
+
+
+HEADS, WEIGHTS, LAYERS = 8 * 4 + 4, 8 * 5 + 8 + 8 * 8 + 8 + 8 * 4 + 4, 8
+"""Numbers of the small PPO's output layers and of all; its weight tensors."""
+
+COUNTED = {
+    "CLEAR": (lambda: CLEAR(buffer_size=100, policy_coeff=1.0, value_coeff=1.0), 100 * (5 + 4 * 3 + 4)),
+    "EWC": (lambda: EWC(**OF_EWC, heads="single"), 12 * WEIGHTS),
+    "EWC online": (lambda: EWC(**{**OF_EWC, "online": True}, heads="single"), 12 * WEIGHTS),
+    "EWC multi": (lambda: EWC(**OF_EWC, heads="multi"), 12 * WEIGHTS + 3 * 4 * HEADS),
+    "L2": (lambda: L2(coeff=1, heads="single"), 12 * WEIGHTS),
+    "MAS": (lambda: MAS(coeff=1, num_samples=16, heads="single"), 12 * WEIGHTS),
+    "MaskBLC": (MaskBLC, (3 + 2) * 4 * WEIGHTS + 3 * 4 * LAYERS),
+    "MaskLC": (MaskLC, (3 + 2) * 4 * WEIGHTS + 3 * 4 * LAYERS),
+    "MaskRI": (MaskRI, (3 + 2) * 4 * WEIGHTS),
+    "Multitask": (Multitask, 0),
+    "None": (Method, 0),
+    "PackNet": (lambda: PackNet(retrain=0.5), 8 * WEIGHTS + 3 * 4 * HEADS),
+    "SI": (lambda: SI(coeff=1, epsilon=1, heads="single"), 28 * WEIGHTS),
+    "Scratch": (Scratch, 3 * 4 * WEIGHTS),
+}
+"""Methods, and the bytes that their docstrings count for three tasks."""
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_what_is_stored_is_what_is_counted(small_agent, name):
+    make, counted = COUNTED[name]
+    method = make()
+    if name in ("None", "Multitask"):
+        worn = Wearing(small_agent("ppo", TASKS), method, of(*(Block(task, 160) for task in TASKS)))
+    else:
+        worn = wearing(small_agent, "ppo", method)
+    assert len(worn.agent.method.weights) == WEIGHTS and len(worn.agent.method.weights.parameters) == LAYERS
+
+    for number in range(3):
+        stay(worn, number)
+
+        assert nbytes(dict(method.state_dict())) == counted
+
+
+def test_the_samples_of_a_task_are_stored_until_its_end(small_agent):
+    method = EWC(**{**OF_EWC, "num_samples": 20}, heads="single")
+    worn = wearing(small_agent, "ppo", method)
+    worn.start_task(0)
+
+    worn.learn(batches(worn, ONE, 1)[0])
+
+    # 32 frames, the last minibatch: observation, action, chance, advantage, target.
+    assert nbytes(method.get_extra_state()) == 32 * (5 + 8 + 3 * 4)
+
+
+# Compiled steps
+
+
+COMPILED = {
+    "clear": (lambda: CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0)),
+    "ewc": (lambda: EWC(**OF_EWC, heads="multi")),
+    "mask_lc": MaskLC,
+    "mask_ri": MaskRI,
+    "packnet": (lambda: PackNet(retrain=0.5)),
+    "si": (lambda: SI(coeff=10.0, epsilon=0.1, heads="single")),
+}
+
+
+def two_tasks(small_agent, name: str, *overrides: str, whole: bool = False) -> Wearing:
+    worn = wearing(small_agent, "ppo", COMPILED[name](), TASKS, *overrides)
+    if whole:  # the step that is compiled, without compiling it
+        worn.agent.compiled_step = whole_step
+        worn.agent.optimise = lambda parameters: _optimise(worn.agent, parameters)
+    for number in range(2):
+        torch.manual_seed(number)
+        stay(worn, number)
+    return worn
+
+
+def _optimise(agent: Any, parameters: Any) -> None:
+    type(agent).optimise(agent, parameters)
+    agent.compiled_step = whole_step
+
+
+def check_close(one: Wearing, other: Wearing) -> None:
+    """Equal up to rounding: weights of all tasks, and the method's buffers."""
+    for found, expected in zip(one.agent.parameters(), other.agent.parameters(), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-3)
+    for found, expected in zip(one.agent.method.buffers(), other.agent.method.buffers(), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(small_agent, name):
+    eager, whole = two_tasks(small_agent, name), two_tasks(small_agent, name, whole=True)
+
+    check_close(whole, eager)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPILED)
+def test_no_task_needs_more_than_one_compiled_step(small_agent, monkeypatch, name):
+    """There is a limit, so else a curriculum of many tasks stops."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    worn = wearing(small_agent, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
+
+    with torch._dynamo.config.patch(recompile_limit=1):
+        for number in (0, 1, 2, 0):
+            stay(worn, number)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPILED)
+def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(small_agent, name):
+    eager, compiled = two_tasks(small_agent, name), two_tasks(small_agent, name, "agent.compile=true")
+
+    assert compiled.agent.compiled_step is not None
+    check_close(compiled, eager)
