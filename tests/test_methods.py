@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from conftest import SMALL_AGENT
 from kill_runs import equal
 from test_agents import batches, saved_and_loaded
 from test_lifelong import ONE, TWO, Scripted
@@ -15,7 +16,7 @@ from test_resume import MINIBATCHES, REPLAY, SMALL, THREE, of
 
 from baselines.methods.method import Method
 from baselines.methods.wearing import Wearing
-from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum, run
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, RunLog, learn_curriculum, run
 from ctgraph_rl.train import new_agent
 
 AGENTS = {"a2c": [], "dqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
@@ -45,8 +46,8 @@ BLOCKS = (Block(ONE, 80), Block(TWO, 64), Block(THREE, 96), Block(ONE, 40))
 CURRICULUM = of(*BLOCKS, evaluation=Evaluation(2, greedy=False, before=False), task_id="one_hot")
 """Batches of 32 frames, and at the end of blocks of less; the first task comes again."""
 
-KEPT = (6, 8)
-"""Updates after which a state is kept: within the third block, and at its end."""
+KEPT = (4, 8)
+"""Updates after which a state is kept: within the second block, and at the end of the third."""
 
 
 COMPOSED: dict[tuple[str, ...], Any] = {}
@@ -90,10 +91,18 @@ def life(compose, agent: str, method: str, *overrides: str, curriculum: Curricul
     return Life(prepared, lambda *specs: make_method().worn_by(make_alone(*specs), prepared))
 
 
-def wearing(small_agent, agent: str, method: Method, tasks=TASKS, *overrides: str) -> Wearing:
+def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
+    """An agent as the fixture ``small_agent`` builds it, whose configuration is composed once."""
+    env = CTGraphEnv(tasks)
+    torch.manual_seed(0)
+    make_agent = made(compose, "agent", agent, *SMALL_AGENT[agent], *overrides)
+    return make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
+
+
+def wearing(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> Wearing:
     """A small agent with a method, which is told the ids of tasks that have a block each."""
     curriculum = method.prepare(of(*(Block(task, 160) for task in tasks), task_id="at_boundaries"))
-    return method.worn_by(small_agent(agent, tasks, *overrides), curriculum)
+    return method.worn_by(small(compose, agent, tasks, *overrides), curriculum)
 
 
 def stay(worn: Wearing, number: int, tasks=TASKS, number_of_batches: int = 2) -> None:
@@ -242,7 +251,7 @@ def test_every_agent_goes_on_with_every_method_as_if_never_stopped(compose, agen
         assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
         assert later and later == lines[-len(later) :]
     if method != "multitask":
-        assert [state["frames"] for state in states] == [176, 240]
+        assert [state["frames"] for state in states] == [112, 240]
     check_policies(its, whole, differ=method in OF_EACH_TASK)
 
 
@@ -254,6 +263,16 @@ def check_policies(its: Life, whole: Any, differ: bool) -> None:
     policies = [weights_for(whole, number) for number in range(3)]
     assert equal(policies, [weights_for(loaded, number) for number in range(3)])
     assert equal(policies[0], policies[1]) != differ
+
+
+def test_packnet_goes_on_before_it_prunes_within_a_block(compose, monkeypatch):
+    monkeypatch.setitem(globals(), "KEPT", (1,))
+    its = life(compose, "ppo", "packnet", "method.retrain=0.3")  # prunes before the third update
+
+    whole, _, states = its.live()
+    resumed, _, _ = its.live(states[0])
+
+    assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
 
 
 @pytest.mark.parametrize("method", ["ewc_published", "mask_lc", "packnet"])

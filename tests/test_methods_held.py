@@ -176,8 +176,8 @@ def test_mas_is_the_mean_sensitivity_of_the_squared_length_of_linear_outputs():
     torch.testing.assert_close(worn.agent.method.importance, once + by_hand(second["observation"]))
 
 
-def test_the_outputs_that_mas_weighs_are_log_probabilities_and_value(small_agent):
-    worn = wearing(small_agent, "a2c", MAS(coeff=1, num_samples=4, heads="single"))
+def test_the_outputs_that_mas_weighs_are_log_probabilities_and_value(compose):
+    worn = wearing(compose, "a2c", MAS(coeff=1, num_samples=4, heads="single"))
     batch = batches(worn, ONE, 1)[0]
     worn.start_task(0)
     minibatch = {key: batch[key].flatten(0, 1)[:4] for key in ("observation", "action")}
@@ -194,9 +194,9 @@ def test_the_outputs_that_mas_weighs_are_log_probabilities_and_value(small_agent
 
 
 @pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
-def test_every_agents_policy_has_the_fisher_information_of_its_frames(small_agent, agent):
+def test_every_agents_policy_has_the_fisher_information_of_its_frames(compose, agent):
     """Against sum_a (d pi_a / d w)^2 / pi_a, which is the same as E[(d log pi_a / d w)^2], frame by frame."""
-    worn = wearing(small_agent, agent, EWC(coeff=1, **{**EWC_SETTINGS, "num_samples": 16}))
+    worn = wearing(compose, agent, EWC(coeff=1, **{**EWC_SETTINGS, "num_samples": 16}))
     keys = [*worn.policy.in_keys, "action"]
     rows = batches(worn, ONE, 1)[0][:2]
     minibatch = {key: rows[key] if worn.memory else rows[key].flatten(0, 1) for key in keys}
@@ -350,8 +350,8 @@ MULTI = {
 
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
 @pytest.mark.parametrize("name", MULTI)
-def test_output_layers_are_swapped_with_the_task_and_not_held(small_agent, agent, name):
-    worn = wearing(small_agent, agent, MULTI[name]())
+def test_output_layers_are_swapped_with_the_task_and_not_held(compose, agent, name):
+    worn = wearing(compose, agent, MULTI[name]())
     method, inside = worn.agent.method, worn.agent.method.weights.in_heads
     begun_with = method.weights.vector().detach()[inside]
 
@@ -372,18 +372,18 @@ def test_output_layers_are_swapped_with_the_task_and_not_held(small_agent, agent
     assert torch.equal(acted, torch.cat([parameter.flatten() for parameter in worn.policy.parameters()]))
 
 
-def test_the_output_layers_are_the_last_layers_of_policy_and_critic(small_agent):
+def test_the_output_layers_are_the_last_layers_of_policy_and_critic(compose):
     found = {}
     for agent in ("a2c", "dqn", "lstm_ppo", "ppo"):
-        weights = wearing(small_agent, agent, L2(coeff=1, heads="multi")).agent.method.weights
+        weights = wearing(compose, agent, L2(coeff=1, heads="multi")).agent.method.weights
         found[agent] = sorted(tuple(parameter.shape) for parameter in weights.in_head_parameters)
 
     heads = [(1,), (1, 8), (3,), (3, 8)]
     assert found == {"a2c": heads, "dqn": [(3,), (3, 8)], "lstm_ppo": heads, "ppo": heads}
 
 
-def test_the_optimiser_forgets_former_output_layers_and_nothing_else(small_agent):
-    worn = wearing(small_agent, "ppo", L2(coeff=0.1, heads="multi"))
+def test_the_optimiser_forgets_former_output_layers_and_nothing_else(compose):
+    worn = wearing(compose, "ppo", L2(coeff=0.1, heads="multi"))
     stay(worn, 0)
 
     worn.start_task(1)
@@ -394,8 +394,8 @@ def test_the_optimiser_forgets_former_output_layers_and_nothing_else(small_agent
     assert all(known[parameter] for parameter in known if not any(parameter is head for head in heads))
 
 
-def test_the_target_network_gets_the_task_s_output_layers(small_agent):
-    worn = wearing(small_agent, "dqn", L2(coeff=0.1, heads="multi"))
+def test_the_target_network_gets_the_task_s_output_layers(compose):
+    worn = wearing(compose, "dqn", L2(coeff=0.1, heads="multi"))
     stay(worn, 0)
 
     worn.start_task(1)
@@ -412,8 +412,8 @@ def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():
         tiny(L2(coeff=1, heads="multi"))
 
 
-def test_a_task_that_never_began_is_acted_in_with_the_output_layers_of_the_first(small_agent):
-    worn = wearing(small_agent, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
+def test_a_task_that_never_began_is_acted_in_with_the_output_layers_of_the_first(compose):
+    worn = wearing(compose, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
     stay(worn, 0)
     stay(worn, 1)
 

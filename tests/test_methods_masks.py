@@ -9,7 +9,7 @@ import pytest
 import torch
 from test_agents import GREEDY, batches
 from test_lifelong import ONE, TWO
-from test_methods import TASKS, stay, wearing, weights_for
+from test_methods import TASKS, small, stay, wearing, weights_for
 from test_methods_held import RATE, Tiny, seen
 from test_resume import THREE, of
 from torch import Tensor
@@ -54,8 +54,8 @@ def masked(method: type[Masks]) -> Wearing:
 
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
 @pytest.mark.parametrize("name", KEEPS)
-def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(small_agent, agent, name):
-    worn = wearing(small_agent, agent, KEEPS[name]())
+def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(compose, agent, name):
+    worn = wearing(compose, agent, KEEPS[name]())
     data = batches(worn, ONE, 1)[0][:, 0].clone()
     stay(worn, 0)
     first = said(worn, 0, data), weights_for(worn, 0)
@@ -71,8 +71,8 @@ def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(small_
 
 
 @pytest.mark.parametrize("name", KEEPS)
-def test_a_task_that_comes_again_goes_on_with_what_it_had(small_agent, name):
-    worn = wearing(small_agent, "ppo", KEEPS[name]())
+def test_a_task_that_comes_again_goes_on_with_what_it_had(compose, name):
+    worn = wearing(compose, "ppo", KEEPS[name]())
     stay(worn, 0)
     had = weights_for(worn, 0)
     stay(worn, 1)
@@ -88,8 +88,8 @@ def test_a_task_that_comes_again_goes_on_with_what_it_had(small_agent, name):
 
 
 @pytest.mark.parametrize("name", KEEPS)
-def test_a_task_that_never_began_is_acted_in_as_the_first(small_agent, name):
-    worn = wearing(small_agent, "ppo", KEEPS[name]())
+def test_a_task_that_never_began_is_acted_in_as_the_first(compose, name):
+    worn = wearing(compose, "ppo", KEEPS[name]())
     before = weights_for(worn, 2)
     assert same(before, weights_for(worn, 0))
     stay(worn, 1)  # the first one that begins has the id 1
@@ -101,8 +101,8 @@ def test_a_task_that_never_began_is_acted_in_as_the_first(small_agent, name):
 
 
 @pytest.mark.parametrize("name", KEEPS)
-def test_a_task_beyond_those_of_the_curriculum_is_refused(small_agent, name):
-    worn = wearing(small_agent, "ppo", KEEPS[name](), (ONE, TWO))
+def test_a_task_beyond_those_of_the_curriculum_is_refused(compose, name):
+    worn = wearing(compose, "ppo", KEEPS[name](), (ONE, TWO))
     for number in (0, 1, 0):
         stay(worn, number, (ONE, TWO), 1)
 
@@ -111,8 +111,8 @@ def test_a_task_beyond_those_of_the_curriculum_is_refused(small_agent, name):
 
 
 @pytest.mark.parametrize("name", KEEPS)
-def test_the_target_network_follows_where_weights_are_changed(small_agent, name):
-    worn = wearing(small_agent, "dqn", KEEPS[name]())
+def test_the_target_network_follows_where_weights_are_changed(compose, name):
+    worn = wearing(compose, "dqn", KEEPS[name]())
     stay(worn, 0)
 
     worn.start_task(1)
@@ -122,13 +122,24 @@ def test_the_target_network_follows_where_weights_are_changed(small_agent, name)
     assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
 
 
+def test_a_policy_for_another_task_explores_as_the_present_one_does(compose):
+    worn = wearing(compose, "dqn", MaskRI())
+    stay(worn, 0)
+    worn.start_task(1)
+    assert worn.policy_for(0).module[1].eps.item() == 1.0
+
+    worn.learn(batches(worn, TWO, 1)[0])
+
+    assert worn.policy_for(0).module[1].eps.item() == worn.policy_for(1).module[1].eps.item() < 1.0
+
+
 # Masks
 
 
 @pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
-def test_the_network_is_of_signed_constants_and_zero_biases(small_agent, agent):
-    drawn = [weights.detach().clone() for weights in small_agent(agent, TASKS).policy.parameters()]
-    worn = wearing(small_agent, agent, MaskRI())
+def test_the_network_is_of_signed_constants_and_zero_biases(compose, agent):
+    drawn = [weights.detach().clone() for weights in small(compose, agent).policy.parameters()]
+    worn = wearing(compose, agent, MaskRI())
 
     for number in range(2):
         stay(worn, number)
@@ -139,9 +150,9 @@ def test_the_network_is_of_signed_constants_and_zero_biases(small_agent, agent):
             assert before.ndim == 1 or 0 < kept.sum() < kept.numel()
 
 
-def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_inputs(build_agent):
+def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_inputs(compose):
     method = MaskRI()
-    worn = wearing(build_agent, "ppo", method, TASKS, "agent.num_layers=2")
+    worn = wearing(compose, "ppo", method, TASKS, "agent.hidden_size=64")
 
     worn.start_task(0)
 
@@ -157,8 +168,8 @@ def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_in
 
 
 @every_mask
-def test_each_new_task_s_own_scores_are_drawn_anew(small_agent, method):
-    worn = wearing(small_agent, "ppo", method())
+def test_each_new_task_s_own_scores_are_drawn_anew(compose, method):
+    worn = wearing(compose, "ppo", method())
     own = []
     for number in range(2):
         worn.start_task(number)
@@ -190,8 +201,8 @@ SHARES = {MaskLC: [[1.0], [0.5] * 2, [1 / 3] * 3], MaskBLC: [[1.0], [0.5, 0.5], 
 
 
 @pytest.mark.parametrize("method", SHARES)
-def test_a_linear_combination_begins_with_its_shares(small_agent, method):
-    worn = wearing(small_agent, "ppo", method())
+def test_a_linear_combination_begins_with_its_shares(compose, method):
+    worn = wearing(compose, "ppo", method())
     its = worn.agent.method
 
     for number in range(3):
@@ -230,8 +241,8 @@ def test_a_step_moves_the_combination_of_each_weight_tensor_by_its_own_shares(me
 
 
 @pytest.mark.parametrize("method", SHARES)
-def test_the_combination_is_consolidated_at_the_tasks_end(small_agent, method):
-    worn = wearing(small_agent, "ppo", method())
+def test_the_combination_is_consolidated_at_the_tasks_end(compose, method):
+    worn = wearing(compose, "ppo", method())
     its = worn.agent.method
     stay(worn, 0)
     worn.start_task(1)
@@ -267,8 +278,8 @@ def test_a_task_that_comes_again_learns_its_consolidated_scores_alone(method):
 
 
 @every_mask
-def test_the_optimiser_starts_anew_with_each_task(small_agent, method):
-    worn = wearing(small_agent, "ppo", method())
+def test_the_optimiser_starts_anew_with_each_task(compose, method):
+    worn = wearing(compose, "ppo", method())
     stay(worn, 0)
     assert worn.agent.optimiser.state
 
@@ -277,20 +288,20 @@ def test_the_optimiser_starts_anew_with_each_task(small_agent, method):
     assert not worn.agent.optimiser.state
     live = worn.agent.live
     assert live[0] is worn.agent.method.own and len(live) == (1 if method is MaskRI else 2)
-    assert worn.agent.optimiser.defaults == small_agent("ppo", TASKS).optimiser.defaults
+    assert worn.agent.optimiser.defaults == small(compose, "ppo").optimiser.defaults
 
 
 # PackNet
 
 
-def packed(small_agent, agent: str = "ppo", retrain: float = 0.5) -> tuple[Wearing, PackNet]:
+def packed(compose, agent: str = "ppo", retrain: float = 0.5) -> tuple[Wearing, PackNet]:
     method = PackNet(retrain=retrain)
-    return wearing(small_agent, agent, method), method
+    return wearing(compose, agent, method), method
 
 
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo"])
-def test_each_task_keeps_an_equal_share_of_every_weight_matrix(small_agent, agent):
-    worn, method = packed(small_agent, agent)
+def test_each_task_keeps_an_equal_share_of_every_weight_matrix(compose, agent):
+    worn, method = packed(compose, agent)
     for number in range(3):
         stay(worn, number)
 
@@ -307,8 +318,8 @@ def test_each_task_keeps_an_equal_share_of_every_weight_matrix(small_agent, agen
             assert counts[0] == 0 and all(abs(count - parameter.numel() / 3) < 1 for count in counts[1:])
 
 
-def test_the_largest_free_weights_are_kept_and_the_others_are_zero(small_agent):
-    worn, method = packed(small_agent)
+def test_the_largest_free_weights_are_kept_and_the_others_are_zero(compose):
+    worn, method = packed(compose)
     worn.start_task(0)
     worn.learn(batches(worn, ONE, 1)[0])
     trained = [parameter.detach().clone() for parameter in method.weights.parameters]
@@ -326,8 +337,8 @@ def test_the_largest_free_weights_are_kept_and_the_others_are_zero(small_agent):
             assert torch.equal(now, torch.where(kept, before, 0.0))
 
 
-def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_zero(small_agent):
-    worn, method = packed(small_agent)
+def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_zero(compose):
+    worn, method = packed(compose)
     stay(worn, 0)
     trunk = ~method.in_heads
     kept, first = (method.owner == 0) & trunk, method.weights.vector().detach()
@@ -345,12 +356,10 @@ def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_ze
 
 
 @pytest.mark.parametrize(("retrain", "number_of_prunings"), [(0.5, 2), (0.0, 4), (0.75, 1)])
-def test_pruning_leaves_a_share_of_the_block_for_retraining(small_agent, retrain, number_of_prunings):
+def test_pruning_leaves_a_share_of_the_block_for_retraining(compose, retrain, number_of_prunings):
     """Blocks of 160 frames are announced; batches have 16."""
     method = PackNet(retrain=retrain)
-    worn = wearing(
-        small_agent, "ppo", method, TASKS, "agent.num_envs=4", "agent.num_steps=10", "agent.num_minibatches=1"
-    )
+    worn = wearing(compose, "ppo", method, TASKS, "agent.num_envs=4", "agent.num_steps=10", "agent.num_minibatches=1")
     worn.start_task(0)
 
     pruned = []
@@ -366,8 +375,8 @@ def test_pruning_leaves_a_share_of_the_block_for_retraining(small_agent, retrain
     assert not method.weights.vector()[zero].any()
 
 
-def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(small_agent):
-    worn, method = packed(small_agent, retrain=0.999)
+def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(compose):
+    worn, method = packed(compose, retrain=0.999)
     worn.start_task(0)
     one, other, more = batches(worn, ONE, 3)
     worn.learn(one)
@@ -383,8 +392,8 @@ def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(small_agent)
     assert not torch.equal(after[kept], before[kept])
 
 
-def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_acts_with(small_agent):
-    worn, method = packed(small_agent)
+def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_acts_with(compose):
+    worn, method = packed(compose)
     for number in range(3):
         stay(worn, number)
     inside, packed_before, owner = method.in_heads, method.packed.clone(), method.owner.clone()
@@ -406,9 +415,9 @@ def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_
 # From scratch
 
 
-def test_a_new_task_draws_a_new_network_and_forgets_the_optimisers_state(small_agent):
-    begun_with = [weights.detach().clone() for weights in small_agent("ppo", TASKS).policy.parameters()]
-    worn = wearing(small_agent, "ppo", Scratch())
+def test_a_new_task_draws_a_new_network_and_forgets_the_optimisers_state(compose):
+    begun_with = [weights.detach().clone() for weights in small(compose, "ppo").policy.parameters()]
+    worn = wearing(compose, "ppo", Scratch())
 
     worn.start_task(0)
     assert same([*worn.policy.parameters()], begun_with)
@@ -424,8 +433,8 @@ def test_a_new_task_draws_a_new_network_and_forgets_the_optimisers_state(small_a
     assert not any(value.any() for state in worn.agent.optimiser.state.values() for value in state.values())
 
 
-def test_a_task_from_scratch_is_learned_as_by_a_new_agent_with_those_weights(small_agent):
-    worn, alone = wearing(small_agent, "ppo", Scratch()), small_agent("ppo", TASKS)
+def test_a_task_from_scratch_is_learned_as_by_a_new_agent_with_those_weights(compose):
+    worn, alone = wearing(compose, "ppo", Scratch()), small(compose, "ppo")
     stay(worn, 0)
     worn.start_task(1)
     alone.policy.load_state_dict(deepcopy(worn.policy.state_dict()))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from test_agents import batches
 from test_lifelong import ONE, TWO
-from test_methods import TASKS, stay, wearing
+from test_methods import TASKS, small, stay, wearing
 from test_resume import THREE, of
 from torch import Tensor
 
@@ -39,19 +39,19 @@ OF_EWC = {"coeff": 10.0, "online": False, "alpha": 0.5, "fisher": "policy", "num
 
 
 OFFERS = {
-    "one by one": [1] * 40,
-    "less than there is room for, then more": [3, 20, 17],
-    "more than there is room for": [40],
-    "twice more than there is room for": [16, 24],
-    "odd sizes": [5, 1, 7, 2, 11, 14],
+    "one by one": [1] * 12,
+    "less than there is room for, then more": [2, 6, 4],
+    "more than there is room for": [12],
+    "twice more than there is room for": [5, 7],
+    "odd sizes": [3, 1, 4, 2, 2],
 }
 
 
 @pytest.mark.parametrize("offers", OFFERS.values(), ids=OFFERS)
 def test_every_item_is_kept_with_the_same_chance_and_every_pair_too(offers):
-    """40 items and 8 places: an item is kept with chance 1/5, a pair with 8/40 * 7/39."""
+    """12 items and 3 places: an item is kept with chance 1/4, a pair with 3/12 * 2/11."""
     torch.manual_seed(0)
-    trials, capacity, total = min(4000, 20_000 // len(offers)), 8, sum(offers)
+    trials, capacity, total = 2500, 3, 12
     kept, early = torch.zeros(total), []
 
     for _ in range(trials):
@@ -64,14 +64,14 @@ def test_every_item_is_kept_with_the_same_chance_and_every_pair_too(offers):
         kept[held] += 1
         early.append((held < total // 2).sum())
 
-    # Chi-square of draws without replacement, 39 degrees of freedom: above 96.2 with a chance of 1e-6.
+    # Chi-square of draws without replacement, 11 degrees of freedom: above 49.0 with a chance of 1e-6.
     chance = capacity / total
     off = (kept - trials * chance).square().sum() / (trials * chance * (1 - chance))
-    assert off * (total - 1) / total < 96.2
-    # How many are of the first half is hypergeometric: mean 4, variance 64/39; its square has the deviation 2.22.
-    gap = torch.stack(early) - 4.0
-    assert abs(gap.mean()) < 5 * math.sqrt(64 / 39 / trials)
-    assert abs(gap.square().mean() - 64 / 39) < 5 * 2.22 / math.sqrt(trials)
+    assert off * (total - 1) / total < 49.0
+    # How many are of the first half is hypergeometric: mean 1.5, variance 27/44; that of its square is below 0.8**2.
+    gap = torch.stack(early) - 1.5
+    assert abs(gap.mean()) < 5 * math.sqrt(27 / 44 / trials)
+    assert abs(gap.square().mean() - 27 / 44) < 5 * 0.8 / math.sqrt(trials)
 
 
 def test_a_reservoir_keeps_all_items_until_it_is_full_and_keys_together():
@@ -104,10 +104,10 @@ def test_samples_are_drawn_alike_from_what_is_there():
 # Behaviour cloning
 
 
-def cloning(small_agent, agent: str, **settings: float) -> tuple[Wearing, dict[str, Tensor], dict[Any, Tensor]]:
+def cloning(compose, agent: str, **settings: float) -> tuple[Wearing, dict[str, Tensor], dict[Any, Tensor]]:
     """An agent with a batch of 128 steps in its reservoir, its losses, and what was replayed."""
     method = CLEAR(**{"buffer_size": 128, "policy_coeff": 1.0, "value_coeff": 1.0, **settings})
-    worn = wearing(small_agent, agent, method)
+    worn = wearing(compose, agent, method)
     method.see(batches(worn, ONE, 1)[0])
     torch.manual_seed(1)
     mixed = method.mixed({"action": torch.zeros(6, dtype=torch.int64)})
@@ -116,8 +116,8 @@ def cloning(small_agent, agent: str, **settings: float) -> tuple[Wearing, dict[s
 
 
 @pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
-def test_cloning_loses_nothing_right_after_storing(small_agent, agent):
-    worn, mixed, replayed = cloning(small_agent, agent)
+def test_cloning_loses_nothing_right_after_storing(compose, agent):
+    worn, mixed, replayed = cloning(compose, agent)
 
     losses = worn.agent.method.loss(mixed)
 
@@ -134,8 +134,8 @@ def change(worn: Wearing) -> None:
 
 
 @pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
-def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error_of_values(small_agent, agent):
-    worn, mixed, replayed = cloning(small_agent, agent, policy_coeff=0.5, value_coeff=3.0)
+def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error_of_values(compose, agent):
+    worn, mixed, replayed = cloning(compose, agent, policy_coeff=0.5, value_coeff=3.0)
     change(worn)
 
     losses = worn.agent.method.loss(mixed)
@@ -151,8 +151,8 @@ def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error
     assert all(gradient.any() for gradient in gradients)
 
 
-def test_a_q_learner_clones_its_action_values(small_agent):
-    worn, mixed, replayed = cloning(small_agent, "dqn", value_coeff=3.0)
+def test_a_q_learner_clones_its_action_values(compose):
+    worn, mixed, replayed = cloning(compose, "dqn", value_coeff=3.0)
     change(worn)
 
     losses = worn.agent.method.loss(mixed)
@@ -162,8 +162,8 @@ def test_a_q_learner_clones_its_action_values(small_agent):
     torch.testing.assert_close(losses["loss_value_cloning"], 3 * error.mean())
 
 
-def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(small_agent):
-    worn, _, replayed = cloning(small_agent, "ppo")
+def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(compose):
+    worn, _, replayed = cloning(compose, "ppo")
     batch = batches(worn, ONE, 1)[0]
     said = worn.agent.outputs({"observation": batch["observation"].flatten(0, 1)})["log_probs"]
 
@@ -178,8 +178,8 @@ def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(small
     assert all(min(math.dist(one, other) for other in known) < 1e-6 for one in found)
 
 
-def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(small_agent):
-    worn = wearing(small_agent, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
+def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(compose):
+    worn = wearing(compose, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
     sizes, loss = Counter(), worn.agent.method.loss
     worn.agent.method.loss = lambda batch: (sizes.update([len(batch["replay", "log_probs"])]), loss(batch))[1]
 
@@ -242,13 +242,13 @@ COUNTED = {
 
 
 @pytest.mark.parametrize("name", COUNTED)
-def test_what_is_stored_is_what_is_counted(small_agent, name):
+def test_what_is_stored_is_what_is_counted(compose, name):
     make, counted = COUNTED[name]
     method = make()
     if name in ("None", "Multitask"):
-        worn = Wearing(small_agent("ppo", TASKS), method, of(*(Block(task, 160) for task in TASKS)))
+        worn = Wearing(small(compose, "ppo"), method, of(*(Block(task, 160) for task in TASKS)))
     else:
-        worn = wearing(small_agent, "ppo", method)
+        worn = wearing(compose, "ppo", method)
     assert len(worn.agent.method.weights) == WEIGHTS and len(worn.agent.method.weights.parameters) == LAYERS
 
     for number in range(3):
@@ -257,9 +257,9 @@ def test_what_is_stored_is_what_is_counted(small_agent, name):
         assert nbytes(dict(method.state_dict())) == counted
 
 
-def test_the_samples_of_a_task_are_stored_until_its_end(small_agent):
+def test_the_samples_of_a_task_are_stored_until_its_end(compose):
     method = EWC(**{**OF_EWC, "num_samples": 20}, heads="single")
-    worn = wearing(small_agent, "ppo", method)
+    worn = wearing(compose, "ppo", method)
     worn.start_task(0)
 
     worn.learn(batches(worn, ONE, 1)[0])
@@ -281,8 +281,8 @@ COMPILED = {
 }
 
 
-def two_tasks(small_agent, name: str, *overrides: str, whole: bool = False) -> Wearing:
-    worn = wearing(small_agent, "ppo", COMPILED[name](), TASKS, *overrides)
+def two_tasks(compose, name: str, *overrides: str, whole: bool = False) -> Wearing:
+    worn = wearing(compose, "ppo", COMPILED[name](), TASKS, *overrides)
     if whole:  # the step that is compiled, without compiling it
         worn.agent.compiled_step = whole_step
         worn.agent.optimise = lambda parameters: _optimise(worn.agent, parameters)
@@ -306,18 +306,18 @@ def check_close(one: Wearing, other: Wearing) -> None:
 
 
 @pytest.mark.parametrize("name", COMPILED)
-def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(small_agent, name):
-    eager, whole = two_tasks(small_agent, name), two_tasks(small_agent, name, whole=True)
+def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(compose, name):
+    eager, whole = two_tasks(compose, name), two_tasks(compose, name, whole=True)
 
     check_close(whole, eager)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPILED)
-def test_no_task_needs_more_than_one_compiled_step(small_agent, monkeypatch, name):
+def test_no_task_needs_more_than_one_compiled_step(compose, monkeypatch, name):
     """There is a limit, so else a curriculum of many tasks stops."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    worn = wearing(small_agent, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
+    worn = wearing(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
 
     with torch._dynamo.config.patch(recompile_limit=1):
         for number in (0, 1, 2, 0):
@@ -326,8 +326,8 @@ def test_no_task_needs_more_than_one_compiled_step(small_agent, monkeypatch, nam
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPILED)
-def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(small_agent, name):
-    eager, compiled = two_tasks(small_agent, name), two_tasks(small_agent, name, "agent.compile=true")
+def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(compose, name):
+    eager, compiled = two_tasks(compose, name), two_tasks(compose, name, "agent.compile=true")
 
     assert compiled.agent.compiled_step is not None
     check_close(compiled, eager)
