@@ -23,18 +23,18 @@ AGENTS = {"a2c": [], "dqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
 
 METHODS: dict[str, tuple[str, ...]] = {
     "clear": ("method.buffer_size=48",),
-    "ewc": ("method.num_samples=8",),
+    "ewc": ("method.num_samples=8", "method.heads=single"),
     "ewc_published": ("method.num_samples=8",),
     "finetune": (),
     "l2": ("method.heads=multi",),
-    "mas": ("method.num_samples=8", "method.heads=multi"),
+    "mas": ("method.num_samples=8",),
     "mask_blc": (),
     "mask_lc": (),
     "mask_ri": (),
     "multitask": (),
     "packnet": (),
     "scratch": (),
-    "si": (),
+    "si": ("method.heads=single",),
 }
 """Each with overrides that make it small, or meet more of it."""
 
@@ -177,7 +177,7 @@ def test_what_needs_to_know_nothing_takes_any_curriculum(compose, method):
     assert prepared(compose, method, curriculum).num_frames == 128
 
 
-@pytest.mark.parametrize("method", [name for name in METHODS if name != "finetune"])
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in ("finetune", "multitask")])
 def test_an_agent_that_is_no_learner_is_refused_before_it_is_touched(compose, method):
     agent = Scripted()
     before = dict(vars(agent))
@@ -217,7 +217,7 @@ WRONG = [
     ("ewc", "alpha=1.5", "alpha must be .* got 1.5"),
     ("ewc", "fisher=true_one", "fisher must be one of policy, loss, got 'true_one'"),
     ("ewc", "num_samples=0", "num_samples must be an integer >= 1, got 0"),
-    ("l2", "heads=two", "heads must be one of single, multi, got 'two'"),
+    ("l2", "heads=two", "heads must be one of auto, single, multi, got 'two'"),
     ("mas", "num_samples=1.5", "num_samples must be an integer >= 1, got 1.5"),
     ("packnet", "retrain=1", r"retrain must be a number in \[0, 1\), got 1"),
     ("si", "epsilon=0", "epsilon must be a number > 0, got 0"),
@@ -283,6 +283,17 @@ def test_ids_at_boundaries_are_enough(compose, method):
 
     assert whole.agent.method.begun if method != "ewc_published" else whole.agent.method.heads.begun == [0, 1, 2]
     assert sum(line["kind"] == "evaluation" for line in lines) == 12
+
+
+@pytest.mark.parametrize("method", ["ewc", "l2", "mas", "si"])
+def test_each_task_has_output_layers_of_its_own_where_ids_are_told_unless_it_is_said_otherwise(compose, method):
+    hidden = replace(CURRICULUM, protocol=replace(CURRICULUM.protocol, task_id="hidden"))
+
+    told = life(compose, "ppo", method, "method.heads=auto").new()
+    secret = life(compose, "ppo", method, "method.heads=auto", curriculum=hidden).new()
+
+    assert told.agent.method.heads is not None
+    assert secret.agent.method.heads is None
 
 
 def test_a_first_block_that_is_no_whole_batch_can_be_learned_with_replayed_rows(compose):

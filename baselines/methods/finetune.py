@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from baselines.methods.method import Method
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.curriculum import Curriculum
 
 
 class Finetune(Method):
-    """The agent as it is goes from task to task. Nothing is stored."""
+    """The agent as it is goes from task to task. Nothing is stored; it goes with any agent."""
 
     needs_boundaries = False
+
+    def worn_by(self, agent: Agent, curriculum: Curriculum) -> Agent:
+        """The agent itself."""
+        return agent

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from baselines.learner import one_of
 from baselines.methods.heads import Heads
-from baselines.methods.method import Method
+from baselines.methods.method import Method, blocks_of_several
 from baselines.methods.weights import Weights, flat
 from baselines.networks import Data
 from ctgraph_rl.checks import at_least_one, positive, require
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 class Importance(Method):
     """Adds coeff * sum_i I_i (w_i - a_i)^2 to the losses: I is how important weights were, a where they were.
 
-    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; with ``heads="multi"``
-    also the output layers of each task, see `Heads`.
+    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; where each task has
+    output layers of its own also those, see `Heads`.
 
     Args:
         coeff: weight of what is added.
         heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
-            own, which are not held.
+            own, which are not held; ``auto``: multi where the curriculum tells task ids, else single.
     """
 
     importance: Tensor  # float32 [P]
@@ -39,21 +39,19 @@ class Importance(Method):
 
     def __init__(self, coeff: float, heads: str) -> None:
         super().__init__()
-        require(*positive(coeff=coeff), *one_of(("single", "multi"), heads=heads))
-        self.coeff = coeff
-        self.heads = Heads() if heads == "multi" else None
-
-    def prepare(self, curriculum: Curriculum) -> Curriculum:
-        """See `Method`; separate output layers need task ids."""
-        super().prepare(curriculum)
-        return curriculum if self.heads is None else self.heads.prepare(curriculum)
+        require(*positive(coeff=coeff), *one_of(("auto", "single", "multi"), heads=heads))
+        self.coeff, self.wanted = coeff, heads
+        self.needs_task_id = heads == "multi"
+        self.heads: Heads | None = None
 
     def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().put_on(agent, weights, curriculum)
         self.register_buffer("importance", torch.zeros(len(weights)))
         self.register_buffer("anchor", torch.zeros(len(weights)))
-        if self.heads is not None:
+        told = curriculum.protocol.task_id != "hidden" and not blocks_of_several(curriculum)
+        if self.wanted == "multi" or (self.wanted == "auto" and told):
+            self.heads = Heads()
             self.heads.put_on(agent, weights, curriculum)
         self.register_buffer("held", torch.ones(len(weights)) if self.heads is None else 1.0 - weights.in_heads.float())
 

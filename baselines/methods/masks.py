@@ -157,9 +157,14 @@ class CombinedMasks(Masks):
         earlier = self.num_combined
         if not earlier:
             return self.own
-        shares = self.betas[:, : earlier + 1].softmax(dim=-1)
-        parts = zip(shares, self.weights.split(self.scores[:earlier]), self.weights.split(self.own), strict=True)
-        return torch.cat([(share[:-1, None] * old).sum(dim=0) + share[-1] * new for share, old, new in parts])
+        old, new = self.weights.split(self.scores[:earlier]), self.weights.split(self.own)
+        return torch.cat(list(map(_combined, self.betas[:, : earlier + 1], old, new)))
+
+
+def _combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
+    """Scores of a weight tensor, [n], of earlier [k, n] and new ones; shares are a softmax of k + 1."""
+    shares = betas.softmax(dim=0)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
+    return (shares[:-1, None] * old).sum(dim=0) + shares[-1] * new
 
 
 def _signed_constant(parameter: Tensor) -> Tensor:

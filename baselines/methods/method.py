@@ -28,7 +28,7 @@ class Method(nn.Module):
     Buffers and parameters of a method are part of the agent's state.
     """
 
-    needs_task_id: ClassVar[bool] = False
+    needs_task_id: bool = False
     """Whether it must be told which task it is in, while learning and while acting."""
 
     needs_boundaries: ClassVar[bool] = True
@@ -46,8 +46,7 @@ class Method(nn.Module):
         Raises:
             ValueError: if the curriculum does not tell what the method needs to know.
         """
-        told, name = curriculum.protocol, type(self).__name__
-        several = [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
+        told, name, several = curriculum.protocol, type(self).__name__, blocks_of_several(curriculum)
         require(
             (
                 not self.needs_task_id or told.task_id != "hidden",
@@ -110,6 +109,11 @@ class Method(nn.Module):
     def weights_of(self, task: int) -> Tensor | None:
         """The weights to act with in a task, float32 [P]; None: as they are."""
         return None
+
+
+def blocks_of_several(curriculum: Curriculum) -> list[int]:
+    """The numbers of the blocks with several tasks, from 1."""
+    return [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
 
 
 class TaskMethod(Method):

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from baselines.methods.method import Method
+from baselines.methods.finetune import Finetune
 from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Block, Curriculum
 from ctgraph_rl.switch import ByEpisode
 
 
-class Multitask(Method):
+class Multitask(Finetune):
     """In place of the blocks there is one with all their tasks and frames; each row takes them in turn by the episode.
 
-    Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look different can all be solved.
+    The agent is as it is. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
+    different can all be solved.
     """
-
-    needs_boundaries = False
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
         """The tasks at once.

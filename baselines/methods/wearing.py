@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.learner import Learner
-from baselines.methods.finetune import Finetune
 from baselines.methods.method import Method
 from baselines.methods.weights import Weights
 from ctgraph_rl.agent import Agent
@@ -79,13 +78,11 @@ class Wearing(nn.Module):
 
 
 def wear(agent: Agent, method: Method, curriculum: Curriculum) -> Agent:
-    """An agent with a method for a curriculum; fine-tuning is the agent itself.
+    """An agent with a method for a curriculum.
 
     Raises:
         ValueError: if the two cannot go together.
     """
-    if type(method) is Finetune:
-        return agent
     name = type(method).__name__
     message = f"method {name} needs an agent that derives from baselines.learner.Learner, got {type(agent).__name__}"
     require((isinstance(agent, Learner), f"{message}; method=finetune goes with any"))
