@@ -94,7 +94,8 @@ class RecurrentModule(TensorDictSequential):
         state = (data[key].flatten(0, 1)[first].transpose(0, 1).contiguous() for key in STATE_KEYS)
         packed = PackedSequence(features.flatten(0, 1).index_select(0, places), within.sum(dim=1).cpu())
         memory = lstm(packed, tuple(state))[0].data
-        return memory.index_select(0, places.argsort()).view_as(features)
+        back = torch.empty_like(places).scatter_(0, places, torch.arange(len(places), device=places.device))
+        return memory.index_select(0, back).view_as(features)
 
 
 def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:

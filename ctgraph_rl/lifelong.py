@@ -19,6 +19,7 @@ from ctgraph_rl.curriculum import Block, Curriculum, Evaluation
 from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.log import RunLog
+from ctgraph_rl.native import is_native
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.stepping import Step, in_time_order, take_step
 from ctgraph_rl.task import Task
@@ -109,13 +110,16 @@ def make_env(
 ) -> CTGraphEnv:
     """An environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
 
-    Held-out tasks have no id, which shows as zeros.
+    Held-out tasks have no id, which shows as zeros. The environment is a C kernel where there can be one, with the same
+    bits.
     """
     how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    place: dict[str, Any] = {"task_pool": pool, "device": device}
+    place["compiled"] = is_native((task.reward_fn for task in pool), device)
     if how.task_id != "one_hot":
-        return CTGraphEnv(tasks, seed, task_pool=pool, device=device)
+        return CTGraphEnv(tasks, seed, **place)
     length = how.length(len(curriculum.tasks))
-    return CTGraphEnv(tasks, seed, task_pool=pool, device=device, task_ids=curriculum.task_ids, num_task_ids=length)
+    return CTGraphEnv(tasks, seed, task_ids=curriculum.task_ids, num_task_ids=length, **place)
 
 
 def _left(curriculum: Curriculum, frames: int) -> Iterator[tuple[int, tuple[Block, ...]]]:

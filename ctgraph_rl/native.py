@@ -51,6 +51,15 @@ def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | 
     _library()
 
 
+def is_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> bool:
+    """Whether the kernel can be made here, and knows these rewards."""
+    try:
+        require_native(reward_fns, device)
+    except ValueError:
+        return False
+    return True
+
+
 class Native:
     """The kernel for the rows of one batch; copies of it start without what it has prepared."""
 

@@ -407,7 +407,7 @@ def test_an_announced_boundary_ends_the_episodes_and_shortens_the_batch():
     learn_curriculum(sequence(protocol=Protocol("one_hot"), evaluation=Evaluation(2)), agent)
 
     learnt = [("learn", 4, steps) for steps in (3, 2, 3, 3, 1)]
-    assert agent.events == [("start", None), *learnt[:2], "end", ("start", None), *learnt[2:], "end"]
+    assert agent.events == [("start", 0), *learnt[:2], "end", ("start", 1), *learnt[2:], "end"]
     assert ends_of(torch.cat(agent.batches, dim=1)) == [(3, 0, OUTCOME_GOAL), (8, 1, OUTCOME_OTHER_END)]
 
 
@@ -469,12 +469,12 @@ def test_a_switch_of_all_rows_is_followed_in_learning():
     ("protocol", "told"),
     [
         (Protocol(), [None, None, None]),
-        (Protocol("one_hot"), [None, None, None]),
+        (Protocol("one_hot"), [0, 1, 0]),
         (Protocol("at_boundaries"), [0, 1, 0]),
         (Protocol("at_boundaries", task_ids=(5, 2)), [5, 2, 5]),
     ],
 )
-def test_the_agent_is_given_the_tasks_id_only_at_the_boundaries_that_say_so(protocol, told):
+def test_the_agent_is_given_the_tasks_id_at_announced_boundaries_unless_it_is_hidden(protocol, told):
     agent = Told()
 
     learn_curriculum(

@@ -90,11 +90,11 @@ def scores(lines: Raw, experts: Raw) -> dict[str, float | None]:
         "TPOT": metrics.total_performance_over_time(run),
         "tasks learned": metrics.tasks_learned(run, SOLVED),
     }
+    values = {name: metric.value for name, metric in found.items()}
     if experts:
-        areas = [metrics.trapezoid_area(curve) for curve in curves(experts).performance.T]
-        own = metrics.stage_areas(run, trapezoids=True)
-        found["forward transfer"] = metrics.forward_transfer_from_experts(own, torch.stack(areas)[None])
-    return {name: metric.value for name, metric in found.items()}
+        alone = torch.stack([metrics.mean_area(curve) for curve in curves(experts).performance.T])
+        values["forward transfer"] = float((metrics.stage_areas(run) - alone).mean())
+    return values
 
 
 COLUMNS = ("average performance", "forward transfer", "forgetting", "TPOT", "tasks learned")
