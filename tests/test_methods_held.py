@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_agents import batches
 from test_lifelong import ONE, TWO
@@ -132,6 +133,23 @@ def test_importance_is_of_the_last_samples_alone(method):
 
 
 @pytest.mark.parametrize("method", [EWC, MAS])
+def test_frames_that_are_learned_from_again_are_counted_once(method):
+    settings = EWC_SETTINGS if method is EWC else {"heads": "single", "num_samples": 100}
+    worn, once = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    minibatches = [seen(4, seed=1), seen(4, seed=2)]
+    worn.start_task(0)
+    for _ in range(2):
+        worn.agent.method.see(TensorDict(batch_size=[8]))
+        for minibatch in (*minibatches, seen(8, seed=3)):  # the second pass
+            worn.agent.method.mixed(minibatch)
+
+    worn.end_task()
+    task_with(once, 0, *minibatches, *minibatches)
+
+    torch.testing.assert_close(worn.agent.method.importance, once.agent.method.importance)
+
+
+@pytest.mark.parametrize("method", [EWC, MAS])
 def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method):
     settings = EWC_SETTINGS if method is EWC else {"heads": "single", "num_samples": 100}
     worn, alone = (tiny(method(coeff=1, **settings)) for _ in range(2))
@@ -144,7 +162,7 @@ def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method)
     torch.testing.assert_close(worn.agent.method.importance - before, alone.agent.method.importance)
 
 
-def test_fisher_of_the_losses_is_the_mean_square_of_the_gradient_of_their_sum():
+def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_size_of_minibatches():
     worn = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
     minibatches = [seen(4, seed=1), seen(6, seed=2)]
 
@@ -155,7 +173,7 @@ def test_fisher_of_the_losses_is_the_mean_square_of_the_gradient_of_their_sum():
         torch.cat([(m["factor"].T @ m["observation"] / len(m["factor"])).flatten(), m["factor"].mean(dim=0)])
         for m in minibatches
     ]
-    expected = (gradients[0].square() + gradients[1].square()) / 2
+    expected = gradients[0].square() / 4 + gradients[1].square() / 6
     torch.testing.assert_close(worn.agent.method.importance, expected)
 
 
@@ -304,7 +322,7 @@ def test_online_ewc_is_one_term_with_the_running_mean_at_the_last_weights():
 
     weights = move(worn, seed=7)
 
-    mean = 0.25 * (0.25 * fishers[0] + 0.75 * fishers[1]) + 0.75 * fishers[2]
+    mean = 0.75 * (0.25**2 * fishers[0] + 0.25 * fishers[1] + fishers[2])  # begins at 0
     torch.testing.assert_close(gradient_of_penalty(worn), 4 * mean * (weights - anchors[2]))
 
 

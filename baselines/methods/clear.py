@@ -5,6 +5,7 @@ Rolnick et al. 2019 (NeurIPS, arXiv 1811.11682), the cloning losses of section 3
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from baselines.networks import Data
 from baselines.policy_gradient import loss_weight
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.params import require_memory
 
 if TYPE_CHECKING:
     from baselines.learner import Learner
@@ -64,8 +66,9 @@ class CLEAR(Method):
     """Adds what is lost by leaving earlier behaviour, on as many replayed steps as there are fresh ones in a minibatch.
 
     L = policy_coeff KL(mu || pi) + value_coeff |V_mu - V|^2, where mu and V_mu are what the network said when the step
-    was made; for a Q-learner value_coeff |Q_mu - Q|^2. The agent's own losses are on its own data: the paper's
-    off-policy policy gradient (V-trace) on replayed steps is left out. It needs no task ids and no boundaries.
+    was made; for a Q-learner value_coeff |Q_mu - Q|^2, the mean over actions. The agent's own losses are on its own
+    data: the paper's off-policy policy gradient (V-trace) on replayed steps is left out. It needs no task ids and no
+    boundaries.
 
     Stored are ``buffer_size`` steps, each with what the network reads and says, whatever the number of tasks; with
     memory whole rows of a batch, of which those are left out that the end of a block has shortened.
@@ -92,6 +95,8 @@ class CLEAR(Method):
         steps = agent.num_steps if agent.memory else 1
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
         require((self.buffer_size >= steps, message))
+        size = self.buffer_size * math.prod(curriculum.tasks[0].images.shape)
+        require_memory(f"replayed observations of buffer_size={self.buffer_size} steps", size, "steps")
         self.reservoir = Reservoir(self.buffer_size // steps)
 
     @torch.no_grad()
@@ -137,5 +142,6 @@ class CLEAR(Method):
         self.reservoir = Reservoir(self.reservoir.capacity)
         self.reservoir.offered = state["offered"]
         for key, value in state["items"].items():
-            self.reservoir.items[key] = value.new_zeros(self.reservoir.capacity, *value.shape[1:])
-            self.reservoir.items[key][: len(value)] = value
+            room = value.new_zeros(self.reservoir.capacity, *value.shape[1:], device=self.weights.device)
+            room[: len(value)] = value
+            self.reservoir.items[key] = room

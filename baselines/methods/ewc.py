@@ -23,15 +23,17 @@ class EWC(SampledImportance):
 
     Separate: one such term for each earlier task k, with its own F_k and weights a_k. As a sum of squares is a square,
     they are kept exactly as one: F = sum_k F_k, a = sum_k F_k a_k / F. Online: F is the running mean
-    alpha F + (1 - alpha) F_k, and a are the weights at the end of the last task.
+    alpha F + (1 - alpha) F_k, which begins at 0, and a are the weights at the end of the last task; Schwarz et al. have
+    the sum gamma F + F_k.
 
     Args:
         coeff: lambda.
         online: one running term; False: a term for each task.
         alpha: share of the earlier tasks in the running mean, in [0, 1].
         fisher: ``policy``: F_i = E[sum_action pi(action|s) (d log pi(action|s) / d w_i)^2] over the samples, in closed
-            form over actions; a Q-learner's policy is the softmax of its values. ``loss``: the mean square of the
-            gradient of the agent's losses over minibatches, as in the code of Ben-Iwhiwhu et al. 2023.
+            form over actions; a Q-learner's policy is the softmax of its values. ``loss``: the squares of the gradients
+            of the agent's losses on minibatches, summed up and divided by the size of a minibatch, as in the code of
+            Ben-Iwhiwhu et al. 2023: it grows with the number of samples.
         settings: ``num_samples`` and ``heads`` of `SampledImportance`.
     """
 
@@ -53,8 +55,7 @@ class EWC(SampledImportance):
             self.importance.copy_(total)
             self.anchor.copy_(moved)
             return
-        first = not self.importance.any()
-        self.importance.copy_(new if first else self.alpha * self.importance + (1 - self.alpha) * new)
+        self.importance.copy_(self.alpha * self.importance + (1 - self.alpha) * new)
         self.anchor.copy_(weights)
 
     def _of_policy(self, item: Data) -> Iterator[Tensor]:
@@ -64,9 +65,9 @@ class EWC(SampledImportance):
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 
     def _of_losses(self) -> Tensor:
-        total, minibatches = torch.zeros_like(self.importance), self.samples.minibatches
-        for minibatch in minibatches:
+        total = torch.zeros_like(self.importance)
+        for minibatch in self.samples.minibatches:
             losses = [value for key, value in self.agent.loss(minibatch).items() if key.startswith("loss_")]
             gradients = torch.autograd.grad(sum(losses), self.weights.parameters, materialize_grads=True)  # type: ignore[arg-type]
-            total += flat(gradients).square()
-        return total / max(len(minibatches), 1)
+            total += flat(gradients).square() / minibatch["action"].numel()
+        return total

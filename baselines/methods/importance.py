@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.learner import one_of
@@ -89,7 +91,7 @@ class Importance(Method):
 
 
 class Samples:
-    """The last minibatches that were learned from, of at least so many frames in all.
+    """The last minibatches that were learned from, of at least so many frames in all; each batch's first pass alone.
 
     Args:
         num_frames: frames.
@@ -97,16 +99,28 @@ class Samples:
 
     def __init__(self, num_frames: int) -> None:
         require(*at_least_one(num_samples=num_frames))
-        self.num_frames = num_frames
+        self.num_frames, self.held = num_frames, 0
+        self.due = math.inf
+        """Frames of the present batch that are still to be taken."""
+
         self.minibatches: deque[dict[Any, Tensor]] = deque()
 
     def add(self, minibatch: Data) -> None:
         """Take a minibatch in, and drop those that are not needed any more."""
+        size = minibatch["action"].numel()
+        if self.due <= 0:
+            return
+        self.due -= size
+        self.held += size
         self.minibatches.append(dict(minibatch))
-        sizes = [each["action"].numel() for each in self.minibatches]
-        while sum(sizes) - sizes[0] >= self.num_frames:
+        while self.held - (first := self.minibatches[0]["action"].numel()) >= self.num_frames:
             self.minibatches.popleft()
-            sizes.pop(0)
+            self.held -= first
+
+    def clear(self) -> None:
+        """Drop all."""
+        self.minibatches.clear()
+        self.held = 0
 
     def items(self) -> Iterator[dict[Any, Tensor]]:
         """The items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
@@ -119,13 +133,19 @@ class Samples:
                 frames += item["action"].numel()
                 yield item
 
-    def state(self) -> list[dict[Any, Tensor]]:
+    def state(self) -> dict[str, Any]:
         """Plain values for a state dict."""
-        return list(self.minibatches)
+        keys = self.minibatches[0] if self.minibatches else ()
+        items = {key: torch.cat([minibatch[key] for minibatch in self.minibatches]) for key in keys}
+        return {"sizes": [len(minibatch["action"]) for minibatch in self.minibatches], "items": items}
 
-    def restore(self, state: Sequence[Mapping[Any, Tensor]]) -> None:
+    def restore(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Go back to what `state` gave."""
-        self.minibatches = deque(dict(minibatch) for minibatch in state)
+        self.clear()
+        parts = {key: value.to(device).split(state["sizes"]) for key, value in state["items"].items()}
+        for number in range(len(state["sizes"])):
+            self.minibatches.append({key: part[number] for key, part in parts.items()})
+            self.held += self.minibatches[-1]["action"].numel()
 
 
 class SampledImportance(Importance):
@@ -142,6 +162,10 @@ class SampledImportance(Importance):
         super().__init__(**settings)
         self.samples = Samples(num_samples)
 
+    def see(self, batch: TensorDictBase) -> None:
+        """So many frames are to be kept."""
+        self.samples.due = batch.numel()
+
     def mixed(self, batch: Data) -> Data:
         """The minibatch itself, which is kept for the end of the task."""
         self.samples.add(batch)
@@ -150,7 +174,7 @@ class SampledImportance(Importance):
     def end_task(self) -> None:
         """Weigh up what the task needs; a later task's is a matter of its own samples."""
         super().end_task()
-        self.samples.minibatches.clear()
+        self.samples.clear()
 
     def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
         """The sum of the terms of every sample, [P] each, over the number of frames."""
@@ -171,4 +195,4 @@ class SampledImportance(Importance):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
-        self.samples.restore(state["samples"])
+        self.samples.restore(state["samples"], self.weights.device)

@@ -139,7 +139,9 @@ class TaskMethod(Method):
 
     def start_task(self, task: int | None) -> None:
         """Go to the task's place."""
-        assert task is not None
+        name = type(self).__name__
+        if task is None:
+            raise ValueError(f"{name} needs the id of the task that begins: blocks of one task, with ids that are told")
         if task not in self.begun:
             message = f"there is room for {self.num_tasks} tasks, got another, {task}"
             require((len(self.begun) < self.num_tasks, message))

@@ -88,9 +88,9 @@ class PackNet(TaskMethod):
         self.heads.end_task()
 
     def see(self, batch: TensorDictBase) -> None:
-        """Prune when only the share of frames for retraining is left."""
+        """Prune before the first batch that reaches into the share for retraining, unless nothing was learned yet."""
         budget = self.budgets[self.block % len(self.budgets)]
-        if self.frames >= (1 - self.retrain) * budget:
+        if self.frames and self.frames + batch.numel() > (1 - self.retrain) * budget:
             self._prune()
         self.frames += batch.numel()
 

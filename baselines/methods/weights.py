@@ -27,6 +27,11 @@ class Weights:
     def __len__(self) -> int:
         return sum(self.sizes)
 
+    @property
+    def device(self) -> torch.device:
+        """Where they are."""
+        return self.parameters[0].device
+
     def vector(self) -> Tensor:
         """A copy, float32 [P]; gradients reach the parameters."""
         return flat(self.parameters)

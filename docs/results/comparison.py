@@ -19,6 +19,7 @@ from raw import HERE, Raw, groups, mean_of, read, table, write
 from ctgraph_rl import metrics
 from ctgraph_rl.log import RunLog
 from ctgraph_rl.metrics import Curves
+from ctgraph_rl.metrics.curves import SMALLEST_HEADROOM
 
 EXPERT = "expert"
 CELL = ("curriculum", "agent", "method", "seed")
@@ -30,15 +31,26 @@ MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 EXPERIMENTS = (*MASKS, "methods")
 CONF = HERE.parent.parent / "conf" / "experiment"
 SOLVED = 0.9
+MOST_NAMED = 12
+"""Cells without results are named up to so many, apart from seeds; else counted."""
 
 
 def collect(name: str, folder: Path) -> None:
-    """Put what the finished runs under a folder say in place of what the raw results have of them; keep the rest."""
-    found = groups(read(name), *CELL)
-    for metrics_file in sorted(folder.rglob("metrics.json")):
-        lines = evaluations(metrics_file.parent)
-        found |= groups(lines, *CELL)
-    ordered = [line for cell in sorted(found) for line in found[cell]]
+    """Add what the finished runs under a folder say to the raw results, in place of what these had of the same runs.
+
+    Raises:
+        ValueError: for two runs of one cell, which differ in what is not in the raw results, and another curriculum.
+    """
+    kept, found = groups(read(name), *CELL), {}
+    for run_dir in sorted(path.parent for path in folder.rglob("metrics.json")):
+        for cell, lines in groups(evaluations(run_dir), *CELL).items():
+            before = found.get(cell, lines)
+            if before != lines and cell[2] != EXPERT:
+                raise ValueError(f"{folder} has two runs of {' '.join(cell)}: collect from a folder with one of them")
+            if cell in kept and kept[cell][0]["fingerprint"] != lines[0]["fingerprint"]:
+                raise ValueError(f"{run_dir} learned another curriculum than {name}.csv has of {' '.join(cell)}")
+            found[cell] = lines
+    ordered = [line for _, lines in sorted({**kept, **found}.items()) for line in lines]
     width = max(sum(key.isdigit() for key in line) for line in ordered)
     write(name, [{**line, **{str(j): line.get(str(j), "") for j in range(1, width + 1)}} for line in ordered])
 
@@ -93,11 +105,13 @@ def scores(lines: Raw, experts: Raw) -> dict[str, float | None]:
     values = {name: metric.value for name, metric in found.items()}
     if experts:
         alone = torch.stack([metrics.mean_area(curve) for curve in curves(experts).performance.T])
-        values["forward transfer"] = float((metrics.stage_areas(run) - alone).mean())
+        gain, left = metrics.stage_areas(run) - alone, 1 - alone
+        values["gain over experts"] = float(gain.mean())
+        values["forward transfer"] = float((gain / left)[left >= SMALLEST_HEADROOM].mean())
     return values
 
 
-COLUMNS = ("average performance", "forward transfer", "forgetting", "TPOT", "tasks learned")
+COLUMNS = ("average performance", "forward transfer", "gain over experts", "forgetting", "TPOT", "tasks learned")
 
 
 def summary(name: str) -> str:
@@ -107,7 +121,7 @@ def summary(name: str) -> str:
         return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
     rows = []
     for method in dict.fromkeys(expected(name)["method"]):
-        found = [scores(of[cell], of.get((EXPERT, cell[1]), [])) for cell in of if cell[0] == method]
+        found = [scores(lines, of.get((EXPERT, seed), [])) for (who, seed), lines in of.items() if who == method]
         values = [mean_of([each.get(column) for each in found]) for column in COLUMNS]
         rows.append([f"`{method}`", str(len(found)), *values])
     return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{missing(name)}"
@@ -149,18 +163,17 @@ def _choices(text: str) -> list[str]:
 def missing(name: str) -> str:
     """Which cells of an experiment have no raw results."""
     swept = expected(name)
-    keys = ["seed" if key == "seed" else key for key in swept]
-    there = set(groups(read(name), *keys))
+    there = set(groups(read(name), *swept))
     lacking = [cell for cell in product(*swept.values()) if cell not in there]
     if not lacking:
         return "All cells were run."
+    place = list(swept).index("seed")
     by_seed: dict[tuple[str, ...], list[str]] = {}
-    place = keys.index("seed")
     for cell in lacking:
         by_seed.setdefault(cell[:place] + cell[place + 1 :], []).append(cell[place])
+    count = f"Not run yet: {len(lacking)} of {len(list(product(*swept.values())))} cells"
     cells = "; ".join(f"{' '.join(cell)} (seeds {', '.join(seeds)})" for cell, seeds in by_seed.items())
-    count = len(list(product(*swept.values())))
-    return f"Not run yet, {len(lacking)} of {count} cells: {cells}."
+    return f"{count}." if len(by_seed) > MOST_NAMED else f"{count}, {cells}."
 
 
 def by_agent(curriculum: str) -> str:
