@@ -1,0 +1,102 @@
+"""docs/lifelong.md: made from raw results, whose numbers are those of a calculation by hand."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "results"
+
+
+@pytest.fixture(scope="module")
+def make():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(FOLDER))
+        yield __import__("make")
+        for name in ("make", "comparison", "raw"):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def comparison(make):
+    return sys.modules["comparison"]
+
+
+def lines(*evaluations):
+    """Evaluations of two tasks: block, frames, and the return on each."""
+    return [dict(zip(("block", "frames", "1", "2"), map(str, each), strict=True)) for each in evaluations]
+
+
+def test_the_page_is_what_its_raw_results_make(make):
+    assert make.lifelong_page() == make.LIFELONG.read_text(encoding="utf-8")
+
+
+def test_every_cell_of_the_published_comparison_has_one_curriculum_and_all_evaluations(comparison):
+    cells = comparison.groups(comparison.read("masks_ct8_md"), "method", "seed")
+
+    fingerprints = {line["fingerprint"] for cell in cells.values() for line in cell}
+    assert len(fingerprints) == 1
+    counts = {len(cell) for (method, _), cell in cells.items() if method != comparison.EXPERT}
+    assert counts == {161}  # 160 and the one before training
+    assert {len(cell) for (method, _), cell in cells.items() if method == comparison.EXPERT} == {21}
+
+
+def test_numbers_of_a_run_are_those_by_hand(comparison):
+    run = lines((0, 0, 1, 1), (1, 10, 0.5, 0), (1, 20, 1, 0.25), (2, 30, 0.5, 0.5), (2, 40, 0, 1))
+    experts = lines((0, 0, 0, 0), (1, 10, 1, 0), (1, 20, 1, 0.5))
+
+    found = comparison.scores(run, experts)
+
+    assert found == pytest.approx(
+        {
+            "average performance": 0.5,
+            "forgetting": 0.5,  # task 1 falls from 1 to 0, task 2 stays: over both tasks
+            "TPOT": 0.5 + 1.25 + 1.0 + 1.0,
+            "tasks learned": 2,
+            "gain over experts": ((0.75 - 1) + (0.75 - 0.25)) / 2,
+            "forward transfer": 0.5 / 0.75,  # the first expert leaves nothing to gain
+        }
+    )
+
+
+def test_what_was_not_run_is_named_by_method_and_seed(comparison, monkeypatch):
+    monkeypatch.setattr(comparison, "expected", lambda name: {"method": ["a", "b"], "seed": ["0", "1", "2"]})
+    monkeypatch.setattr(comparison, "read", lambda name: [{"method": "a", "seed": "1"}, {"method": "b", "seed": "2"}])
+
+    assert comparison.missing("x") == "Not run yet: 4 of 6 cells, a (seeds 0, 2); b (seeds 0, 1)."
+
+
+def write_run(folder, num_frames, fingerprint="f"):
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text("{}")
+    kinds = [
+        {"kind": "run", "schema": 1, "curriculum": "ct8", "fingerprint": fingerprint, "config": {"seed": 3}},
+        {"kind": "evaluation", "block": 1, "frames": num_frames, "task": 1, "return_mean": 0.5},
+    ]
+    (folder / "run.jsonl").write_text("".join(json.dumps({"n": 0, **line}) + "\n" for line in kinds))
+
+
+def test_two_runs_that_cannot_be_told_apart_are_refused_and_nothing_is_written(comparison, monkeypatch, tmp_path):
+    written = []
+    monkeypatch.setattr(comparison, "read", lambda name: [])
+    monkeypatch.setattr(comparison, "write", lambda name, lines: written.append(lines))
+    write_run(tmp_path / "ct8" / "ppo-ewc-seed3-aaaa", 512)
+    comparison.collect("x", tmp_path)
+    write_run(tmp_path / "ct8" / "ppo-ewc-seed3-bbbb", 1024)
+
+    with pytest.raises(ValueError, match="two runs of ct8 ppo ewc 3"):
+        comparison.collect("x", tmp_path)
+
+    assert [[line["frames"] for line in each] for each in written] == [["512"]]
+
+
+def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(comparison, monkeypatch, tmp_path):
+    there = {"curriculum": "ct8", "agent": "ppo", "method": "finetune", "seed": "3", "fingerprint": "other"}
+    monkeypatch.setattr(comparison, "read", lambda name: [there])
+    write_run(tmp_path / "ct8" / "ppo-seed3-aaaa", 512)
+
+    with pytest.raises(ValueError, match=r"learned another curriculum than x\.csv has of ct8 ppo finetune 3"):
+        comparison.collect("x", tmp_path)
