@@ -35,6 +35,8 @@ class Importance(Method):
             own, which are not held; ``auto``: multi where the curriculum tells task ids, else single.
     """
 
+    without_ids = ", or method.heads=single"
+
     importance: Tensor  # float32 [P]
     anchor: Tensor  # float32 [P]
     held: Tensor  # float32 [P]: 1 where weights are held, 0 in output layers of a task's own

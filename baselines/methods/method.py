@@ -31,6 +31,9 @@ class Method(nn.Module):
     needs_task_id: bool = False
     """Whether it must be told which task it is in, while learning and while acting."""
 
+    without_ids = ""
+    """What else can be done where ids are hidden, for the message that refuses them."""
+
     needs_boundaries: ClassVar[bool] = True
     """Whether it must be told when the task changes."""
 
@@ -50,7 +53,8 @@ class Method(nn.Module):
         require(
             (
                 not self.needs_task_id or told.task_id != "hidden",
-                f"{name} needs task ids, which are hidden: set protocol.task_id=one_hot or at_boundaries",
+                f"{name} needs task ids, which are hidden: "
+                f"set protocol.task_id=one_hot or at_boundaries{self.without_ids}",
             ),
             (
                 not self.needs_boundaries or told.boundaries == "announced",

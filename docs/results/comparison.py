@@ -180,11 +180,9 @@ def by_agent(curriculum: str) -> str:
     """Average performance at the end, and forgetting, of every method (lines) and agent (columns) on a curriculum."""
     lines = [line for line in read("methods") if line["curriculum"] == curriculum]
     of, swept = groups(lines, "method", "agent"), expected("methods")
-    rows = []
-    for method in swept["method"]:
-        cells = [_both(of.get((method, agent), [])) for agent in swept["agent"]]
-        rows.append([f"`{method}`", *cells])
-    return table([curriculum, *swept["agent"]], rows)
+    agents = [agent for agent in swept["agent"] if any(who == agent for _, who in of)]
+    rows = [[f"`{method}`", *(_both(of.get((method, agent), [])) for agent in agents)] for method in swept["method"]]
+    return table([curriculum, *agents], rows) if agents else f"Nothing was run yet of {curriculum}."
 
 
 def _both(lines: Raw) -> str:
