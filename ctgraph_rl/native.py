@@ -52,7 +52,12 @@ def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | 
 
 
 def is_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> bool:
-    """Whether the kernel can be made here, and knows these rewards."""
+    """Whether the kernel can be made here, and knows these rewards; what fails is tried once a process."""
+    return _is_native(frozenset(reward_fns), device)
+
+
+@cache
+def _is_native(reward_fns: frozenset[RewardFn], device: torch.device | str | None) -> bool:
     try:
         require_native(reward_fns, device)
     except ValueError:

@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from oracles import confounding, fully_observable, record, scripts, surjective
+from tensordict import TensorDictBase
 from test_any_input import batches, examples, seeds
 from test_fast import FAMILIES, MIXED
 from test_stock import calls
@@ -20,8 +21,10 @@ from test_switches import SWITCHED, VECTORS
 from torch import Tensor
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import CTGraphEnv, Rows, Steps, Task, native, rollout
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, native, rollout
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
+from ctgraph_rl.lifelong import collect, make_env
+from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.rewards import Arrival
 from ctgraph_rl.switch import AtRandom, ByEpisode
 
@@ -264,9 +267,11 @@ def test_data_are_not_changed_by_later_steps():
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty cache, and the kernel not yet loaded."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native._library.cache_clear()
+    for made in (native._library, native._is_native):
+        made.cache_clear()
     yield tmp_path / "ctgraph_rl"
-    native._library.cache_clear()
+    for made in (native._library, native._is_native):
+        made.cache_clear()
 
 
 def test_the_kernel_is_compiled_once_into_a_folder_that_is_the_users_alone(own_cache, monkeypatch):
@@ -311,3 +316,23 @@ def test_a_cache_that_cannot_be_made_is_refused(own_cache, monkeypatch):
 
     with pytest.raises(ValueError, match=r"cannot be made .* name a folder of yours"):
         native._library()
+
+
+@pytest.mark.parametrize("missing", [None, "a compiler", "the rewards"])
+def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(own_cache, monkeypatch, missing):
+    if missing == "a compiler":
+        monkeypatch.setenv("CC", "no-such-compiler")
+    if missing == "the rewards":
+        monkeypatch.setattr(native, "REWARDS", ())
+    curriculum = Curriculum("one", 1, "-", (Block(confounding(2, 2, 0.5), 480),))
+    plain = CTGraphEnv(curriculum.tasks * 8, 3)
+
+    env = make_env(curriculum, curriculum.tasks * 8, 3)
+
+    assert env.rows.compiled == (missing is None)
+    assert all((one == other).all() for one, other in zip(*map(random_batches, (env, plain)), strict=True))
+
+
+def random_batches(env: CTGraphEnv) -> list[TensorDictBase]:
+    torch.manual_seed(0)
+    return list(collect(env, RandomPolicy(env), 480, 20))

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from baselines.compiled import total
 from baselines.learner import one_of, true_or_false
 from baselines.methods.importance import SampledImportance
 from baselines.methods.weights import flat
@@ -65,9 +66,9 @@ class EWC(SampledImportance):
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 
     def _of_losses(self) -> Tensor:
-        total = torch.zeros_like(self.importance)
+        squares = torch.zeros_like(self.importance)
         for minibatch in self.samples.minibatches:
-            losses = [value for key, value in self.agent.loss(minibatch).items() if key.startswith("loss_")]
-            gradients = torch.autograd.grad(sum(losses), self.weights.parameters, materialize_grads=True)  # type: ignore[arg-type]
-            total += flat(gradients).square() / minibatch["action"].numel()
-        return total
+            loss = total(self.agent.loss(minibatch))
+            gradients = torch.autograd.grad(loss, self.weights.parameters, materialize_grads=True)
+            squares += flat(gradients).square() / minibatch["action"].numel()
+        return squares

@@ -6,7 +6,7 @@ Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), on the supermasks of Wortsman 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -107,14 +107,14 @@ class Masks(TaskMethod):
     def _masked(self, scores: Tensor) -> Tensor:
         return torch.where(scores >= 0, self.constant, 0.0)
 
-    def get_extra_state(self) -> dict[str, object]:
+    def get_extra_state(self) -> dict[str, Any]:
         """Who has which place, and how many have ended."""
         return {**super().get_extra_state(), "ended": self.ended}
 
-    def set_extra_state(self, state: dict[str, object]) -> None:
+    def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         super().set_extra_state(state)
-        self.ended = state["ended"]  # type: ignore[assignment]
+        self.ended = state["ended"]
 
 
 class CombinedMasks(Masks):

@@ -40,7 +40,7 @@ class Method(nn.Module):
     agent: Learner
     weights: Weights
 
-    def __init__(self) -> None:
+    def __init__(self) -> None:  # a module takes any arguments, a method those that it names
         super().__init__()
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:

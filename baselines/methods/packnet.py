@@ -6,7 +6,7 @@ Mallya and Lazebnik 2018 (CVPR, arXiv 1711.05769).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -143,11 +143,11 @@ class PackNet(TaskMethod):
     def _within(self, chosen: Tensor) -> Tensor:
         return chosen.to(self.owner.device)
 
-    def get_extra_state(self) -> dict[str, object]:
+    def get_extra_state(self) -> dict[str, Any]:
         """Who has which place, and how far the block is."""
         return {**super().get_extra_state(), "block": self.block, "frames": self.frames}
 
-    def set_extra_state(self, state: dict[str, object]) -> None:
+    def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         super().set_extra_state(state)
-        self.block, self.frames = state["block"], state["frames"]  # type: ignore[assignment]
+        self.block, self.frames = state["block"], state["frames"]

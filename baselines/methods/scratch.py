@@ -30,12 +30,12 @@ class Scratch(TaskMethod):
 
     def start_task(self, task: int | None) -> None:
         """Go to the task's network; that of the first is the one the agent began with."""
-        new = bool(self.begun) and task not in self.begun
+        first, known = not self.begun, task in self.begun
         super().start_task(task)
-        if new:
-            self.agent.policy.apply(_draw)
-        elif len(self.begun) > 1 or self.kept[self.place].any():
+        if known:
             self.weights.write(self.kept[self.place])
+        elif not first:
+            self.agent.policy.apply(_draw)
         self.agent.forget(self.weights.parameters)
         self.agent.weights_changed()
 

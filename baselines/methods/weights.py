@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
@@ -46,17 +46,15 @@ class Weights:
         """The parts of a vector [..., P] that belong to each parameter."""
         return vector.split(self.sizes, dim=-1)
 
-    def where(self, chosen: Mapping[str, bool]) -> Tensor:
+    def where(self, names: Collection[str]) -> Tensor:
         """bool [P]: the numbers in the parameters with these names."""
-        sizes = zip(self.names, self.parameters, strict=True)
-        return flat(
-            [torch.full_like(parameter, chosen.get(name, False), dtype=torch.bool) for name, parameter in sizes]
-        )
+        named = zip(self.names, self.parameters, strict=True)
+        return flat([torch.full_like(value, name in names, dtype=torch.bool) for name, value in named])
 
     @property
     def in_heads(self) -> Tensor:
         """bool [P]: the numbers of the output layers."""
-        return self.where(dict.fromkeys(self.head_names, True))
+        return self.where(self.head_names)
 
     @property
     def in_head_parameters(self) -> list[nn.Parameter]:
@@ -67,7 +65,7 @@ class Weights:
     @property
     def in_matrices(self) -> Tensor:
         """bool [P]: the numbers of weight matrices, which are no biases."""
-        return self.where({name: value.ndim > 1 for name, value in zip(self.names, self.parameters, strict=True)})
+        return self.where([name for name, value in zip(self.names, self.parameters, strict=True) if value.ndim > 1])
 
     @torch.no_grad()
     def give(self, policy: TensorDictModuleBase, vector: Tensor) -> None:

@@ -57,6 +57,8 @@ def collect(name: str, folder: Path) -> None:
 
 def evaluations(run_dir: Path) -> Raw:
     """The lines of a run, and of the experts that it was compared with; none for an expert's own directory."""
+    if run_dir.parent.name == "experts":
+        return []
     log = RunLog.read(run_dir / "run.jsonl")
     about = log.of_kind("run")[0]
     agent, method = run_dir.name.split("-seed")[0], "finetune"
@@ -64,8 +66,6 @@ def evaluations(run_dir: Path) -> Raw:
         agent, method = agent.split("-")
     who = {"curriculum": run_dir.parent.name, "fingerprint": about["fingerprint"], "agent": agent}
     cell = {**who, "method": method, "seed": str(about["config"]["seed"])}
-    if run_dir.parent.name == "experts":
-        return []
     lines = _lines(cell, log.of_kind("evaluation"))
     experts = [expert for line in log.of_kind("experts") for expert in line["experts"]]
     own = []
