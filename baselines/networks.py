@@ -132,6 +132,14 @@ def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> Te
     return TensorDictModule(nn.Linear(num_features, num_outputs), in_keys=[in_key], out_keys=[out_key])
 
 
+def make_orthogonal(module: nn.Module, gain: float = 1.0) -> None:
+    """Give all linear layers orthogonal weights times a gain, and biases of 0."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain)
+            nn.init.zeros_(layer.bias)
+
+
 def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> ProbabilisticActor:
     """A categorical policy that reads features and writes ``action`` and ``action_log_prob``."""
     return ProbabilisticActor(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
@@ -19,6 +19,7 @@ from baselines.networks import (
     encoder,
     entropy,
     log_probabilities,
+    make_orthogonal,
     recurrent,
     zero_state,
 )
@@ -49,6 +50,8 @@ class PolicyGradient(Learner):
         gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016, arXiv 1506.02438); 1: returns
             of up to ``num_steps`` steps.
         compile: run gradient steps through ``torch.compile``; only without memory.
+        orthogonal_init: linear layers begin with orthogonal weights, those of the heads a thousand times smaller, and
+            biases of 0, as in the code of Ben-Iwhiwhu et al. 2023; False: as torch's do.
     """
 
     num_epochs = num_minibatches = 1
@@ -69,6 +72,7 @@ class PolicyGradient(Learner):
         max_grad_norm: float,
         gae_lambda: float = 1.0,
         compile: bool = False,
+        orthogonal_init: bool = False,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
         require(
@@ -76,13 +80,16 @@ class PolicyGradient(Learner):
             *one_of(OPTIMISERS, optimiser=optimiser),
             *positive(learning_rate=learning_rate, gamma=gamma, gae_lambda=gae_lambda),
             *fraction(gamma=gamma, gae_lambda=gae_lambda),
-            *true_or_false(normalize_advantage=normalize_advantage),
+            *true_or_false(normalize_advantage=normalize_advantage, orthogonal_init=orthogonal_init),
         )
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
         self.features = "memory" if self.memory else "features"
         self.actor = actor(self.features, hidden_size, action_spec)
         self.critic = critic(self.features, hidden_size)
+        if orthogonal_init:
+            make_orthogonal(self.trunk)
+            make_orthogonal(nn.ModuleList([self.actor, self.critic]), 0.001)
         state = [("next", key) for key in STATE_KEYS if self.memory]
         self.policy = ActorCritic(self.trunk, self.actor, self.critic, selected_out_keys=[*ACTED_KEYS, *state])
         self.optimiser = make_optimiser(optimiser, self.parameters(), learning_rate)

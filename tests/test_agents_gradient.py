@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from test_agents import GREEDY, POLICY_GRADIENTS, batches, learnt_from
+from torch import nn
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.ppo_count import SimHashCounts
@@ -126,6 +127,20 @@ def test_reinforce_weighs_log_probabilities_by_the_return_less_the_baseline(smal
     losses = agent.loss({key: value.flatten(0, 1) for key, value in learnt.items()})
     expected = -(batch["action_log_prob"].unsqueeze(-1) * (returns - batch["state_value"])).mean()
     torch.testing.assert_close(losses["loss_actor"], expected)
+
+
+def test_an_orthogonal_start_has_small_heads_and_no_biases(build_agent):
+    agent = build_agent("ppo_published", [ct_su_b1()])
+
+    trunk = [layer for layer in agent.trunk.modules() if isinstance(layer, nn.Linear)]
+    heads = [agent.actor.module[0].module, agent.critic.module]
+    assert len(trunk) == 3
+    for layer, size in [*((layer, 1.0) for layer in trunk), *((head, 1e-3) for head in heads)]:
+        rows = layer.weight if len(layer.weight) <= layer.weight.shape[1] else layer.weight.T
+        torch.testing.assert_close(rows @ rows.T, torch.eye(len(rows)) * size**2, atol=1e-5 * size**2, rtol=0)
+        assert not layer.bias.any()
+    with pytest.raises(ValueError, match="orthogonal_init must be true or false, got 1"):
+        build_agent("ppo_published", [ct_su_b1()], "agent.orthogonal_init=1")
 
 
 @pytest.mark.parametrize("name", POLICY_GRADIENTS)

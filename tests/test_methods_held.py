@@ -430,12 +430,15 @@ def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():
         tiny(L2(coeff=1, heads="multi"))
 
 
-def test_a_task_that_never_began_is_acted_in_with_the_output_layers_of_the_first(compose):
+def test_a_task_that_never_began_is_acted_in_with_output_layers_that_have_learned_nothing(compose):
     worn = wearing(compose, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
+    method, inside = worn.agent.method, worn.agent.method.weights.in_heads
+    begun_with = method.weights.vector().detach()[inside]
     stay(worn, 0)
     stay(worn, 1)
 
-    unseen, first, second = (weights_for(worn, number) for number in (2, 0, 1))
+    unseen, present = method.weights_of(2), method.weights.vector()
 
-    assert all(torch.equal(*pair) for pair in zip(unseen, first, strict=True))
-    assert not all(torch.equal(*pair) for pair in zip(unseen, second, strict=True))
+    assert torch.equal(unseen[inside], begun_with)
+    assert torch.equal(unseen[~inside], present[~inside])
+    assert not torch.equal(unseen[inside], present[inside])

@@ -48,6 +48,11 @@ class Heads(TaskMethod):
         """Keep the task's."""
         self.kept[self.place] = self.weights.vector()[self.inside.to(self.kept.device)]
 
+    def place_of(self, task: int) -> int:
+        """Where a task's output layers are; those of one that has not begun are as the agent began with."""
+        unseen = task not in self.begun and len(self.begun) < self.num_tasks
+        return len(self.begun) if unseen else super().place_of(task)
+
     @torch.no_grad()
     def weights_of(self, task: int) -> Tensor | None:
         """The present weights with a task's output layers."""
