@@ -1,8 +1,8 @@
-/* Steps of many rows in one pass: what `dynamics` computes with tensors, bit for bit.
+/* Steps of many rows in one pass: what `dynamics` computes with tensors, bit for bit; and two of its parts alone.
 
-   `native` packs the parameters, checks the arguments, compiles this file and calls `ctgraph_run`. Rows are run in
-   blocks: the state of a block stays in the cache through all steps, and the draws of its rows are made in loops that
-   compilers vectorize. Every row is computed alone, so blocks and threads do not change its bits. Nothing is written
+   `library` compiles this file. `native` packs the parameters, checks the arguments and calls `ctgraph_run`. Rows are
+   run in blocks: the state of a block stays in the cache through all steps, and the draws of its rows are made in loops
+   that compilers vectorize. Every row is computed alone, so blocks and threads do not change its bits. Nothing is written
    beyond the arrays of a call whatever their values, and nothing read beyond the tables: states that no task can have
    are counted instead. Overflow wraps as in torch (-fwrapv); products are never fused with sums (-ffp-contract=off). */
 
@@ -72,10 +72,10 @@ typedef struct {
     uint32_t noise[4][BLOCK];
 } Block;
 
-/* Philox4x32-10 of (tick, row, stream) with the key of a seed, see `philox.draw`. */
-static inline void draw(uint64_t seed, uint64_t row, uint64_t tick, uint64_t stream, uint32_t word[4])
+/* Philox4x32-10 of a counter and a key, see `philox.philox`. */
+static inline void
+philox(uint64_t c0, uint64_t c1, uint64_t c2, uint64_t c3, uint64_t k0, uint64_t k1, uint32_t word[4])
 {
-    uint64_t c0 = tick & WORD, c1 = tick >> 32, c2 = row, c3 = stream << 28, k0 = seed & WORD, k1 = seed >> 32;
 #pragma GCC unroll 10
     for (int round = 0; round < 10; round++) {
         uint64_t even = c0 * 0xD2511F53u, odd = c2 * 0xCD9E8D57u;
@@ -84,6 +84,12 @@ static inline void draw(uint64_t seed, uint64_t row, uint64_t tick, uint64_t str
         k0 = (k0 + 0x9E3779B9u) & WORD, k1 = (k1 + 0xBB67AE85u) & WORD;
     }
     word[0] = c0, word[1] = c1, word[2] = c2, word[3] = c3;
+}
+
+/* `philox.draw`: of (tick, row, stream), with the key of a seed. */
+static inline void draw(uint64_t seed, uint64_t row, uint64_t tick, uint64_t stream, uint32_t word[4])
+{
+    philox(tick & WORD, tick >> 32, row, stream << 28, seed & WORD, seed >> 32, word);
 }
 
 static void draw_all(Block *block, uint64_t stream, uint32_t word[4][BLOCK])
@@ -464,4 +470,38 @@ int64_t ctgraph_run(const Call *call)
         wrong += run_block(call, first, rest < BLOCK ? rest : BLOCK);
     }
     return wrong;
+}
+
+/* Philox of `count` counters and keys: six words each, one for all (step 0) or one each (step 1); out is [4, count]. */
+void ctgraph_philox(
+    const int64_t *const in[6], const int64_t step[6], int64_t *restrict out, int64_t count, int64_t num_threads)
+{
+    int64_t blocks = (count + BLOCK - 1) / BLOCK;
+#pragma omp parallel for schedule(static) num_threads(num_threads) if (num_threads > 1)
+    for (int64_t b = 0; b < blocks; b++) {
+        int64_t first = b * BLOCK, rest = count - first, size = rest < BLOCK ? rest : BLOCK;
+        uint64_t given[6][BLOCK] = {{0}};
+        uint32_t word[4][BLOCK];
+        for (int i = 0; i < 6; i++)
+            for (int64_t j = 0; j < size; j++)
+                given[i][j] = (uint64_t)in[i][(first + j) * step[i]];
+        for (int j = 0; j < BLOCK; j++) {
+            uint32_t one[4];
+            philox(given[0][j], given[1][j], given[2][j], given[3][j], given[4][j], given[5][j], one);
+            word[0][j] = one[0], word[1][j] = one[1], word[2][j] = one[2], word[3][j] = one[3];
+        }
+        for (int i = 0; i < 4; i++)
+            for (int64_t j = 0; j < size; j++)
+                out[i * count + first + j] = word[i][j];
+    }
+}
+
+/* `reading.add_noise` for images of `size` pixels. */
+void ctgraph_noise(
+    uint8_t *restrict out, const uint8_t *restrict image, const int64_t *start, const int64_t *read_noise, int64_t count,
+    int64_t size, int64_t num_threads)
+{
+#pragma omp parallel for schedule(static) num_threads(num_threads) if (num_threads > 1)
+    for (int64_t j = 0; j < count; j++)
+        add_noise(out + j * size, image + j * size, size, (uint64_t)start[j], (uint16_t)(read_noise[j] + 1));
 }

@@ -1,21 +1,9 @@
-"""Steps as a small C kernel, `native.c`: the bits of `dynamics` at the speed of memory, on CPUs.
-
-It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works.
-"""
+"""Steps as a small C kernel, `native.c`: the bits of `dynamics` at the speed of memory, on CPUs."""
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import os
-import platform
-import shlex
-import stat
-import subprocess
-import tempfile
 from collections.abc import Iterable
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,6 +11,7 @@ from torch import Tensor
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.dynamics import STATE_DTYPES, ObservationParams, RewardParams, RowState, Shown, Uses
+from ctgraph_rl.library import is_available, library, num_threads
 from ctgraph_rl.rewards import Gradient, Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.tree import TreeParams
 
@@ -32,9 +21,6 @@ if TYPE_CHECKING:
 REWARDS = (Needle, Gradient, ReferenceLinear)
 """The rewards that the kernel knows, in its order; a user's own are Python and need the tensor code."""
 
-ROWS_A_THREAD = 2048
-"""Row steps for which another thread pays."""
-
 
 def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> None:
     """Refuse what the kernel cannot run, and a machine that cannot compile it.
@@ -42,27 +28,22 @@ def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | 
     Raises:
         ValueError: saying which.
     """
-    other = [fn for fn in reward_fns if type(fn) not in REWARDS]
+    other = _unknown(reward_fns)
     names = ", ".join(reward.__name__ for reward in REWARDS)
     require(
         (not other, f"compiled=True knows the rewards {names}, got {other[:3]}; use compiled=False"),
         (torch.device(device or "cpu").type == "cpu", f"compiled=True runs on a CPU, got {device}; use compiled=False"),
     )
-    _library()
+    library()
 
 
 def is_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> bool:
-    """Whether the kernel can be made here, and knows these rewards; what fails is tried once a process."""
-    return _is_native(frozenset(reward_fns), device)
+    """Whether the kernel can be made here, and knows these rewards."""
+    return torch.device(device or "cpu").type == "cpu" and not _unknown(reward_fns) and is_available()
 
 
-@cache
-def _is_native(reward_fns: frozenset[RewardFn], device: torch.device | str | None) -> bool:
-    try:
-        require_native(reward_fns, device)
-    except ValueError:
-        return False
-    return True
+def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
+    return [fn for fn in reward_fns if type(fn) not in REWARDS]
 
 
 class Native:
@@ -118,9 +99,9 @@ class Native:
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
         call.num_steps, call.restarts = num_steps, restarts
-        call.num_threads = max(1, min(torch.get_num_threads(), -(-n // _BLOCK), n * num_steps // ROWS_A_THREAD))
+        call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
         kept = [self._set(name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
-        wrong = _library()(ctypes.byref(call))
+        wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
         self._state = after
@@ -238,74 +219,3 @@ class _Call(ctypes.Structure):
         ("after", _Pointers),
         *((name, ctypes.c_void_p) for name in _ARRAYS),
     ]
-
-
-_FLAGS = ("-O3", "-march=native", "-std=gnu11", "-ffp-contract=off", "-fwrapv", "-shared", "-fPIC")
-
-
-@cache
-def _library() -> Any:
-    """The kernel's function, compiled if it was not before."""
-    source = Path(__file__).with_name("native.c")
-    compiler = shlex.split(os.environ.get("CC", "cc"))
-    path = _cache_folder() / f"native-{_key(source, compiler)}.so"
-    if not path.exists():
-        _compile(source, compiler, path)
-    _require_own(path)
-    function = ctypes.CDLL(str(path)).ctgraph_run
-    function.argtypes, function.restype = [ctypes.POINTER(_Call)], ctypes.c_int64
-    return function
-
-
-def _key(source: Path, compiler: list[str]) -> str:
-    """What decides the machine code, hashed: the source, the flags, the compiler and the CPU."""
-    try:
-        version = subprocess.run([*compiler, "--version"], capture_output=True, check=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        fix = "install one (gcc or clang), name it in the environment variable CC, or use compiled=False"
-        raise ValueError(f"compiled=True needs a C compiler, {shlex.join(compiler)!r} does not run; {fix}") from error
-    parts = (source.read_bytes(), repr((compiler, _FLAGS)).encode(), version, _cpu().encode())
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
-
-
-def _cpu() -> str:
-    """The CPU's model and instructions."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return repr((platform.machine(), platform.processor(), sorted({x for x in lines if x.startswith(wanted)})))
-
-
-def _cache_folder() -> Path:
-    """The user's own folder for compiled kernels."""
-    parent = os.environ.get("XDG_CACHE_HOME")
-    folder = (Path(parent) if parent else Path.home() / ".cache") / "ctgraph_rl"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        fix = "name a folder of yours in the environment variable XDG_CACHE_HOME"
-        message = f"compiled=True keeps its kernel in {folder}, which cannot be made ({error}); {fix}"
-        raise ValueError(message) from error
-    _require_own(folder)
-    return folder
-
-
-def _require_own(path: Path) -> None:
-    """Refuse what another user could have put there."""
-    found = path.stat()
-    own = found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    require((own, f"{path} must belong to this user and be writable by no other; remove it or set XDG_CACHE_HOME"))
-
-
-def _compile(source: Path, compiler: list[str], path: Path) -> None:
-    """Compile into a file of its own that then takes the place; without OpenMP where the compiler has none."""
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
-        for openmp in (["-fopenmp"], []):
-            command = [*compiler, *_FLAGS, *openmp, str(source), "-o", str(made), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True)
-            if done.returncode == 0:
-                break
-        require((done.returncode == 0, f"compiled=True: {shlex.join(command)} failed: {done.stderr[-2000:]}"))
-        made.chmod(0o700)
-        made.replace(path)

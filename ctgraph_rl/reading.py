@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ctgraph_rl import library
 from ctgraph_rl.philox import STREAM_NOISE, draw, splitmix64
 
 
@@ -25,13 +26,19 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     Returns:
         uint8 [N, 1, r, r].
     """
-    return _opaque(images, start, read_noise) if torch.compiler.is_compiling() else _by_parts(images, start, read_noise)
+    return _opaque(images, start, read_noise) if torch.compiler.is_compiling() else _added(images, start, read_noise)
 
 
 _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
 
 
-def _by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    given = images, start, read_noise
+    return library.add_noise(*given) if library.takes(*given) else by_parts(*given)
+
+
+def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """`add_noise` where there is no C code."""
     parts = zip(*(part.split(_NOISE_ROWS) for part in (images, start, read_noise)), strict=True)
     noised = [noisy(*part) for part in parts]
     return noised[0] if len(noised) == 1 else torch.cat(noised)
@@ -47,7 +54,7 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 # Inductor of torch 2.13 writes beyond its buffers when it fuses the noise with what comes before it. As an operator of
 # its own it stays whole; `fast` compiles it alone, in a way that is right.
-_opaque = torch.library.custom_op("ctgraph_rl::add_noise", _by_parts, mutates_args=())
+_opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
 
 

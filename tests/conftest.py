@@ -32,7 +32,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return
     for item in items:
         compiled = getattr(item, "callspec", None) and item.callspec.params.get("compiled")
-        if compiled or "test_native.py" in item.nodeid or "compiled" in item.nodeid:
+        if compiled or "test_native.py" in item.nodeid or "test_library.py" in item.nodeid or "compiled" in item.nodeid:
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 

@@ -6,8 +6,8 @@ import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
 from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, draw, philox, randint, splitmix64
-from ctgraph_rl.reading import _NOISE_ROWS, add_noise
+from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, by_tensors, draw, philox, randint, splitmix64
+from ctgraph_rl.reading import _NOISE_ROWS, add_noise, by_parts
 from ctgraph_rl.tree import State, stays, transition
 from ctgraph_rl.tree import tree_params as make_tree
 
@@ -53,8 +53,9 @@ def as_tensors(b, d, cases):
     return State(torch.tensor(kinds), torch.tensor(numbers))
 
 
+@pytest.mark.parametrize("philox", [philox, by_tensors])
 @pytest.mark.parametrize(("counter", "key", "expected"), KNOWN_ANSWERS)
-def test_philox_meets_the_published_known_answers(counter, key, expected):
+def test_philox_meets_the_published_known_answers(philox, counter, key, expected):
     words = philox(tuple(map(torch.tensor, counter)), tuple(map(torch.tensor, key)))
 
     assert tuple(map(int, words)) == expected
@@ -254,7 +255,8 @@ def test_splitmix64_equals_plain_python_for_any_start():
         assert [number % 2**64 for number in numbers] == list(islice(splitmix64_in_python(start % 2**64), 40))
 
 
-def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence():
+@pytest.mark.parametrize("add_noise", [add_noise, by_parts])
+def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence(add_noise):
     images = torch.zeros(2, 1, 9, 9, dtype=torch.uint8)
     words = draw(torch.tensor(9), torch.tensor([4, 5]), torch.tensor([6, 7]), STREAM_NOISE)
     expected = []
@@ -269,7 +271,8 @@ def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence()
     assert noise.flatten(1).tolist() == expected
 
 
-def test_noise_of_many_rows_is_that_of_each_part_of_them():
+@pytest.mark.parametrize("add_noise", [add_noise, by_parts])
+def test_noise_of_many_rows_is_that_of_each_part_of_them(add_noise):
     n = 2 * _NOISE_ROWS + 3
     images = torch.zeros(n, 1, 4, 4, dtype=torch.uint8)
     arguments = (torch.arange(n) * 7**20, torch.arange(n) % 256)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from test_switches import SWITCHED, VECTORS
 from torch import Tensor
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, native, rollout
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, library, native, rollout
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.lifelong import collect, make_env
 from ctgraph_rl.policies import RandomPolicy
@@ -30,6 +28,14 @@ from ctgraph_rl.switch import AtRandom, ByEpisode
 
 WIDE = replace(surjective(70, 1, 0.2), goal_change=(1, 2))
 DEEP = replace(surjective(2, 40), goal_change=(1, 1), step_reward=-0.0)
+
+
+@pytest.fixture(autouse=True)
+def tensors_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the kernel is compared with has no C code in it."""
+    monkeypatch.setattr(library, "takes", lambda *tensors: False)
+
+
 KINDS = FAMILIES | {
     "switched": list(SWITCHED),
     "vectors": list(VECTORS),
@@ -263,65 +269,10 @@ def test_data_are_not_changed_by_later_steps():
     assert (step == kept).all() and same(held, tuple(state))
 
 
-@pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty cache, and the kernel not yet loaded."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for made in (native._library, native._is_native):
-        made.cache_clear()
-    yield tmp_path / "ctgraph_rl"
-    for made in (native._library, native._is_native):
-        made.cache_clear()
-
-
-def test_the_kernel_is_compiled_once_into_a_folder_that_is_the_users_alone(own_cache, monkeypatch):
-    native._library()
-    (made,) = own_cache.iterdir()
-    native._library.cache_clear()
-    monkeypatch.setattr(native, "_compile", None)
-
-    native._library()
-
-    assert made.suffix == ".so" and own_cache.stat().st_mode & 0o777 == 0o700
-
-
-def test_without_a_compiler_all_else_works(own_cache, monkeypatch):
-    monkeypatch.setenv("CC", "no-such-compiler")
-
-    Rows([surjective()]).reset()
-    with pytest.raises(ValueError, match="needs a C compiler, 'no-such-compiler' does not run; install one"):
-        Rows([surjective()], compiled=True)
-
-
-def test_a_compiler_that_fails_is_named_with_what_it_said(own_cache, monkeypatch):
-    monkeypatch.setattr(native, "_FLAGS", ("-no-such-flag",))
-
-    with pytest.raises(ValueError, match=r"compiled=True: cc -no-such-flag .* failed: .*no-such-flag"):
-        native._library()
-    assert not list(own_cache.iterdir())
-
-
-def test_a_kernel_that_others_could_have_written_is_refused(own_cache):
-    native._library()
-    own_cache.chmod(0o777)
-    native._library.cache_clear()
-
-    with pytest.raises(ValueError, match="must belong to this user and be writable by no other"):
-        native._library()
-
-
-def test_a_cache_that_cannot_be_made_is_refused(own_cache, monkeypatch):
-    own_cache.parent.joinpath("file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(own_cache.parent / "file"))
-
-    with pytest.raises(ValueError, match=r"cannot be made .* name a folder of yours"):
-        native._library()
-
-
 @pytest.mark.parametrize("missing", [None, "a compiler", "the rewards"])
-def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(own_cache, monkeypatch, missing):
+def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(monkeypatch, missing):
     if missing == "a compiler":
-        monkeypatch.setenv("CC", "no-such-compiler")
+        monkeypatch.setattr(native, "is_available", lambda: False)
     if missing == "the rewards":
         monkeypatch.setattr(native, "REWARDS", ())
     curriculum = Curriculum("one", 1, "-", (Block(confounding(2, 2, 0.5), 480),))
