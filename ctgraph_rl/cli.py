@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from difflib import get_close_matches
 from importlib import import_module
@@ -24,7 +25,20 @@ COMMANDS = {
 
 
 def main() -> None:
-    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; anything else is for `ctgraph_rl.run`."""
+    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; anything else is for `ctgraph_rl.run`.
+
+    Ends quietly where nobody reads its output any more, as in ``ctgraph-rl results | head``.
+    """
+    try:
+        _call()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
+        sys.exit(1)
+
+
+def _call() -> None:
+    """Go to what the first word names."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in COMMANDS:
         _require_ours(COMMANDS[word])

@@ -299,6 +299,8 @@ def main(
         else:
             is_file = arguments.name.endswith(".json") or Path(arguments.name).is_file()
             _describe(Curriculum.from_json(arguments.name) if is_file else load(arguments.name), arguments)
+    except BrokenPipeError:
+        raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(str(error))
 

@@ -353,6 +353,8 @@ def main() -> None:
             for pair, found in comparisons(runs, arguments.compare).items():
                 comment = "% " if arguments.format == "latex" else ""
                 print(f"\n{comment}{_sentence(*pair, found, arguments.difference)}")
+    except BrokenPipeError:
+        raise
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(str(error))
     for problem in problems:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from made_runs import write_run
 
 import curricula
 from ctgraph_rl import cli, run
@@ -125,6 +126,23 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
 
     assert code == 2
     assert f"ctgraph_rl.{command}" in err and str(tmp_path) in err
+
+
+@pytest.mark.parametrize("words", ["agents", "methods", "curricula", "curricula describe su_b1_4tasks", "results RUNS"])
+def test_a_reader_that_goes_away_ends_a_command_quietly(checkout, tmp_path, words):
+    write_run(tmp_path / "run")
+    call = [
+        sys.executable,
+        "-c",
+        "from ctgraph_rl.cli import main; main()",
+        *words.replace("RUNS", str(tmp_path)).split(),
+    ]
+    command = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=checkout)
+
+    command.stdout.close()
+
+    assert command.stderr.read() == ""
+    assert command.wait() == 1
 
 
 @pytest.mark.parametrize("words", [[], ["seed=1"], ["-m", "seed=1,2"], ["~logger"], ["+new=1"], ["--help"]])

@@ -7,12 +7,15 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from test_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
+from torch import nn
+from torch.nn.utils.rnn import PackedSequence
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
 from baselines import benchmark
 from baselines.compiled import whole_step
+from baselines.networks import distinct, packed_lstm
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.lifelong import collect
 from ctgraph_rl.stepping import in_time_order, take_step
@@ -77,7 +80,43 @@ def test_an_lstm_over_time_in_plain_tensors_equals_torchrls(small_agent, episode
     with set_recurrent_mode(True):
         expected = TensorDictSequential(*agent.trunk.module)(batch.select(*agent.trunk.in_keys))["memory"]
     assert batch["is_init"][:, 1:].any() == episodes_start
-    assert torch.equal(memory, expected)
+    torch.testing.assert_close(memory, expected, atol=1e-6, rtol=0)
+    found, others = (
+        torch.autograd.grad(values.square().mean(), list(agent.trunk.parameters())) for values in (memory, expected)
+    )
+    torch.testing.assert_close(found, others, atol=1e-6, rtol=0)
+
+
+def test_a_packed_lstm_and_its_gradients_equal_pytorchs():
+    torch.manual_seed(0)
+    lstm, sizes = nn.LSTM(3, 4).double(), torch.tensor([5, 3, 3, 1])
+    features, kinds = torch.randn(6, 3, dtype=torch.float64, requires_grad=True), torch.randint(6, (12,))
+    h, c = torch.randn(2, 1, 5, 4, dtype=torch.float64, requires_grad=True).unbind()
+
+    memory = packed_lstm(lstm, features, kinds, sizes, h, c)
+
+    expected = lstm(PackedSequence(features[kinds], sizes), (h, c))[0].data
+    wanted, by = [features, h, c, *lstm.parameters()], torch.randn_like(memory)
+    found, others = (torch.autograd.grad(values, wanted, by) for values in (memory, expected))
+    torch.testing.assert_close((memory, *found), (expected, *others), atol=1e-10, rtol=0)
+
+
+def test_frames_are_of_one_kind_where_all_their_inputs_are_the_same():
+    images, numbers = torch.tensor([[[7]], [[9]], [[7]], [[7]]]).byte(), torch.tensor([[0.5], [0.5], [0.5], [0.0]])
+
+    examples, kinds = distinct([images, numbers])
+
+    assert len(examples) == 3
+    assert kinds[0] == kinds[2]
+    assert torch.equal(images[examples][kinds], images) and torch.equal(numbers[examples][kinds], numbers)
+
+
+def test_frames_that_differ_by_less_than_rounding_are_of_different_kinds():
+    values = torch.tensor([[1e30, 0.0], [1e30, 1.0], [1e30, 0.0]])
+
+    examples, kinds = distinct([values])
+
+    assert torch.equal(values[examples][kinds], values)
 
 
 STOCK_LOSSES = {

@@ -61,7 +61,7 @@ def test_many_tasks_are_a_line_each(run_dir):
 
     rows = shown(run_dir, 90)
 
-    assert ["task", "before", "best", "after block", "at the end", "curve"] in rows
+    assert ["task", "before", "best", "best after block", "at the end", "curve"] in rows
     assert ["goal0", "0.00", "1.00", "1", "0.50", ""] in rows
     assert ["goal1", "0.00", "0.25", "1", "0.25", ""] in rows
     assert ["goal6", "0.00", "0.25", "1", "-", ""] in rows

@@ -97,7 +97,7 @@ def _task_table(
     """
     where = f"performance.csv has it after each of {len(rows) - 1} blocks"
     table = Table(title=Text(f"{Path(run_dir).name}: mean return on each task; {where}"))
-    for heading in ("task", "before", "best", "after block", "at the end", "curve"):
+    for heading in ("task", "before", "best", "best after block", "at the end", "curve"):
         table.add_column(heading, justify="left" if heading in ("task", "curve") else "right")
     for column, label in enumerate(header[2:], 2):
         values = [float(row[column]) for row in rows]
