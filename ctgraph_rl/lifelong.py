@@ -74,11 +74,13 @@ def learn_curriculum(
         The log; ``log.performance()`` is the performance matrix.
 
     Raises:
-        ValueError: before any work, if frames are not a multiple of the agent's rows.
+        ValueError: before any work, if frames are not a multiple of the agent's rows, or it reads task ids that are not
+            shown.
         FloatingPointError: if a loss or weight is not finite; names it, block and frames.
     """
     log = RunLog() if log is None else log
     check_rows(curriculum, agent.num_envs)
+    _check_ids(curriculum, agent)
     env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
     examiner = Examiner(curriculum, seed, log, device)
     if saved is None:
@@ -228,6 +230,14 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
         alike = [str(i) for i, other in enumerate(curriculum.blocks, 1) if other.num_frames == block.num_frames]
         rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike)}")
     require(*rules.values())
+
+
+def _check_ids(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
+    reads = "task_id" in getattr(agent.policy, "in_keys", ())
+    shows = curriculum.protocol.task_id == "one_hot"
+    fix = "give it a curriculum with protocol.task_id=one_hot, or make a new agent"
+    require((shows or not reads, f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show; {fix}"))
 
 
 def collect(

@@ -128,7 +128,7 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
     assert f"ctgraph_rl.{command}" in err and str(tmp_path) in err
 
 
-@pytest.mark.parametrize("words", ["agents", "methods", "curricula", "curricula describe su_b1_4tasks", "results RUNS"])
+@pytest.mark.parametrize("words", ["agents", "results RUNS"])
 def test_a_reader_that_goes_away_ends_a_command_quietly(checkout, tmp_path, words):
     write_run(tmp_path / "run")
     call = [

@@ -21,7 +21,7 @@ from baselines.methods.l2 import L2
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, evaluate, learn_curriculum
 from ctgraph_rl.checkpoints import Checkpoints
 from ctgraph_rl.run import conf_dir
-from ctgraph_rl.train import train
+from ctgraph_rl.train import new_agent, train
 from ctgraph_rl.trained import load
 
 SETTINGS = {
@@ -131,6 +131,13 @@ def learn_with(method: dict, run_dir: Path):
 
     train(told, make_worn, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
     return made[-1]
+
+
+def test_an_agent_that_reads_task_ids_is_refused_where_none_are_shown():
+    agent = new_agent(replace(LEARNED, protocol=Protocol("one_hot")), make_agent, 0)
+
+    with pytest.raises(ValueError, match=f"A2C reads task ids, which {LEARNED.name} does not show; give it"):
+        learn_curriculum(LEARNED, agent)
 
 
 def learned_again(agent, curriculum: Curriculum) -> list[dict]:
