@@ -236,8 +236,8 @@ def _check_ids(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
     reads = "task_id" in getattr(agent.policy, "in_keys", ())
     shows = curriculum.protocol.task_id == "one_hot"
-    fix = "give it a curriculum with protocol.task_id=one_hot, or make a new agent"
-    require((shows or not reads, f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show; {fix}"))
+    message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
+    require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))
 
 
 def collect(
