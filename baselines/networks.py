@@ -117,8 +117,8 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     widths = [value.shape[1] for value in flat]
     weights = torch.randn(sum(widths), generator=torch.Generator().manual_seed(0)).split(widths)
     sums = torch.stack([value.float() @ part for value, part in zip(flat, weights, strict=True)]).sum(dim=0)
-    kinds = sums.unique(return_inverse=True)[1]
-    examples = frames.new_empty(int(kinds.max()) + 1).scatter_(0, kinds, frames)
+    different, kinds = sums.unique(return_inverse=True)
+    examples = frames.new_empty(len(different)).scatter_(0, kinds, frames)
     same = examples[kinds]
     differ = any((value - value.index_select(0, same)).any() for value in flat)  # though they have the same sum
     return (frames, frames) if differ else (examples, kinds)

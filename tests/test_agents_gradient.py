@@ -72,8 +72,8 @@ def test_lstm_ppo_remembers_within_an_episode(small_agent):
     difference = (values_in_loss(agent, batch) - values_in_loss(agent, changed)).abs()[..., 0]
 
     same_episode = batch["is_init"][..., 0].cumsum(dim=1) == 1
-    assert (difference[same_episode] > 0).all()
-    assert (difference[~same_episode] == 0).all()
+    assert (difference[same_episode] > 1e-4).all()
+    assert (difference[~same_episode] < 1e-6).all()  # rounding, as other frames are computed together
 
 
 def small_batch(agent):
