@@ -112,7 +112,7 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """
     flat = [value.flatten(1) for value in inputs]
     frames = torch.arange(len(flat[0]), device=flat[0].device)
-    if frames.is_cuda:  # which would have to wait for the search
+    if not frames.is_cpu:  # a GPU would have to wait for the search
         return frames, frames
     widths = [value.shape[1] for value in flat]
     weights = torch.randn(sum(widths), generator=torch.Generator().manual_seed(0)).split(widths)
@@ -120,7 +120,7 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     different, kinds = sums.unique(return_inverse=True)
     examples = frames.new_empty(len(different)).scatter_(0, kinds, frames)
     same = examples[kinds]
-    differ = any((value - value.index_select(0, same)).any() for value in flat)  # though they have the same sum
+    differ = any((value != value.index_select(0, same)).any() for value in flat)  # though they have the same sum
     return (frames, frames) if differ else (examples, kinds)
 
 

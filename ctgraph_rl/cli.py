@@ -31,10 +31,22 @@ def main() -> None:
     """
     try:
         _call()
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except BrokenPipeError:
+        if _has_reader():
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
         sys.exit(1)
+
+
+def _has_reader() -> bool:
+    """Whether it was another pipe that broke than standard output's; an empty line there finds out."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return False
+    return True
 
 
 def _call() -> None:

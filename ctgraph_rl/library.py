@@ -33,25 +33,28 @@ def num_threads(num_rows: int, most: int) -> int:
 
 
 def takes(*tensors: Tensor) -> bool:
-    """Whether the functions below can have these tensors: real ones in this machine's memory, and a library is there.
+    """Whether the functions below can have these tensors: plain int64 or uint8 ones on the CPU, and a library is there.
 
-    ``torch.compile`` and ``torch.vmap`` trace tensors that have no memory.
+    Where something looks on, as ``torch.compile``, ``torch.vmap`` and other transforms do, it must see tensor code.
     """
     return (
         not torch.compiler.is_compiling()
-        and all(type(each) is Tensor and each.is_cpu and not _is_mapped(each) for each in tensors)
+        and not torch.jit.is_tracing()
+        and torch._C._functorch.peek_interpreter_stack() is None
+        and torch._C._len_torch_dispatch_stack() == 0
+        and all(type(each) is Tensor and each.is_cpu and each.dtype in _DTYPES for each in tensors)
         and is_available()
     )
 
 
-_is_mapped = torch._C._functorch.is_functorch_wrapped_tensor
+_DTYPES = (torch.int64, torch.uint8)
 
 
 def philox(words: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """`philox.philox` of the four words of the counter and the two of the key, int64 that broadcast."""
     shape = torch.broadcast_shapes(*(word.shape for word in words))
     given = [word.long() if word.numel() == 1 else word.long().expand(shape).contiguous() for word in words]
-    made = torch.empty(4, *shape, dtype=torch.int64)
+    made = torch.empty(4, *shape, dtype=torch.int64, device="cpu")
     count = made[0].numel()
     library().ctgraph_philox(
         (ctypes.c_void_p * 6)(*(word.data_ptr() for word in given)),
@@ -97,6 +100,13 @@ def library() -> ctypes.CDLL:
     Raises:
         ValueError: where they cannot be, saying why.
     """
+    try:
+        return _made()
+    except (OSError, RuntimeError, AttributeError) as error:
+        raise ValueError(f"compiled=True cannot make or load its kernel: {error}; use compiled=False") from error
+
+
+def _made() -> ctypes.CDLL:
     source = Path(__file__).with_name("native.c")
     compiler = shlex.split(os.environ.get("CC", "cc"))
     path = _cache_folder() / f"native-{_key(source, compiler)}.so"

@@ -234,7 +234,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
 
 def _check_ids(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
-    reads = "task_id" in getattr(agent.policy, "in_keys", ())
+    reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
     shows = curriculum.protocol.task_id == "one_hot"
     message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
     require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))

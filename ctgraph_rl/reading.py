@@ -34,7 +34,8 @@ _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
 
 def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     given = images, start, read_noise
-    return library.add_noise(*given) if library.takes(*given) else by_parts(*given)
+    fits = images.dtype == torch.uint8 and start.shape == read_noise.shape == images.shape[:1]
+    return library.add_noise(*given) if fits and library.takes(*given) else by_parts(*given)
 
 
 def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:

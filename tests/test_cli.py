@@ -128,6 +128,16 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
     assert f"ctgraph_rl.{command}" in err and str(tmp_path) in err
 
 
+def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):
+    def breaks() -> None:
+        raise BrokenPipeError("another pipe")
+
+    monkeypatch.setattr(cli, "_call", breaks)
+
+    with pytest.raises(BrokenPipeError, match="another pipe"):
+        cli.main()
+
+
 @pytest.mark.parametrize("words", ["agents", "results RUNS"])
 def test_a_reader_that_goes_away_ends_a_command_quietly(checkout, tmp_path, words):
     write_run(tmp_path / "run")

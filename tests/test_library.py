@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from oracles import confounding, surjective
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ctgraph_rl import Rows, library, philox, reading
 
@@ -118,6 +119,50 @@ def test_threads_change_no_bit_of_the_functions(threads):
 
     assert all(map(torch.equal, words, alone))
     assert torch.equal(noised, reading.by_parts(images, alone[0], counter[0] % 256))
+
+
+@pytest.mark.parametrize("break_", ["a noexec mount", "a torn file", "no home"])
+def test_whatever_keeps_the_library_from_loading_the_tensor_code_runs(own_cache, monkeypatch, break_):
+    def broken(*_: object) -> None:
+        raise {"a noexec mount": OSError, "a torn file": OSError, "no home": RuntimeError}[break_](break_)
+
+    monkeypatch.setattr(library.Path, "home" if break_ == "no home" else "exists", broken)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    counter, key = (torch.arange(3),) * 4, (torch.tensor(1),) * 2
+
+    assert all(map(torch.equal, philox.philox(counter, key), philox.by_tensors(counter, key)))
+    with pytest.raises(ValueError, match=f"compiled=True cannot make or load its kernel: {break_}; use compiled=False"):
+        library.library()
+
+
+def test_another_default_device_changes_nothing():
+    rows = Rows([confounding(2, 2, 0.5, read_noise=9)] * 3)
+    rows.reset()
+
+    with torch.device("meta"):
+        words = philox.philox((rows.tick,) * 4, (rows.seed,) * 2)
+
+    assert all(word.is_cpu for word in words)
+
+
+def test_noise_of_other_shapes_stays_with_the_tensor_code():
+    images, start = torch.zeros(3, 1, 2, 2, dtype=torch.uint8), torch.arange(3)
+
+    assert torch.equal(
+        reading.add_noise(images, start, torch.tensor([9])), reading.by_parts(images, start, torch.tensor([9] * 3))
+    )
+    with pytest.raises(RuntimeError):
+        reading.add_noise(images, torch.arange(1), torch.full((3,), 9))
+
+
+def test_what_is_traced_without_torch_compile_is_tensor_code():
+    others, key = tuple(torch.arange(3) for _ in range(3)), (torch.tensor(1), torch.tensor(2))
+
+    def words(first: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return philox.philox((first, *others), key)
+
+    for trace in (make_fx(words)(torch.arange(3)), torch.jit.trace(words, (torch.arange(3),))):
+        assert all(map(torch.equal, trace(torch.arange(5, 8)), words(torch.arange(5, 8))))
 
 
 def test_traced_tensors_stay_with_the_tensor_code():

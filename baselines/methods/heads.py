@@ -49,7 +49,7 @@ class Heads(TaskMethod):
         self.kept[self.place] = self.weights.vector()[self.inside.to(self.kept.device)]
 
     def place_of(self, task: int) -> int:
-        """Where a task's output layers are; those of one that has not begun are as the agent began with."""
+        """Where a task's output layers are; one that has not begun has those the agent began with, if there is room."""
         unseen = task not in self.begun and len(self.begun) < self.num_tasks
         return len(self.begun) if unseen else super().place_of(task)
 
