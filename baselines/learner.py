@@ -122,11 +122,12 @@ class Learner(nn.Module):
     def gradient_step(self, batch: Data) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
         batch = self.method.mixed(batch)
+        weights = self.weights  # also for the compiled step: a cached property that is not there yet cannot be traced
         usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
         if self.compiled_step is not None and usual:
             return self.compiled_step(self, batch)
         losses = self.losses(batch)
-        gradients = torch.autograd.grad(total(losses), self.weights)
+        gradients = torch.autograd.grad(total(losses), weights)
         for parameter, gradient in zip(self.live, self.method.gradients(gradients), strict=True):
             parameter.grad = gradient
         norm = nn.utils.clip_grad_norm_(self.live, self.max_grad_norm)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -128,19 +130,20 @@ class PolicyGradient(Learner):
         """Some epochs over a batch; returns mean losses, entropy and gradient norm."""
         given = self._with_advantage(batch)
         items = {key: value if self.memory else value.flatten(0, 1) for key, value in given.items()}
-        steps = []
+        steps: list[dict[str, Tensor]] = []
         for _ in range(self.num_epochs):
-            for rows in self._minibatches(items["action"]):
-                steps.append(self.gradient_step({key: value.index_select(0, rows) for key, value in items.items()}))
+            steps += map(self.gradient_step, self._minibatches(items))
         return self.measured(steps)
 
     def reward(self, batch: TensorDictBase) -> Tensor:
         """What is maximised, float32 [num_envs, num_steps, 1]: the environment's reward."""
         return batch["next", "reward"]
 
-    def _minibatches(self, items: Tensor) -> tuple[Tensor, ...]:
-        """Item numbers of each minibatch of one pass."""
-        return torch.randperm(len(items)).to(items.device).chunk(self.num_minibatches)
+    def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
+        """The minibatches of one pass."""
+        order = torch.randperm(len(items["action"])).to(items["action"].device)
+        shuffled = [value.index_select(0, order).chunk(self.num_minibatches) for value in items.values()]
+        return (dict(zip(items, parts, strict=True)) for parts in zip(*shuffled, strict=True))
 
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:

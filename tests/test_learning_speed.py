@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -190,6 +192,21 @@ def test_a_compiled_agent_learns_the_same_but_for_rounding(small_agent, name):
         torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-3)
     agents[1].load_state_dict(saved_and_loaded(agents[0].state_dict()))
     assert parameters_equal(*agents)
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_an_agent_that_goes_on_from_a_saved_state_begins_with_a_compiled_step(small_agent, monkeypatch, name):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    agent, other = (small_agent(name, [ct_su_b1()], "agent.compile=true") for _ in range(2))
+    first, second = batches(agent, ct_su_b1(), 2)
+    agent.learn(first)
+    other.load_state_dict(saved_and_loaded(agent.state_dict()))
+
+    for one in (agent, other):
+        torch.manual_seed(1)
+        one.learn(second)
+
+    assert parameters_equal(agent, other)
 
 
 @pytest.mark.slow
