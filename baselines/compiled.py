@@ -26,12 +26,13 @@ Step = Callable[["Learner", Data], dict[str, Tensor]]
 def compiled_step() -> Step:
     """`whole_step`, compiled for one agent and one size of minibatches.
 
-    Each call gives code of its own, as the number of compilations of one is limited.
+    Each call gives code of its own, as the number of compilations of one is limited. Between its operations are no
+    checks of sizes and, on machines without a GPU, no Python.
     """
     torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
     code = whole_step.__code__.replace()
-    step = FunctionType(code, whole_step.__globals__)
-    return torch.compile(step, fullgraph=True, dynamic=False, options={"size_asserts": False})  # of each buffer
+    options: dict[str, Any] = {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
+    return torch.compile(FunctionType(code, whole_step.__globals__), fullgraph=True, dynamic=False, options=options)
 
 
 def whole_step(learner: Learner, batch: Data) -> dict[str, Tensor]:

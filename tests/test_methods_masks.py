@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from typing import Any
 
@@ -22,6 +23,7 @@ from baselines.methods.masks import Masks
 from baselines.methods.packnet import FREE, PackNet
 from baselines.methods.scratch import Scratch
 from baselines.methods.wearing import Wearing
+from baselines.methods.weights import flat
 from ctgraph_rl import Block
 
 MASKS = (MaskRI, MaskLC, MaskBLC)
@@ -150,13 +152,18 @@ def test_the_network_is_of_signed_constants_and_zero_biases(compose, agent):
             assert before.ndim == 1 or 0 < kept.sum() < kept.numel()
 
 
+def vector(parts: Iterable[Tensor]) -> Tensor:
+    """The values of all weight tensors, [P]."""
+    return flat(list(parts)).detach()
+
+
 def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_inputs(compose):
     method = MaskRI()
     worn = wearing(compose, "ppo", method, TASKS, "agent.hidden_size=64")
 
     worn.start_task(0)
 
-    for parameter, scores in zip(method.weights.parameters, method.weights.split(method.own.detach()), strict=True):
+    for parameter, scores in zip(method.weights.parameters, method.own, strict=True):
         if parameter.ndim == 1:
             assert not scores.any()
             continue
@@ -173,7 +180,7 @@ def test_each_new_task_s_own_scores_are_drawn_anew(compose, method):
     own = []
     for number in range(2):
         worn.start_task(number)
-        own.append(worn.agent.method.own.detach().clone())
+        own.append(vector(worn.agent.method.own))
         worn.end_task()
 
     assert (own[0] != own[1])[worn.agent.method.weights.in_matrices].float().mean() > 0.99
@@ -183,17 +190,18 @@ def test_the_gradient_goes_straight_through_the_mask_to_all_scores():
     worn, minibatch = masked(MaskRI), seen(6)
     worn.start_task(0)
     method = worn.agent.method
-    before, weights = method.own.detach().clone(), method.weights.vector().detach()
+    before, weights = vector(method.own), method.weights.vector().detach()
 
     worn.agent.gradient_step(minibatch)
 
     # dL/dW_kj = mean_n f_nk x_nj whatever the weights are; dL/ds = c dL/dw, and biases have c = 0.
     of_weight = (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
     expected = before[:6] - RATE * method.constant[:6] * of_weight
-    torch.testing.assert_close(method.own[:6].detach(), expected)
+    own = vector(method.own)
+    torch.testing.assert_close(own[:6], expected)
     assert (weights[:6] == 0).any() and (weights[:6] != 0).any()
-    assert not method.own[6:].any() and not method.constant[6:].any()
-    assert torch.equal(method.weights.vector(), torch.where(method.own >= 0, method.constant, 0.0))
+    assert not own[6:].any() and not method.constant[6:].any()
+    assert torch.equal(method.weights.vector(), torch.where(own >= 0, method.constant, 0.0))
 
 
 SHARES = {MaskLC: [[1.0], [0.5] * 2, [1 / 3] * 3], MaskBLC: [[1.0], [0.5, 0.5], [0.25, 0.25, 0.5]]}
@@ -207,7 +215,7 @@ def test_a_linear_combination_begins_with_its_shares(compose, method):
 
     for number in range(3):
         worn.start_task(number)
-        present, own = its.present_scores().detach(), its.own.detach()
+        present, own = vector(its.present_scores()), vector(its.own)
         expected = sum(
             share * scores for share, scores in zip(SHARES[method][number], [*its.scores[:number], own], strict=True)
         )
@@ -225,13 +233,13 @@ def test_a_step_moves_the_combination_of_each_weight_tensor_by_its_own_shares(me
         worn.agent.gradient_step(minibatch)
         worn.end_task()
     worn.start_task(2)
-    shares, own, old = torch.tensor(SHARES[method][2]), its.own.detach().clone(), its.scores[:2].clone()
+    shares, own, old = torch.tensor(SHARES[method][2]), vector(its.own), its.scores[:2].clone()
     betas = its.betas.detach().clone()
 
     worn.agent.gradient_step(minibatch)
 
     of_scores = its.constant[:6] * (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
-    torch.testing.assert_close(its.own[:6].detach(), own[:6] - RATE * shares[2] * of_scores)
+    torch.testing.assert_close(vector(its.own)[:6], own[:6] - RATE * shares[2] * of_scores)
     # d/d b_i of sum_k softmax(b)_k s_k is a_i (s_i - sum_k a_k s_k).
     terms = torch.stack([*old, own])[:, :6]
     of_betas = shares * ((terms - shares @ terms) @ of_scores)
@@ -248,13 +256,13 @@ def test_the_combination_is_consolidated_at_the_tasks_end(compose, method):
     worn.start_task(1)
     for batch in batches(worn, TWO, 2):
         worn.learn(batch)
-    combined, weights = its.present_scores().detach().clone(), weights_for(worn, 1)
-    assert not torch.equal(combined, its.own)
+    combined, weights = vector(its.present_scores()), weights_for(worn, 1)
+    assert not torch.equal(combined, vector(its.own))
 
     worn.end_task()
 
     assert torch.equal(its.scores[1], combined)
-    assert torch.equal(its.present_scores(), combined)
+    assert torch.equal(vector(its.present_scores()), combined)
     assert same(weights_for(worn, 1), weights)
 
 
@@ -287,7 +295,9 @@ def test_the_optimiser_starts_anew_with_each_task(compose, method):
 
     assert not worn.agent.optimiser.state
     live = worn.agent.live
-    assert live[0] is worn.agent.method.own and len(live) == (1 if method is MaskRI else 2)
+    its = worn.agent.method
+    expected = [*its.own] if method is MaskRI else [*its.own, its.betas]
+    assert all(one is other for one, other in zip(live, expected, strict=True))
     assert worn.agent.optimiser.defaults == small(compose, "ppo").optimiser.defaults
 
 

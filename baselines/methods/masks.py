@@ -32,7 +32,7 @@ class Masks(TaskMethod):
 
     constant: Tensor  # c, float32 [P]
     scores: Tensor  # of tasks that have ended, in the order of their beginning; float32 [tasks, P]
-    own: nn.Parameter  # the scores that are learned, float32 [P]
+    own: nn.ParameterList  # the scores that are learned, float32 [n] of each weight tensor
 
     def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`; the optimiser changes scores from now on."""
@@ -43,30 +43,30 @@ class Masks(TaskMethod):
         constant = flat([_signed_constant(parameter) for parameter in weights.parameters])
         self.register_buffer("constant", constant.detach())
         self.register_buffer("scores", torch.zeros(self.num_tasks, len(weights)))
-        self.own = nn.Parameter(self.new_scores())
+        self.own = nn.ParameterList(self.new_scores())
         agent.optimise(self.live)
         self._write()
 
     @property
     def live(self) -> list[nn.Parameter]:
         """What the optimiser changes."""
-        return [self.own]
+        return list(self.own)
 
-    def new_scores(self) -> Tensor:
-        """Random scores, float32 [P]."""
-        with torch.no_grad():
-            return flat([_drawn_scores(parameter) for parameter in self.weights.parameters])
+    @torch.no_grad()
+    def new_scores(self) -> list[Tensor]:
+        """Random scores, float32 [n] of each weight tensor."""
+        return [_drawn_scores(parameter).flatten() for parameter in self.weights.parameters]
 
-    def present_scores(self) -> Tensor:
-        """The scores that make the present mask, float32 [P], as a function of what is learned."""
-        return self.own
+    def present_scores(self) -> Sequence[Tensor]:
+        """The scores that make the present mask, float32 [n] of each weight tensor, as functions of what is learned."""
+        return list(self.own)
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
         """Begin with a new task's scores, or go back to those of a task that was here before."""
         super().start_task(task)
         if self.place < self.ended:
-            self.own.copy_(self.scores[self.place])
+            self.go_on_from(self.weights.split(self.scores[self.place]))
         else:
             self.begin()
         self.agent.optimise(self.live)
@@ -75,20 +75,28 @@ class Masks(TaskMethod):
 
     def begin(self) -> None:
         """Draw a new task's scores."""
-        self.own.copy_(self.new_scores())
+        self.go_on_from(self.new_scores())
+
+    def go_on_from(self, scores: Sequence[Tensor]) -> None:
+        """Give what is learned the values of scores."""
+        for own, value in zip(self.own, scores, strict=True):
+            own.copy_(value)
 
     @torch.no_grad()
     def end_task(self) -> None:
         """Keep the task's scores."""
-        self.scores[self.place] = self.present_scores()
-        self.own.copy_(self.scores[self.place])
+        present = self.present_scores()
+        self.scores[self.place] = flat(present)
+        self.go_on_from(present)
         self.ended = max(self.ended, self.place + 1)
 
     def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
         """Those of what is learned, through the scores."""
         with torch.enable_grad():
             scores = self.present_scores()
-        return torch.autograd.grad(scores, self.live, self.constant * flat(gradients), materialize_grads=True)
+        constants = self.weights.split(self.constant)
+        of_scores = [constant * gradient.flatten() for constant, gradient in zip(constants, gradients, strict=True)]
+        return torch.autograd.grad(scores, self.live, of_scores, materialize_grads=True)
 
     def settle(self) -> None:
         """Give the network the weights that count now."""
@@ -98,14 +106,11 @@ class Masks(TaskMethod):
     def weights_of(self, task: int) -> Tensor | None:
         """The weights that count in a task."""
         place = self.place_of(task)
-        return None if not self.begun or place == self.place else self._masked(self.scores[place])
+        return None if not self.begun or place == self.place else _masked(self.scores[place], self.constant)
 
     @torch.no_grad()
     def _write(self) -> None:
-        self.weights.write(self._masked(self.present_scores()))
-
-    def _masked(self, scores: Tensor) -> Tensor:
-        return torch.where(scores >= 0, self.constant, 0.0)
+        self.weights.write_parts(list(map(_masked, self.present_scores(), self.weights.split(self.constant))))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Who has which place, and how many have ended."""
@@ -135,7 +140,7 @@ class CombinedMasks(Masks):
     @property
     def live(self) -> list[nn.Parameter]:
         """The new scores, and the weights of the combination where there is one."""
-        return [self.own, self.betas]
+        return [*self.own, self.betas]
 
     @property
     def num_combined(self) -> int:
@@ -152,13 +157,17 @@ class CombinedMasks(Masks):
         self.betas.zero_()
         self.betas[:, : self.place + 1] = self.new_betas(self.place)
 
-    def present_scores(self) -> Tensor:
+    def present_scores(self) -> Sequence[Tensor]:
         """The combination."""
         earlier = self.num_combined
         if not earlier:
-            return self.own
-        old, new = self.weights.split(self.scores[:earlier]), self.weights.split(self.own)
-        return torch.cat(list(map(_combined, self.betas[:, : earlier + 1], old, new)))
+            return super().present_scores()
+        old = self.weights.split(self.scores[:earlier])
+        return list(map(_combined, self.betas[:, : earlier + 1], old, self.own))
+
+
+def _masked(scores: Tensor, constant: Tensor) -> Tensor:
+    return torch.where(scores >= 0, constant, 0.0)
 
 
 def _combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:

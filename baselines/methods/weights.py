@@ -39,7 +39,12 @@ class Weights:
     @torch.no_grad()
     def write(self, vector: Tensor) -> None:
         """Give the parameters the values of a vector, [P]."""
-        for parameter, part in zip(self.parameters, self.split(vector), strict=True):
+        self.write_parts(self.split(vector))
+
+    @torch.no_grad()
+    def write_parts(self, parts: Sequence[Tensor]) -> None:
+        """Give each parameter the values of a vector, [n] each."""
+        for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.copy_(part.view_as(parameter))
 
     def split(self, vector: Tensor) -> Sequence[Tensor]:
