@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from test_agents import batches
+from test_agents import batches, saved_and_loaded
 from test_lifelong import ONE, TWO
-from test_methods import TASKS, small, stay, wearing
+from test_methods import TASKS, small, stay, wearing, weights_for
+from test_methods_masks import same
 from test_resume import THREE, of
 from torch import Tensor
 
@@ -310,6 +311,27 @@ def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(co
     eager, whole = two_tasks(compose, name), two_tasks(compose, name, whole=True)
 
     check_close(whole, eager)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPILED)
+def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monkeypatch, name):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    whole, resumed = (wearing(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
+    torch.manual_seed(1)
+    stay(whole, 0)
+    whole.start_task(1)
+    first, second = batches(whole, TWO, 2)
+    whole.learn(first)
+    resumed.load_state_dict(saved_and_loaded(whole.state_dict()))
+
+    for worn in (whole, resumed):
+        torch.manual_seed(2)
+        worn.learn(second)
+        worn.end_task()
+
+    for number in range(2):
+        assert same(weights_for(resumed, number), weights_for(whole, number))
 
 
 @pytest.mark.slow
