@@ -192,8 +192,13 @@ def _both(lines: Raw) -> str:
     forgotten = [
         metrics.continual_world_forgetting(run).value for run in runs
     ]  # none where all tasks are learned at once
-    at_end = mean_of([float(run.performance[-1].mean()) for run in runs])
+    at_end = mean_of(returns_at_end(lines))
     return at_end if None in forgotten else f"{at_end}; {mean_of(forgotten)}"
+
+
+def returns_at_end(lines: Raw) -> list[float]:
+    """The mean return over all tasks at the end of each run."""
+    return [float(curves(each).performance[-1].mean()) for each in groups(lines, "seed").values()]
 
 
 def draw(name: str, path: Path) -> None:
@@ -219,6 +224,31 @@ def draw(name: str, path: Path) -> None:
     axes.set_ylabel("mean return over all tasks")
     axes.set_ylim(-0.02, 1.02)
     axes.legend(fontsize=7, frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
+
+
+def draw_by_agent(path: Path) -> None:
+    """The mean over seeds of the return at the end: a panel for each curriculum, methods by agents."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    of, swept = groups(read("methods"), "curriculum", "method", "agent"), expected("methods")
+    figure, panels = pyplot.subplots(1, len(swept["curriculum"]), figsize=(7.2, 3.6), sharey=True)
+    for axes, curriculum in zip(panels, swept["curriculum"], strict=True):
+        cells = torch.full([len(swept["method"]), len(swept["agent"])], torch.nan)
+        for (row, method), (column, agent) in product(enumerate(swept["method"]), enumerate(swept["agent"])):
+            if lines := of.get((curriculum, method, agent)):
+                value = cells[row, column] = torch.tensor(returns_at_end(lines)).mean()
+                colour = "white" if value < 0.6 else "black"
+                axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+        axes.imshow(cells, vmin=0, vmax=1, cmap="viridis", aspect="auto")
+        axes.set_title(curriculum, fontsize=9)
+        axes.set_xticks(range(len(swept["agent"])), swept["agent"], fontsize=7, rotation=30)
+        axes.set_yticks(range(len(swept["method"])), swept["method"], fontsize=7)
     figure.tight_layout()
     figure.savefig(path, dpi=150)
     pyplot.close(figure)

@@ -206,6 +206,7 @@ def main() -> None:
     for name in comparison.MASKS:
         if read(name):
             comparison.draw(name, HERE / f"{name}.png")
+    comparison.draw_by_agent(HERE / "methods.png")
 
 
 if __name__ == "__main__":
