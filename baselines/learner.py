@@ -112,6 +112,10 @@ class Learner(nn.Module):
             for value in self.optimiser.state.get(parameter, {}).values():
                 value.zero_()
 
+    def draw_weights(self) -> None:
+        """Draw all weights anew, in the way in which the agent began."""
+        self.policy.apply(_draw)
+
     def weights_changed(self) -> None:
         """Called where the weights were changed other than by learning; nothing else depends on them."""
 
@@ -156,6 +160,12 @@ class Learner(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave."""
         self.optimiser.load_state_dict(state["optimiser"])
+
+
+def _draw(module: nn.Module) -> None:
+    """Draw the weights of a layer, as PyTorch does at its construction."""
+    if isinstance(module, (nn.Linear, nn.LSTM)):
+        module.reset_parameters()
 
 
 def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:

@@ -89,9 +89,8 @@ class PolicyGradient(Learner):
         self.features = "memory" if self.memory else "features"
         self.actor = actor(self.features, hidden_size, action_spec)
         self.critic = critic(self.features, hidden_size)
-        if orthogonal_init:
-            make_orthogonal(self.trunk)
-            make_orthogonal(nn.ModuleList([self.actor, self.critic]), 0.001)
+        self.orthogonal_init = orthogonal_init
+        self._make_orthogonal()
         state = [("next", key) for key in STATE_KEYS if self.memory]
         self.policy = ActorCritic(self.trunk, self.actor, self.critic, selected_out_keys=[*ACTED_KEYS, *state])
         self.optimiser = make_optimiser(optimiser, self.parameters(), learning_rate)
@@ -111,6 +110,16 @@ class PolicyGradient(Learner):
     def initial_state(self, num_envs: int) -> TensorDict:
         """Zeros for the LSTM's state; empty without memory."""
         return zero_state(self.trunk, num_envs) if self.memory else super().initial_state(num_envs)
+
+    def draw_weights(self) -> None:
+        """See `Learner`."""
+        super().draw_weights()
+        self._make_orthogonal()
+
+    def _make_orthogonal(self) -> None:
+        if self.orthogonal_init:
+            make_orthogonal(self.trunk)
+            make_orthogonal(nn.ModuleList([self.actor, self.critic]), 0.001)
 
     def judged(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
         """What the present networks say of data: log-probabilities of all actions and of those taken, and values.

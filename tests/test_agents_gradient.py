@@ -129,9 +129,14 @@ def test_reinforce_weighs_log_probabilities_by_the_return_less_the_baseline(smal
     torch.testing.assert_close(losses["loss_actor"], expected)
 
 
-def test_an_orthogonal_start_has_small_heads_and_no_biases(build_agent):
+@pytest.mark.parametrize("again", [False, True])
+def test_an_orthogonal_start_has_small_heads_and_no_biases(build_agent, again):
     agent = build_agent("ppo_published", [ct_su_b1()])
+    before = agent.trunk.module.linear.weight.clone()
+    if again:
+        agent.draw_weights()
 
+    assert torch.equal(agent.trunk.module.linear.weight, before) is not again
     trunk = [layer for layer in agent.trunk.modules() if isinstance(layer, nn.Linear)]
     heads = [agent.actor.module[0].module, agent.critic.module]
     assert len(trunk) == 3

@@ -267,6 +267,8 @@ def test_the_samples_of_a_task_are_stored_until_its_end(compose):
 
     # 32 frames, the last minibatch: observation, action, chance, advantage, target.
     assert nbytes(method.get_extra_state()) == 32 * (5 + 8 + 3 * 4)
+    held = [value for minibatch in method.samples.minibatches for value in minibatch.values()]
+    assert all(value.untyped_storage().nbytes() == value.nbytes for value in held)
 
 
 # Compiled steps

@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from ctgraph_rl import metrics
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "results"
 
@@ -48,7 +51,7 @@ def test_numbers_of_a_run_are_those_by_hand(comparison):
     run = lines((0, 0, 1, 1), (1, 10, 0.5, 0), (1, 20, 1, 0.25), (2, 30, 0.5, 0.5), (2, 40, 0, 1))
     experts = lines((0, 0, 0, 0), (1, 10, 1, 0), (1, 20, 1, 0.5))
 
-    found = comparison.scores(run, experts)
+    found = {**comparison.scores(run), **comparison.transfer(run, comparison.expert_areas([experts]))}
 
     assert found == pytest.approx(
         {
@@ -56,10 +59,25 @@ def test_numbers_of_a_run_are_those_by_hand(comparison):
             "forgetting": 0.5,  # task 1 falls from 1 to 0, task 2 stays: over both tasks
             "TPOT": 0.5 + 1.25 + 1.0 + 1.0,
             "tasks learned": 2,
+            "known at the end": 1,
             "gain over experts": ((0.75 - 1) + (0.75 - 0.25)) / 2,
             "forward transfer": 0.5 / 0.75,  # the first expert leaves nothing to gain
         }
     )
+
+
+def test_the_mean_forward_transfer_is_continual_worlds(comparison):
+    """A ratio of means over seeds, whose experts need not be as many."""
+    runs = [lines((1, 10, a, 0), (1, 20, 1, 0), (2, 30, 0, b), (2, 40, 0, 1)) for a, b in ((0.5, 0), (0, 0.25), (1, 1))]
+    experts = [lines((1, 10, 0.5, 0.25), (1, 20, 0.75, 1)), lines((1, 10, 0, 0.5), (1, 20, 1, 0))]
+    alone = comparison.expert_areas(experts)
+
+    found = [comparison.transfer(run, alone)["forward transfer"] for run in runs]
+
+    areas = torch.stack([metrics.stage_areas(comparison.curves(run)) for run in runs])
+    assert alone.tolist() == [(0.625 + 0.5) / 2, (0.625 + 0.25) / 2]
+    expected = metrics.continual_world_forward_transfer(areas, alone).value
+    assert sum(found) / 3 == pytest.approx(expected, abs=1e-12)
 
 
 def test_what_was_not_run_is_named_by_method_and_seed(comparison, monkeypatch):
@@ -91,6 +109,22 @@ def test_two_runs_that_cannot_be_told_apart_are_refused_and_nothing_is_written(c
         comparison.collect("x", tmp_path)
 
     assert [[line["frames"] for line in each] for each in written] == [["512"]]
+
+
+def test_two_sets_of_experts_of_a_seed_are_refused(comparison, monkeypatch, tmp_path):
+    monkeypatch.setattr(comparison, "read", lambda name: [])
+    for number, method in enumerate(("ewc", "si")):
+        own = tmp_path / "runs" / "experts" / method
+        own.mkdir(parents=True)
+        evaluated = {"n": 0, "kind": "evaluation", "block": 1, "frames": 512, "task": 1, "return_mean": float(number)}
+        about = {"n": 0, "kind": "run", "schema": 1}
+        (own / "run.jsonl").write_text(json.dumps(about) + "\n" + json.dumps(evaluated) + "\n")
+        write_run(tmp_path / "runs" / "ct8" / f"ppo-{method}-seed3-aaaa", 512)
+        with open(tmp_path / "runs" / "ct8" / f"ppo-{method}-seed3-aaaa" / "run.jsonl", "a") as file:
+            file.write(json.dumps({"n": 0, "kind": "experts", "experts": [{"task": 1, "run": f"x/{method}"}]}) + "\n")
+
+    with pytest.raises(ValueError, match="two runs of ct8 ppo expert 3"):
+        comparison.collect("x", tmp_path)
 
 
 def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(comparison, monkeypatch, tmp_path):

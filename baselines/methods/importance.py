@@ -114,7 +114,7 @@ class Samples:
             return
         self.due -= size
         self.held += size
-        self.minibatches.append(dict(minibatch))
+        self.minibatches.append({key: value.clone() for key, value in minibatch.items()})  # not a whole pass
         while self.held - (first := self.minibatches[0]["action"].numel()) >= self.num_frames:
             self.minibatches.popleft()
             self.held -= first

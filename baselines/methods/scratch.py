@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
@@ -35,7 +35,7 @@ class Scratch(TaskMethod):
         if known:
             self.weights.write(self.kept[self.place])
         elif not first:
-            self.agent.policy.apply(_draw)
+            self.agent.draw_weights()
         self.agent.forget(self.weights.parameters)
         self.agent.weights_changed()
 
@@ -47,9 +47,3 @@ class Scratch(TaskMethod):
         """The task's network."""
         place = self.place_of(task)
         return None if not self.begun or place == self.place else self.kept[place]
-
-
-def _draw(module: nn.Module) -> None:
-    """Draw the weights of a layer, as PyTorch does at its construction."""
-    if isinstance(module, (nn.Linear, nn.LSTM)):
-        module.reset_parameters()

@@ -228,7 +228,8 @@ def relative_forgetting(curves: Curves) -> Tensor:
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """How many tasks are mastered right after the last block that trains them, forgotten later or not.
 
-    The labs report this number without a formula. A task that no block trains is none.
+    Ben-Iwhiwhu et al. report such a number without a formula; a later evaluation code of the labs (AMSC, 2026) counts
+    tasks that are at 0.9 at the very end. A task that no block trains is none.
 
     Args:
         curves: the evaluations of a run.

@@ -39,13 +39,14 @@ def collect(name: str, folder: Path) -> None:
     """Add what the finished runs under a folder say to the raw results, in place of what these had of the same runs.
 
     Raises:
-        ValueError: for two runs of one cell, which differ in what is not in the raw results, and another curriculum.
+        ValueError: for two runs of one cell or two sets of experts of one seed, which differ in what is not in the raw
+            results, and another curriculum.
     """
     kept, found = groups(read(name), *CELL), {}
     for run_dir in sorted(path.parent for path in folder.rglob("metrics.json")):
         for cell, lines in groups(evaluations(run_dir), *CELL).items():
             before = found.get(cell, lines)
-            if before != lines and cell[2] != EXPERT:
+            if before != lines:
                 raise ValueError(f"{folder} has two runs of {' '.join(cell)}: collect from a folder with one of them")
             if cell in kept and kept[cell][0]["fingerprint"] != lines[0]["fingerprint"]:
                 raise ValueError(f"{run_dir} learned another curriculum than {name}.csv has of {' '.join(cell)}")
@@ -93,8 +94,8 @@ def curves(lines: Raw) -> Curves:
     return Curves(values, blocks, frames, tuple((task,) for task in range(len(tasks))))
 
 
-def scores(lines: Raw, experts: Raw) -> dict[str, float | None]:
-    """The numbers of the table for one run; None where there is none."""
+def scores(lines: Raw) -> dict[str, float | None]:
+    """The numbers of the table that a run has without experts; None where there is none."""
     run = curves(lines)
     found = {
         "average performance": metrics.continual_world_performance(run),
@@ -103,15 +104,34 @@ def scores(lines: Raw, experts: Raw) -> dict[str, float | None]:
         "tasks learned": metrics.tasks_learned(run, SOLVED),
     }
     values = {name: metric.value for name, metric in found.items()}
-    if experts:
-        alone = torch.stack([metrics.mean_area(curve) for curve in curves(experts).performance.T])
-        gain, left = metrics.stage_areas(run) - alone, 1 - alone
-        values["gain over experts"] = float(gain.mean())
-        values["forward transfer"] = float((gain / left)[left >= SMALLEST_HEADROOM].mean())
-    return values
+    return {**values, "known at the end": float((run.performance[-1] >= SOLVED).sum())}
 
 
-COLUMNS = ("average performance", "forward transfer", "gain over experts", "forgetting", "TPOT", "tasks learned")
+def expert_areas(experts: Iterable[Raw]) -> torch.Tensor:
+    """float64 [tasks]: the areas under the curves of the experts, mean over their seeds."""
+    alone = [[metrics.mean_area(curve) for curve in curves(each).performance.T] for each in experts]
+    return torch.tensor(alone, dtype=torch.float64).mean(0)
+
+
+def transfer(lines: Raw, alone: torch.Tensor) -> dict[str, float]:
+    """What a run gains over the areas of the experts, [tasks]: Continual World's forward transfer, and the plain gain.
+
+    The mean of the former over seeds is Continual World's number, of the tasks whose experts leave something to gain.
+    """
+    gain, room = metrics.stage_areas(curves(lines)) - alone, 1 - alone
+    some = room >= SMALLEST_HEADROOM
+    return {"forward transfer": float((gain / room)[some].mean()), "gain over experts": float(gain.mean())}
+
+
+COLUMNS = (
+    "average performance",
+    "forward transfer",
+    "gain over experts",
+    "forgetting",
+    "TPOT",
+    "tasks learned",
+    "known at the end",
+)
 
 
 def summary(name: str) -> str:
@@ -119,12 +139,16 @@ def summary(name: str) -> str:
     of = groups(read(name), "method", "seed")
     if not of:
         return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
-    rows = []
+    experts = [lines for (who, _), lines in of.items() if who == EXPERT]
+    alone, rows = expert_areas(experts), []
     for method in dict.fromkeys(expected(name)["method"]):
-        found = [scores(lines, of.get((EXPERT, seed), [])) for (who, seed), lines in of.items() if who == method]
+        found = [{**scores(lines), **transfer(lines, alone)} for (who, _), lines in of.items() if who == method]
         values = [mean_of([each.get(column) for each in found]) for column in COLUMNS]
         rows.append([f"`{method}`", str(len(found)), *values])
-    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{missing(name)}"
+    perfect = [str(task) for task, area in enumerate(alone.tolist(), 1) if 1 - area < SMALLEST_HEADROOM]
+    left_out = f"task {', '.join(perfect)}, whose experts are perfect from the start" if perfect else "none"
+    said = f"Experts: {len(experts)} seeds of each. Left out of forward transfer: {left_out}."
+    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said} {missing(name)}"
 
 
 def learned(name: str) -> str:
@@ -182,7 +206,15 @@ def by_agent(curriculum: str) -> str:
     of, swept = groups(lines, "method", "agent"), expected("methods")
     agents = [agent for agent in swept["agent"] if any(who == agent for _, who in of)]
     rows = [[f"`{method}`", *(_both(of.get((method, agent), [])) for agent in agents)] for method in swept["method"]]
-    return table([curriculum, *agents], rows) if agents else f"Nothing was run yet of {curriculum}."
+    heads = [f"{agent}, {seeds_of(lines, agent)}" for agent in agents]
+    return table([curriculum, *heads], rows) if agents else f"Nothing was run yet of {curriculum}."
+
+
+def seeds_of(lines: Raw, agent: str) -> str:
+    """How many seeds the cells of an agent have, such as ``n = 2 to 3``."""
+    cells = groups([line for line in lines if line["agent"] == agent], "curriculum", "method").values()
+    counts = sorted({len(groups(cell, "seed")) for cell in cells})
+    return f"n = {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))}"
 
 
 def _both(lines: Raw) -> str:
@@ -236,7 +268,8 @@ def draw_by_agent(path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    of, swept = groups(read("methods"), "curriculum", "method", "agent"), expected("methods")
+    raw, swept = read("methods"), expected("methods")
+    of = groups(raw, "curriculum", "method", "agent")
     figure, panels = pyplot.subplots(1, len(swept["curriculum"]), figsize=(7.2, 3.6), sharey=True)
     for axes, curriculum in zip(panels, swept["curriculum"], strict=True):
         cells = torch.full([len(swept["method"]), len(swept["agent"])], torch.nan)
@@ -247,7 +280,8 @@ def draw_by_agent(path: Path) -> None:
                 axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
         axes.imshow(cells, vmin=0, vmax=1, cmap="viridis", aspect="auto")
         axes.set_title(curriculum, fontsize=9)
-        axes.set_xticks(range(len(swept["agent"])), swept["agent"], fontsize=7, rotation=30)
+        labels = [f"{agent}\n{seeds_of(raw, agent)}" for agent in swept["agent"]]
+        axes.set_xticks(range(len(labels)), labels, fontsize=6)
         axes.set_yticks(range(len(swept["method"])), swept["method"], fontsize=7)
     figure.tight_layout()
     figure.savefig(path, dpi=150)
