@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from importlib import import_module
 from pkgutil import iter_modules
@@ -23,6 +24,7 @@ def agents() -> Iterator[tuple[str, type[Learner]]]:
 
 def main() -> None:
     """Print a line for every agent."""
+    argparse.ArgumentParser(prog="ctgraph-rl agents", description=main.__doc__).parse_args()
     print("agent=NAME   memory  can solve in principle")
     for name, kind in agents():
         print(f"{name:<12} {'yes' if kind.memory else 'no':<7} {kind.solves}")

@@ -28,12 +28,14 @@ class ProgressBar:
         self.console = Console(stderr=True) if console is None else console
         self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._live = self.console.is_terminal
-        self._task = self._bar.add_task("evaluating before training", total=num_frames)
+        self._task = self._bar.add_task(self.beginning, completed=done, total=num_frames)
         self._start = self._last_line = time.perf_counter()
 
     def __enter__(self) -> ProgressBar:
         if self._live:
             self._bar.start()
+        elif self.done:
+            self.console.print(self.beginning, highlight=False, soft_wrap=True)
         return self
 
     def __exit__(
@@ -41,6 +43,11 @@ class ProgressBar:
     ) -> None:
         if self._live:
             self._bar.stop()
+
+    @property
+    def beginning(self) -> str:
+        """What is said before the first batch."""
+        return f"goes on after {_short(self.done)} frames" if self.done else "evaluating before training"
 
     def update(self, block: int, frames: int, episode_return: float) -> None:
         """See `ctgraph_rl.lifelong.Progress`."""

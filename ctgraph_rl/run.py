@@ -15,7 +15,7 @@ import re
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -104,10 +105,29 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
+def check_one_cell() -> None:
+    """Refuse to run one cell in place of a sweep.
+
+    Raises:
+        ValueError: without ``-m``, for what a sweeper should do.
+    """
+    if in_sweep():
+        return
+    chosen = HydraConfig.get()
+    given = {setting.partition("=")[0] for setting in chosen.overrides.task}
+    swept = {key: value for key, value in (chosen.sweeper.get("params") or {}).items() if key not in given}
+    shown = " ".join(f"{key}={value}" for key, value in swept.items())
+    require(
+        (not swept, f"this configuration is a sweep, {shown}: add -m to run it, or give one value of each"),
+        (not chosen.sweeper.get("status"), "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+    )
+
+
 @hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     try:
+        check_one_cell()
         with redirect_stdout(io.StringIO()) if in_sweep() else nullcontext():
             run(cfg, run_dir)
     except BaseException as error:
@@ -130,6 +150,28 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
+    from ctgraph_rl.interrupt import Interrupt
+    from ctgraph_rl.report.style import require_packages
+
+    if cfg.report:
+        require_packages()
+    with locked(run_dir):
+        if is_finished(cfg, run_dir):
+            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+        else:
+            with Interrupt() as interrupt, marked_if_it_fails(run_dir):
+                check_values(cfg)
+                learn(cfg, run_dir, interrupt)
+    if cfg.report or not in_sweep():
+        show(run_dir, cfg.report)
+
+
+def check_values(cfg: DictConfig) -> None:
+    """Refuse values of the run's own keys.
+
+    Raises:
+        ValueError: for one out of range.
+    """
     require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
     cores = os.cpu_count() or 1
     threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
@@ -142,19 +184,6 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
-    from ctgraph_rl.interrupt import Interrupt
-    from ctgraph_rl.report.style import require_packages
-
-    if cfg.report:
-        require_packages()
-    with locked(run_dir):
-        if is_finished(cfg, run_dir):
-            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
-        else:
-            with Interrupt() as interrupt, marked_if_it_fails(run_dir):
-                learn(cfg, run_dir, interrupt)
-    if cfg.report or not in_sweep():
-        show(run_dir, cfg.report)
 
 
 def show(run_dir: Path, report: bool) -> None:
@@ -215,13 +244,13 @@ def config_of(run_dir: Path) -> Mapping[str, Any] | None:
 
 @contextmanager
 def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
-    """Leave the reason in ``failed.txt`` where a run that had begun ends by an error."""
+    """Leave the reason in ``failed.txt`` where a run that had begun, or a cell of a sweep, ends by an error."""
     mark = run_dir / FAILURE
     mark.unlink(missing_ok=True)
     try:
         yield
     except Exception as error:
-        if (run_dir / LOG).exists():
+        if (run_dir / LOG).exists() or in_sweep():
             with suppress(OSError):
                 mark.write_text(f"{type(error).__name__}: {explain(error)}\n", encoding="utf-8")
         raise
@@ -398,10 +427,34 @@ def _is_told(error: BaseException) -> bool:
     return isinstance(error, (ValueError, OSError)) and not isinstance(error, OmegaConfBaseException)
 
 
+def sweepable(arguments: Sequence[str]) -> list[str]:
+    """A command line in which settings of a group, such as ``agent.compile=true``, are choices of one in a sweep.
+
+    Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
+    a setting that this default lacks.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return list(arguments)
+    groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
+    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)", re.DOTALL)
+    found = [(argument, setting.fullmatch(argument)) for argument in arguments]
+    return [f"{match[1]}=choice({match[2]})" if match and _is_fixed(text) else text for text, match in found]
+
+
+def _is_fixed(setting: str) -> bool:
+    """Whether a setting of the command line can be read, and has one value."""
+    try:
+        [parsed] = OverridesParser.create().parse_overrides([setting])
+    except HydraException:  # which Hydra tells
+        return False
+    return not parsed.is_sweep_override()
+
+
 def main() -> None:
     """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
+    sys.argv[1:] = sweepable(sys.argv[1:])
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
         _job()

@@ -121,6 +121,8 @@ def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
                 found.append(read_run(log.parent))
             except (OSError, ValueError) as error:
                 problems.append(Problem(log.parent, str(error)))
+        refused = (mark.parent for mark in sorted(Path(path).rglob(FAILURE)) if not (mark.parent / LOG).exists())
+        problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused]
     runs: dict[tuple[Any, ...], Run] = {}
     for run in [run for run in found if run.group[0] != EXPERT] or found:
         twin = runs.setdefault((*run.configuration, run.seed), run)
@@ -261,10 +263,10 @@ def _number(value: float | None) -> float:
 
 
 def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]:
-    """Runs by seed, for each (curriculum, agent); None for a seed that only other agents have."""
+    """Runs by seed, for each (curriculum, agent), as `_in_order`; None for a seed that only other agents have."""
     groups: dict[tuple[Any, ...], dict[int, Run]] = {}
     expected: dict[tuple[str, str], set[int]] = {}
-    for run in runs:
+    for run in _in_order(runs):
         groups.setdefault(run.configuration, {})[run.seed] = run
         if run.agent is not None:
             expected.setdefault(run.group, set()).add(run.seed)
@@ -286,13 +288,34 @@ def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:
     return {group: name if names.count(name) == 1 else f"{name} {group[1]}" for group, name in named.items()}
 
 
+def _in_order(runs: Sequence[Run]) -> list[Run]:
+    """Runs of one curriculum and agent where the first of them is, by the settings in which they differ."""
+    alike = _alike(runs)
+    return [
+        run
+        for some in alike.values()
+        for keys in [_differing(some)]
+        for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
+    ]
+
+
+def _rank(value: Any) -> tuple[int, float, str]:
+    """Orders values of a setting: first none, then numbers by size, then others by their text."""
+    return (1, value, "") if is_real(value) else (0 if value is None else 2, 0.0, str(value))
+
+
 def _agent_names(runs: Sequence[Run]) -> list[str]:
     """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
-    alike: dict[tuple[Any, ...], list[Run]] = {}
-    for run in runs:
-        alike.setdefault((run.group, _name(run)), []).append(run)
-    differing = {key: _differing(some) for key, some in alike.items()}
+    differing = {key: _differing(some) for key, some in _alike(runs).items()}
     return [_named(run, differing[run.group, _name(run)]) for run in runs]
+
+
+def _alike(runs: Iterable[Run]) -> dict[tuple[Any, ...], list[Run]]:
+    """Runs by curriculum and name of the agent."""
+    found: dict[tuple[Any, ...], list[Run]] = {}
+    for run in runs:
+        found.setdefault((run.group, _name(run)), []).append(run)
+    return found
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:

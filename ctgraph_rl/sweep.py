@@ -22,7 +22,7 @@ from ctgraph_rl.files import FAILURE, LOCK, LOG, METRICS
 DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
 
 SHOWN = 20
-"""Cells that a report names."""
+"""Cells that the report at a sweep's end names."""
 
 SECONDS_BETWEEN_LINES = 60.0
 """Where no terminal shows one line that changes."""
@@ -79,21 +79,22 @@ def lock_holder(folder: Path) -> str | None:
     return holder or "another process"
 
 
-def report(standings: Mapping[str, Standing], repeated: int = 0) -> str:
-    """How many cells stand where, and the first of those that are not done with their reasons.
+def report(standings: Mapping[str, Standing], repeated: int = 0, most: int | None = SHOWN) -> str:
+    """How many cells stand where, and those that are not done with their reasons.
 
     Args:
         standings: each cell by its settings.
         repeated: cells that are left out, as they are there twice.
+        most: cells that are named; None: all.
     """
     counts = Counter(found.state for found in standings.values())
     numbers = ", ".join(f"{counts[state]} {state}" for state in (DONE, FAILED, IN_USE, MISSING))
     twice = f" ({repeated} more are the same as others)" if repeated else ""
     lines = [f"sweep of {len(standings)} cells{twice}: {numbers}"]
     left = [(name, found) for name, found in standings.items() if found.state != DONE]
-    lines += [f"  {state:<7}  {name}  {' '.join(reason.split())}" for name, (state, reason) in left[:SHOWN]]
-    if len(left) > SHOWN:
-        lines.append(f"  and {len(left) - SHOWN} more")
+    lines += [f"  {state:<7}  {name}  {' '.join(reason.split())}" for name, (state, reason) in left[:most]]
+    if most is not None and len(left) > most:
+        lines.append(f"  and {len(left) - most} more")
     if left:
         lines.append("the same command runs what is not done; with hydra.sweeper.status=true it only says what that is")
     return "\n".join(lines)

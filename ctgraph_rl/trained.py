@@ -125,7 +125,7 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     name = str(settings.get("_target_"))
     ours = OURS[part].fullmatch(name)
     if ours is None:
-        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=)")
+        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=), in Python")
     kind: Any = getattr(import_module(ours[1]), ours[2], None) if find_spec(ours[1]) is not None else None
     defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == ours[1]
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))

@@ -26,7 +26,8 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys):
+def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["baselines"])
     main()
 
     assert capsys.readouterr().out == blocks("")[0]

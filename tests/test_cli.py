@@ -205,3 +205,14 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     assert len(blocks) >= 3
     assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".npy", ".pdf"}
     assert names["back"] == names["mine"]
+
+
+@pytest.mark.parametrize("command", ["agents", "methods"])
+@pytest.mark.parametrize(
+    ("word", "code", "said"), [("--help", 0, "usage: "), ("ewc", 2, "unrecognized arguments: ewc")]
+)
+def test_lists_take_no_arguments_but_help(call, command, word, code, said):
+    found, out, err = call(cli.main, command, word)
+
+    assert found == code
+    assert said in (out if code == 0 else err) and "ctgraph-rl " + command in out + err

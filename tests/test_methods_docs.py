@@ -34,6 +34,7 @@ def blocks(language: str) -> list[str]:
 
 
 def test_the_page_shows_the_list_of_methods_as_it_is_printed(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["baselines.methods"])
     main()
     printed = capsys.readouterr().out
     monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "methods"])

@@ -70,3 +70,15 @@ def test_on_a_terminal_the_last_state_stays_visible(frames):
 def test_an_error_passes_through_the_bar():
     with pytest.raises(KeyError), ProgressBar(1, 100, written(True)):
         raise KeyError
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_run_that_goes_on_says_so_at_once(terminal):
+    console = written(terminal)
+
+    with ProgressBar(2, 6_000, console, done=2_500):
+        pass
+
+    said = console.file.getvalue()
+    assert "goes on after 2.5k frames" in said
+    assert "evaluating before training" not in said

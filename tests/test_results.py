@@ -117,15 +117,46 @@ def test_agents_are_told_apart_by_class_and_by_the_settings_that_differ(tmp_path
     }
 
 
+def test_agents_of_one_name_are_in_the_order_of_their_settings(tmp_path):
+    for rate, heads in (
+        (10, "single"),
+        (1000, "multi"),
+        (9.5, "multi"),
+        (1000, "auto"),
+        (9.5, "single"),
+        (10, "multi"),
+    ):
+        make_run(tmp_path, 0, rate=rate, heads=heads)
+
+    agents = dict.fromkeys(row.agent for row in table(all_runs([tmp_path])))
+
+    expected = [("auto", 1000), ("multi", 9.5), ("multi", 10), ("multi", 1000), ("single", 9.5), ("single", 10)]
+    assert list(agents) == [f"PPO heads={heads} rate={rate}" for heads, rate in expected]
+
+
+def test_a_cell_that_did_not_begin_is_left_out_with_its_reason(tmp_path):
+    fine = make_run(tmp_path, 0)
+    refused = tmp_path / "refused"
+    refused.mkdir()
+    (refused / "failed.txt").write_text("ValueError: it needs\ntask ids\n")
+
+    runs, problems = find_runs([tmp_path])
+
+    assert [run.path for run in runs] == [fine]
+    assert [problem.reason for problem in problems] == [
+        f"{refused} did not begin, failed: ValueError: it needs task ids"
+    ]
+
+
 def test_agents_are_compared_seed_by_seed(tmp_path):
     for seed in range(4):
-        make_run(tmp_path, seed, (1.0, 1.0), gamma=0.9)
-        make_run(tmp_path, seed, (0.25 * seed, 1.0), gamma=0.5)
+        make_run(tmp_path, seed, (1.0, 1.0), gamma=0.5)
+        make_run(tmp_path, seed, (0.25 * seed, 1.0), gamma=0.9)
 
     (found,) = comparisons(all_runs([tmp_path]), "average_performance").items()
 
     names, comparison = found
-    assert names == ("two", "PPO gamma=0.9", "PPO gamma=0.5")
+    assert names == ("two", "PPO gamma=0.5", "PPO gamma=0.9")
     assert comparison.difference.value == (0.5 + 0.375 + 0.25 + 0.125) / 4
     assert (comparison.wins, comparison.p_value) == (4, 2 / 16)
 
@@ -296,15 +327,15 @@ def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
 
 
 def test_a_log_of_one_line_is_an_unfinished_run_beside_a_finished_one(tmp_path):
-    make_run(tmp_path, 0, gamma=0.9)
-    crashed = make_run(tmp_path, 0, gamma=0.5, finished=False) / "run.jsonl"
+    make_run(tmp_path, 0, gamma=0.5)
+    crashed = make_run(tmp_path, 0, gamma=0.9, finished=False) / "run.jsonl"
     crashed.write_text(crashed.read_text().splitlines()[0] + "\n")
 
     rows = selected(table(all_runs([tmp_path])), ["forgetting"])
 
     assert [(row.agent, row.measure, str(row.estimate)) for row in rows] == [
-        ("PPO gamma=0.9", "forgetting", "0.00 n = 1"),
-        ("PPO gamma=0.5", "every_metric", "- n = 0/1"),
+        ("PPO gamma=0.5", "forgetting", "0.00 n = 1"),
+        ("PPO gamma=0.9", "every_metric", "- n = 0/1"),
     ]
 
 

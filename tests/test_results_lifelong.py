@@ -102,11 +102,11 @@ def test_two_runs_that_cannot_be_told_apart_are_refused_and_nothing_is_written(c
     monkeypatch.setattr(comparison, "read", lambda name: [])
     monkeypatch.setattr(comparison, "write", lambda name, lines: written.append(lines))
     write_run(tmp_path / "ct8" / "ppo-ewc-seed3-aaaa", 512)
-    comparison.collect("x", tmp_path)
+    comparison.collect("masks_ct8", tmp_path)
     write_run(tmp_path / "ct8" / "ppo-ewc-seed3-bbbb", 1024)
 
     with pytest.raises(ValueError, match="two runs of ct8 ppo ewc 3"):
-        comparison.collect("x", tmp_path)
+        comparison.collect("masks_ct8", tmp_path)
 
     assert [[line["frames"] for line in each] for each in written] == [["512"]]
 
@@ -124,7 +124,7 @@ def test_two_sets_of_experts_of_a_seed_are_refused(comparison, monkeypatch, tmp_
             file.write(json.dumps({"n": 0, "kind": "experts", "experts": [{"task": 1, "run": f"x/{method}"}]}) + "\n")
 
     with pytest.raises(ValueError, match="two runs of ct8 ppo expert 3"):
-        comparison.collect("x", tmp_path)
+        comparison.collect("masks_ct8", tmp_path)
 
 
 def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(comparison, monkeypatch, tmp_path):
@@ -132,5 +132,18 @@ def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(comp
     monkeypatch.setattr(comparison, "read", lambda name: [there])
     write_run(tmp_path / "ct8" / "ppo-seed3-aaaa", 512)
 
-    with pytest.raises(ValueError, match=r"learned another curriculum than x\.csv has of ct8 ppo finetune 3"):
-        comparison.collect("x", tmp_path)
+    with pytest.raises(ValueError, match=r"learned another curriculum than masks_ct8\.csv has of ct8 ppo finetune 3"):
+        comparison.collect("masks_ct8", tmp_path)
+
+
+def test_runs_of_another_experiment_are_refused(comparison, monkeypatch, tmp_path):
+    written = []
+    monkeypatch.setattr(comparison, "write", lambda name, lines: written.append(lines))
+    write_run(tmp_path / "ct8" / "ppo-seed3-aaaa", 512)
+
+    with pytest.raises(ValueError, match="learned ct8, and masks_ct12 is of ct12"):
+        comparison.collect("masks_ct12", tmp_path)
+    with pytest.raises(ValueError, match="and methods is of fo_b1_4tasks, fo_b1_4images, fo_b1_depth2to5"):
+        comparison.collect("methods", tmp_path)
+
+    assert written == []

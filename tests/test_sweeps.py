@@ -90,7 +90,12 @@ def test_a_failing_cell_stops_no_other_and_is_tried_again(learned, monkeypatch, 
         "  failed   seed=-1  ValueError: seed must be an integer in [0, 2**63), got -1",
     ]
     assert lines[3].startswith("the same command runs what is not done")
-    assert not list(Path("runs").rglob("*seed-1*"))
+    (refused,) = Path("runs").rglob("*-seed_1-*")
+    (mark,) = refused.iterdir()
+    assert (mark.name, mark.read_text()) == (
+        "failed.txt",
+        "ValueError: seed must be an integer in [0, 2**63), got -1\n",
+    )
 
 
 def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, capsys):
@@ -106,6 +111,65 @@ def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, ca
         f"  failed   seed={UNLUCKY}  FloatingPointError: the loss is NaN",
         "  missing  seed=14  not begun",
     ]
+
+
+def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monkeypatch, capsys):
+    said = [sweep(monkeypatch, "seed=range(-30,0)", f"hydra.sweeper.status={status}") for status in ("true", "false")]
+
+    lines = capsys.readouterr().out.splitlines()
+    assert said == [1, 1]
+    assert [sum(line.startswith(f"  {state}") for line in lines) for state in ("missing", "failed")] == [30, SHOWN]
+
+
+@pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
+def test_a_setting_that_all_choices_of_a_swept_group_have_is_one_of_all_cells(whole, learned, monkeypatch, tmp_path):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    own = "# @package _global_\nhydra:\n  sweeper:\n    params: {method: 'ewc,l2'}\n"
+    (tmp_path / "mine" / "experiment" / "own.yaml").write_text(own)
+
+    code = sweep(monkeypatch, "--config-dir", str(tmp_path / "mine"), "method.coeff=2.5", *whole.split(), "seed=0")
+
+    coeffs = [json.loads((path / "run.jsonl").read_text())["config"]["method"]["coeff"] for path in learned]
+    assert (code, coeffs) == (0, [3, 3] if "3" in whole else [2.5, 2.5])
+
+
+def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anything_runs(learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, "method=ewc,finetune", "method.coeff=2.5")
+
+    assert (code, learned) == (1, [])
+    assert "method.coeff" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["experiment=masks_ct8"],
+            ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(5): add -m",
+        ),
+        (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(5): add -m"),
+        (["hydra.sweeper.status=true"], "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+    ],
+)
+def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, capsys):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *settings])
+
+    with pytest.raises(SystemExit):
+        run_module.main()
+
+    assert message in capsys.readouterr().err
+    assert learned == [] and not list(Path().rglob("run.jsonl"))
+
+
+def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", "seed=3"])
+    monkeypatch.setattr(run_module, "show", lambda *_: None)
+
+    run_module.main()
+
+    assert [path.name.split("-")[:3] for path in learned] == [["ppo_published", "ewc", "seed3"]]
 
 
 def test_a_cell_that_another_process_runs_is_left_to_it(learned, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +28,7 @@ def methods() -> Iterator[tuple[str, type[Method], str, str]]:
 
 def main() -> None:
     """Print a line for every method."""
+    argparse.ArgumentParser(prog="ctgraph-rl methods", description=main.__doc__).parse_args()
     print("method=NAME  needs ids    boundaries  what it is")
     for name, kind, ids, words in methods():
         print(f"{name:<12} {ids:<12} {'yes' if kind.needs_boundaries else 'no':<11} {words}")

@@ -45,7 +45,7 @@ def collect(name: str, folder: Path) -> None:
         ValueError: for two runs of one cell or two sets of experts of one seed, which differ in what is not in the raw
             results, and another curriculum.
     """
-    kept, found = groups(read(name), *CELL), {}
+    kept, found, own = groups(read(name), *CELL), {}, curricula_of(name)
     for run_dir in sorted(path.parent for path in folder.rglob("metrics.json")):
         for cell, lines in groups(evaluations(run_dir), *CELL).items():
             before = found.get(cell, lines)
@@ -53,6 +53,8 @@ def collect(name: str, folder: Path) -> None:
                 raise ValueError(f"{folder} has two runs of {' '.join(cell)}: collect from a folder with one of them")
             if cell in kept and kept[cell][0]["fingerprint"] != lines[0]["fingerprint"]:
                 raise ValueError(f"{run_dir} learned another curriculum than {name}.csv has of {' '.join(cell)}")
+            if cell[0] not in own:
+                raise ValueError(f"{run_dir} learned {cell[0]}, and {name} is of {', '.join(own)}")
             found[cell] = lines
     ordered = [line for _, lines in sorted({**kept, **found}.items()) for line in lines]
     width = max(sum(key.isdigit() for key in line) for line in ordered)
@@ -177,6 +179,13 @@ def expected(name: str) -> dict[str, list[str]]:
     """What an experiment sweeps."""
     params = OmegaConf.load(CONF / f"{name}.yaml").hydra.sweeper.params
     return {key: _choices(str(value)) for key, value in params.items()}
+
+
+def curricula_of(name: str) -> list[str]:
+    """The curricula of an experiment: those that it sweeps, or the one that it chooses."""
+    defaults = OmegaConf.load(CONF / f"{name}.yaml").get("defaults", [])
+    chosen = [str(each[key]) for each in defaults for key in each if key == "override /curriculum"]
+    return expected(name).get("curriculum", chosen)
 
 
 def _choices(text: str) -> list[str]:

@@ -17,6 +17,9 @@ from raw import HERE, Raw, groups, mean_of, read, table, write
 
 PAGE = HERE.parent / "results.md"
 LIFELONG = HERE.parent / "lifelong.md"
+AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
+"""Tables of agents that each learned one task."""
+
 EPISODES = 1000
 SEED = 2023
 """Of the episodes, the same for all agents."""
@@ -190,7 +193,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     collecting = commands.add_parser("collect", help="raw results from runs")
-    collecting.add_argument("name", help="of the table, such as baselines_b1")
+    names = ("main_job", *AGENTS, *comparison.EXPERIMENTS)
+    collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()
     if options.command == "collect":
@@ -198,7 +202,10 @@ def main() -> None:
             "main_job": lambda name, runs: collect_main_job(runs),
             **dict.fromkeys(comparison.EXPERIMENTS, comparison.collect),
         }
-        of.get(options.name, collect)(options.name, options.runs)
+        try:
+            of.get(options.name, collect)(options.name, options.runs)
+        except (OSError, ValueError) as error:
+            parser.error(str(error))
         return
     PAGE.write_text(page(), encoding="utf-8")
     draw(HERE / "baselines_b1.png")

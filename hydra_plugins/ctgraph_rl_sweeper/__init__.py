@@ -60,7 +60,7 @@ class CellSweeper(BasicSweeper):
         Raises:
             SystemExit: with code 1 if some are not done.
         """
-        from ctgraph_rl.sweep import DONE, SweepProgress, report, standing
+        from ctgraph_rl.sweep import DONE, SHOWN, SweepProgress, report, standing
 
         assert self.config is not None
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
@@ -76,7 +76,8 @@ class CellSweeper(BasicSweeper):
         finally:
             found = {folder: standing(folder, since, errors.get(folder)) for folder in cells}
             names = shortened(list(cells.values()))
-            print(report(dict(zip(names, found.values(), strict=True)), len(batch) - len(cells)))
+            standings = dict(zip(names, found.values(), strict=True))
+            print(report(standings, len(batch) - len(cells), None if self.status else SHOWN))
         if any(state != DONE for state, _ in found.values()):
             sys.exit(1)
 
