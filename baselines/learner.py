@@ -83,6 +83,10 @@ class Learner(nn.Module):
         """Learn from a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
+    def num_learnt(self, batch: TensorDictBase) -> int:
+        """Frames of a batch that one pass learns from."""
+        return batch.numel()
+
     def outputs(self, data: Data) -> dict[str, Tensor]:
         """What the network says of any number of steps, [..., n] each.
 
@@ -113,7 +117,7 @@ class Learner(nn.Module):
                 value.zero_()
 
     def draw_weights(self) -> None:
-        """Draw all weights anew, in the way in which the agent began."""
+        """Draw all weights anew, in the way in which the agent began; layers need ``reset_parameters``."""
         self.policy.apply(_draw)
 
     def weights_changed(self) -> None:
@@ -164,8 +168,8 @@ class Learner(nn.Module):
 
 def _draw(module: nn.Module) -> None:
     """Draw the weights of a layer, as PyTorch does at its construction."""
-    if isinstance(module, (nn.Linear, nn.LSTM)):
-        module.reset_parameters()
+    if list(module.parameters(recurse=False)):
+        module.reset_parameters()  # type: ignore[operator]
 
 
 def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:

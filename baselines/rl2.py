@@ -124,6 +124,10 @@ class RL2(PPO):
                 losses[f"success_of_{name}_episodes"] = episodes.mean().item()
         return losses
 
+    def num_learnt(self, batch: TensorDictBase) -> int:
+        """All frames but each row's last."""
+        return batch[:, :-1].numel()
+
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """All steps but the last; only the end of a trial ends the return."""

@@ -62,12 +62,14 @@ class Life(NamedTuple):
     def new(self) -> Any:
         return new_agent(self.curriculum, self.make_agent, 0)
 
-    def live(self, saved: dict[str, Any] | None = None) -> tuple[Any, list[dict[str, Any]], list[Any]]:
-        """The agent at the end, what was logged, and the states after the updates in `KEPT`."""
+    def live(
+        self, saved: dict[str, Any] | None = None, kept: tuple[int, ...] = KEPT
+    ) -> tuple[Any, list[dict[str, Any]], list[Any]]:
+        """The agent at the end, what was logged, and the states after some updates."""
         agent, log, updates, states = self.new(), RunLog(), count(1), []
 
         def keep(state: Any, at_block_end: bool) -> None:
-            if next(updates) in KEPT:
+            if next(updates) in kept:
                 states.append(saved_and_loaded(state()))
 
         torch.manual_seed(0 if saved is None else 1234)
@@ -255,6 +257,20 @@ def test_every_agent_goes_on_with_every_method_as_if_never_stopped(compose, agen
     if method != "multitask":
         assert [state["frames"] for state in states] == [112, 240]
     check_policies(its, whole, differ=method in OF_EACH_TASK)
+
+
+@pytest.mark.parametrize("method", ["ewc", "ewc_published", "mas"])
+def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_that_are_kept(compose, method):
+    its = life(compose, "lstm_ppo", method, "method.num_samples=64")
+
+    whole, _, (state,) = its.live(kept=(3,))
+    resumed, _, _ = its.live(state)
+
+    steps = [
+        part["items"]["action"].shape[1] for part in state["agent"]["agent.method._extra_state"]["samples"]["parts"]
+    ]
+    assert state["frames"] == 80 and steps == [4, 2]
+    assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
 
 
 def check_policies(its: Life, whole: Any, differ: bool) -> None:

@@ -230,6 +230,36 @@ def test_every_agents_policy_has_the_fisher_information_of_its_frames(compose, a
     torch.testing.assert_close(worn.agent.method.importance, expected)
 
 
+@pytest.mark.parametrize("method", [EWC, MAS])
+def test_steps_that_are_not_learned_from_are_not_weighed(compose, method):
+    settings = {**(EWC_SETTINGS if method is EWC else {"heads": "single"}), "num_samples": 5}
+    worn, other = (wearing(compose, "drqn", method(coeff=1, **settings)) for _ in range(2))
+    batch = batches(worn, ONE, 1)[0][:2]
+    first = {key: batch[key] for key in [*worn.policy.in_keys, "action"]}
+    steps = torch.arange(batch.shape[1])
+    masked = {**first, "learnt": torch.stack([steps < 3, steps < 2])}
+    for each, minibatch in ((worn, masked), (other, {key: value[:, :3] for key, value in first.items()})):
+        each.start_task(0)
+        each.agent.method.mixed(minibatch)
+    other.agent.method.samples.minibatches[0]["learnt"] = torch.tensor([[True, True, True], [True, True, False]])
+
+    worn.end_task()
+    other.end_task()
+
+    assert worn.agent.method.importance.any()
+    torch.testing.assert_close(worn.agent.method.importance, other.agent.method.importance)
+
+
+def test_a_first_pass_of_rl2_has_no_last_steps(compose):
+    worn = wearing(compose, "rl2", MAS(coeff=1, num_samples=1000, heads="single"), TASKS, "agent.num_epochs=2")
+    (batch,) = batches(worn, ONE, 1)
+
+    worn.start_task(0)
+    worn.learn(batch)
+
+    assert worn.agent.method.samples.held == batch.shape[0] * (batch.shape[1] - 1)
+
+
 # Penalties
 
 

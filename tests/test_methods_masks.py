@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from test_agents import GREEDY, batches
 from test_lifelong import ONE, TWO
 from test_methods import TASKS, small, stay, wearing, weights_for
 from test_methods_held import RATE, Tiny, seen
 from test_resume import THREE, of
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.methods.mask_blc import MaskBLC
@@ -27,6 +28,7 @@ from baselines.methods.weights import flat
 from ctgraph_rl import Block
 
 MASKS = (MaskRI, MaskLC, MaskBLC)
+CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
 KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {"PackNet": lambda: PackNet(retrain=0.5)}
 
 every_mask = pytest.mark.parametrize("method", MASKS)
@@ -48,7 +50,55 @@ def same(one: Any, other: Any) -> bool:
 def masked(method: type[Masks]) -> Wearing:
     """A `Tiny` agent with masks."""
     torch.manual_seed(0)
-    return Wearing(Tiny(), method(), of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries"))
+    return Wearing(Tiny(), method(), CURRICULUM)
+
+
+class Normed(Tiny):
+    """Its outputs go through a layer whose weights are a vector."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy = TensorDictModule(nn.Sequential(self.linear, nn.LayerNorm(3)), ["observation"], ["logits"])
+        self.optimiser = torch.optim.SGD(self.parameters(), RATE)
+
+
+class Scaled(nn.Module):
+    """A layer of a kind of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(3))
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.scale * values
+
+
+@every_mask
+def test_weights_that_are_no_matrix_are_refused(method):
+    with pytest.raises(ValueError, match=r"weight matrices, and module\.1\.weight are none"):
+        Wearing(Normed(), method(), CURRICULUM)
+
+
+def test_networks_from_scratch_have_all_kinds_of_layers_drawn_anew():
+    worn = Wearing(Normed(), Scratch(), CURRICULUM)
+    norm = worn.agent.policy.module[1]
+    worn.start_task(0)
+    with torch.no_grad():
+        norm.weight.fill_(2.0)
+    worn.end_task()
+
+    worn.start_task(1)
+
+    assert norm.weight.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_a_layer_that_cannot_be_drawn_anew_is_refused_where_that_is_needed():
+    agent = Normed()
+    agent.policy = TensorDictModule(nn.Sequential(agent.linear, Scaled()), ["observation"], ["logits"])
+    agent.optimiser = torch.optim.SGD(agent.policy.parameters(), RATE)
+
+    with pytest.raises(ValueError, match=r"by reset_parameters, which module\.1 lack: add it"):
+        Wearing(agent, Scratch(), CURRICULUM)
 
 
 # What holds for all of them

@@ -316,9 +316,9 @@ def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(co
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMPILED)
-def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monkeypatch, name):
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+@pytest.mark.parametrize(("name", "backend"), [*((name, "eager") for name in COMPILED), ("mask_lc", "inductor")])
+def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monkeypatch, name, backend):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
     whole, resumed = (wearing(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
     torch.manual_seed(1)
     stay(whole, 0)

@@ -95,8 +95,9 @@ class CLEAR(Method):
         steps = agent.num_steps if agent.memory else 1
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
         require((self.buffer_size >= steps, message))
-        size = self.buffer_size * math.prod(curriculum.tasks[0].images.shape)
-        require_memory(f"replayed observations of buffer_size={self.buffer_size} steps", size, "steps")
+        state = sum(each.nbytes for each in agent.initial_state(1).values())
+        size = math.prod(curriculum.tasks[0].images.shape) + state
+        require_memory(f"replay of buffer_size={self.buffer_size} steps", self.buffer_size * size, "steps")
         self.reservoir = Reservoir(self.buffer_size // steps)
 
     @torch.no_grad()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from baselines.compiled import total
 from baselines.learner import one_of, true_or_false
-from baselines.methods.importance import SampledImportance
+from baselines.methods.importance import SampledImportance, of_learnt
 from baselines.methods.weights import flat
 from baselines.networks import Data
 from ctgraph_rl.checks import fraction, require
@@ -60,8 +60,7 @@ class EWC(SampledImportance):
         self.anchor.copy_(weights)
 
     def _of_policy(self, item: Data) -> Iterator[Tensor]:
-        log_probs = self.agent.outputs(item)["log_probs"].flatten(0, -2)
-        for of_step in log_probs:
+        for of_step in of_learnt(self.agent.outputs(item)["log_probs"], item):
             for log_prob in of_step:
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -92,6 +93,16 @@ class Importance(Method):
         return None if self.heads is None else self.heads.weights_of(task)
 
 
+def num_learnt(data: Data) -> int:
+    """Frames that are learned from; sequences of recurrent Q-learners have others, too."""
+    return data["action"].numel() if "learnt" not in data else int(data["learnt"].sum())
+
+
+def of_learnt(outputs: Tensor, data: Data) -> Tensor:
+    """The outputs of the steps that are learned from, [steps, n], of those of all, [..., n]."""
+    return outputs.flatten(0, -2) if "learnt" not in data else outputs[data["learnt"]]
+
+
 class Samples:
     """The last minibatches that were learned from, of at least so many frames in all; each batch's first pass alone.
 
@@ -109,13 +120,13 @@ class Samples:
 
     def add(self, minibatch: Data) -> None:
         """Take a minibatch in, and drop those that are not needed any more."""
-        size = minibatch["action"].numel()
+        size = num_learnt(minibatch)
         if self.due <= 0:
             return
         self.due -= size
         self.held += size
         self.minibatches.append({key: value.clone() for key, value in minibatch.items()})  # not a whole pass
-        while self.held - (first := self.minibatches[0]["action"].numel()) >= self.num_frames:
+        while self.held - (first := num_learnt(self.minibatches[0])) >= self.num_frames:
             self.minibatches.popleft()
             self.held -= first
 
@@ -132,22 +143,27 @@ class Samples:
                 if frames >= self.num_frames:
                     return
                 item = {key: value[number : number + 1] for key, value in minibatch.items()}
-                frames += item["action"].numel()
+                frames += num_learnt(item)
                 yield item
 
     def state(self) -> dict[str, Any]:
         """Plain values for a state dict."""
-        keys = self.minibatches[0] if self.minibatches else ()
-        items = {key: torch.cat([minibatch[key] for minibatch in self.minibatches]) for key in keys}
-        return {"sizes": [len(minibatch["action"]) for minibatch in self.minibatches], "items": items}
+        alike = groupby(self.minibatches, lambda minibatch: minibatch["action"].shape[1:])  # steps of a sequence
+        return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
     def restore(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Go back to what `state` gave."""
         self.clear()
-        parts = {key: value.to(device).split(state["sizes"]) for key, value in state["items"].items()}
-        for number in range(len(state["sizes"])):
-            self.minibatches.append({key: part[number] for key, part in parts.items()})
-            self.held += self.minibatches[-1]["action"].numel()
+        for part in state["parts"]:
+            split = {key: value.to(device).split(part["sizes"]) for key, value in part["items"].items()}
+            self.minibatches += [dict(zip(split, values, strict=True)) for values in zip(*split.values(), strict=True)]
+        self.held = sum(map(num_learnt, self.minibatches))
+
+
+def _joined(minibatches: Sequence[dict[Any, Tensor]]) -> dict[str, Any]:
+    """Minibatches of items of one shape as one, with their sizes."""
+    items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
+    return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
 
 
 class SampledImportance(Importance):
@@ -166,7 +182,7 @@ class SampledImportance(Importance):
 
     def see(self, batch: TensorDictBase) -> None:
         """So many frames are to be kept."""
-        self.samples.due = batch.numel()
+        self.samples.due = self.agent.num_learnt(batch)
 
     def mixed(self, batch: Data) -> Data:
         """The minibatch itself, which is kept for the end of the task."""
@@ -184,7 +200,7 @@ class SampledImportance(Importance):
         for item in self.samples.items():
             for term in terms(item):
                 total += term
-            frames += item["action"].numel()
+            frames += num_learnt(item)
         return total / max(frames, 1)
 
     def gradient(self, value: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from baselines.methods.importance import SampledImportance
+from baselines.methods.importance import SampledImportance, of_learnt
 from baselines.networks import Data
 
 
@@ -27,6 +27,6 @@ class MAS(SampledImportance):
 
     def _sensitivity(self, item: Data) -> Iterator[Tensor]:
         outputs = self.agent.outputs(item)
-        shown = torch.cat([outputs[key] for key in self.agent.output_keys], dim=-1).flatten(0, -2)
-        for of_step in shown:
+        shown = torch.cat([outputs[key] for key in self.agent.output_keys], dim=-1)
+        for of_step in of_learnt(shown, item):
             yield self.gradient(of_step.square().sum()).abs()

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights, flat
+from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
 
 if TYPE_CHECKING:
@@ -37,6 +38,9 @@ class Masks(TaskMethod):
     def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`; the optimiser changes scores from now on."""
         super().put_on(agent, weights, curriculum)
+        named = zip(weights.names, weights.parameters, strict=True)
+        vectors = [name for name, each in named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
+        require((not vectors, f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"))
         self.ended = 0
         """Tasks whose scores are kept."""
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
+from ctgraph_rl.checks import require
 from ctgraph_rl.curriculum import Curriculum
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ class Scratch(TaskMethod):
     def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().put_on(agent, weights, curriculum)
+        layers = [(name, each) for name, each in agent.policy.named_modules() if list(each.parameters(recurse=False))]
+        fixed = [name for name, layer in layers if not hasattr(layer, "reset_parameters")]
+        require((not fixed, f"Scratch draws weights anew by reset_parameters, which {', '.join(fixed)} lack: add it"))
         self.register_buffer("kept", torch.zeros(self.num_tasks, len(weights)))
 
     def start_task(self, task: int | None) -> None:
