@@ -129,6 +129,15 @@ def test_a_nested_goal_agrees_with_its_deeper_version_in_the_whole_common_tree()
     assert torch.equal(state_agreement(tasks), torch.ones(5, 5, dtype=torch.float64))
 
 
+def test_goals_of_ct8_multi_depth_agree_where_one_policy_solves_all_of_them():
+    """One policy per group, though depths differ: what docs/lifelong.md explains PPO's transfer by."""
+    agree = observation_agreement(curricula.ct8_md().tasks) == 1
+
+    for group in ((0, 2, 4, 6), (0, 2, 4, 7)):  # 00, 000, 0000, then 00000 or 00001
+        assert agree[list(group)][:, list(group)].all()
+    assert not agree[[1, 3, 5, 6], [0, 2, 4, 7]].any()  # of one depth
+
+
 MIXED = [
     (surjective(2, 2, goal=(1, 2)), surjective(3, 2, goal=(1, 3))),
     (surjective(2, 3, 0.5, goal=(1, 2, 1)), replace(surjective(3, 2, goal=(2, 2)), fail_reward=-1.0)),
