@@ -114,7 +114,7 @@ def check_one_cell() -> None:
     if in_sweep():
         return
     chosen = HydraConfig.get()
-    given = {setting.partition("=")[0] for setting in chosen.overrides.task}
+    given = {setting.partition("=")[0].lstrip("+") for setting in chosen.overrides.task}
     swept = {key: value for key, value in (chosen.sweeper.get("params") or {}).items() if key not in given}
     shown = " ".join(f"{key}={value}" for key, value in swept.items())
     require(
@@ -156,11 +156,12 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     if cfg.report:
         require_packages()
     with locked(run_dir):
+        with marked_if_it_fails(run_dir) if in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
+            check_values(cfg)
         if is_finished(cfg, run_dir):
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
         else:
             with Interrupt() as interrupt, marked_if_it_fails(run_dir):
-                check_values(cfg)
                 learn(cfg, run_dir, interrupt)
     if cfg.report or not in_sweep():
         show(run_dir, cfg.report)
@@ -433,21 +434,23 @@ def sweepable(arguments: Sequence[str]) -> list[str]:
     Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
     a setting that this default lacks.
     """
-    if not {"-m", "--multirun"} & set(arguments):
+    if not any(each == "-m" or (each.startswith("--m") and "--multirun".startswith(each)) for each in arguments):
         return list(arguments)
     groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
-    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)", re.DOTALL)
-    found = [(argument, setting.fullmatch(argument)) for argument in arguments]
-    return [f"{match[1]}=choice({match[2]})" if match and _is_fixed(text) else text for text, match in found]
+    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")
+    return [_as_choice(*match.groups()) if (match := setting.fullmatch(each)) else each for each in arguments]
 
 
-def _is_fixed(setting: str) -> bool:
-    """Whether a setting of the command line can be read, and has one value."""
+def _as_choice(key: str, value: str) -> str:
+    """A setting as the choice of its one value; as it is, if it has several, or would not be read the same again."""
+    setting, choice = f"{key}={value}", f"{key}=choice({value})"
+    parse = OverridesParser.create().parse_override
     try:
-        [parsed] = OverridesParser.create().parse_overrides([setting])
-    except HydraException:  # which Hydra tells
-        return False
-    return not parsed.is_sweep_override()
+        before = parse(setting).value()
+        after = [parse(f"{key}={text}").value() for text in parse(choice).sweep_string_iterator()]
+    except HydraException:  # which Hydra tells, if the setting itself is at fault
+        return setting
+    return choice if after == [before] else setting
 
 
 def main() -> None:

@@ -112,17 +112,20 @@ def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
     Single-task experts are left out without a word where there are other runs.
     """
     found, problems = [], []
+    refused: dict[Path, Path] = {}
     for path in paths:
         logs = sorted(Path(path).rglob(LOG))
-        if not logs:
+        marks = [mark.parent for mark in sorted(Path(path).rglob(FAILURE)) if not (mark.parent / LOG).exists()]
+        for folder in marks:
+            refused.setdefault(folder.resolve(), folder)
+        if not logs and not marks:
             problems.append(Problem(Path(path), f"{path} holds no run: no run.jsonl in or below it"))
         for log in logs:
             try:
                 found.append(read_run(log.parent))
             except (OSError, ValueError) as error:
                 problems.append(Problem(log.parent, str(error)))
-        refused = (mark.parent for mark in sorted(Path(path).rglob(FAILURE)) if not (mark.parent / LOG).exists())
-        problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused]
+    problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused.values()]
     runs: dict[tuple[Any, ...], Run] = {}
     for run in [run for run in found if run.group[0] != EXPERT] or found:
         twin = runs.setdefault((*run.configuration, run.seed), run)

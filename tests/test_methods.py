@@ -14,12 +14,13 @@ from test_agents import batches, saved_and_loaded
 from test_lifelong import ONE, TWO, Scripted
 from test_resume import MINIBATCHES, REPLAY, SMALL, THREE, of
 
+from baselines.methods.importance import Samples
 from baselines.methods.method import Method
 from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, RunLog, learn_curriculum, run
 from ctgraph_rl.train import new_agent
 
-AGENTS = {"a2c": [], "dqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
+AGENTS = {"a2c": [], "dqn": REPLAY, "drqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
 
 METHODS: dict[str, tuple[str, ...]] = {
     "clear": ("method.buffer_size=48",),
@@ -271,6 +272,30 @@ def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_
     ]
     assert state["frames"] == 80 and steps == [4, 2]
     assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
+
+
+def test_a_state_of_kept_minibatches_of_one_length_is_read_as_it_once_was_saved():
+    samples, restored = Samples(8), Samples(8)
+    for size in (3, 5):
+        samples.due = 8
+        samples.add({"action": torch.rand(size, 2), "learnt": torch.rand(size, 2) < 0.5})
+    (part,) = samples.state()["parts"]
+
+    for state in (samples.state(), part):
+        restored.restore(state, torch.device("cpu"))
+        assert restored.held == samples.held
+        assert equal(restored.state(), samples.state())
+    restored.restore({"sizes": [], "items": {}}, torch.device("cpu"))
+    assert not restored.minibatches
+
+
+def test_frames_that_are_not_learned_from_do_not_count_among_the_samples():
+    samples = Samples(4)
+    for learnt in (1, 1, 3):
+        samples.add({"action": torch.arange(4), "learnt": torch.arange(4) < learnt})
+
+    assert [int(each["learnt"].sum()) for each in samples.minibatches] == [1, 3]
+    assert samples.held == 4
 
 
 def check_policies(its: Life, whole: Any, differ: bool) -> None:

@@ -162,9 +162,10 @@ def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method)
     torch.testing.assert_close(worn.agent.method.importance - before, alone.agent.method.importance)
 
 
-def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_size_of_minibatches():
+@pytest.mark.parametrize("learnt", [4, 3])
+def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_minibatches(learnt):
     worn = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
-    minibatches = [seen(4, seed=1), seen(6, seed=2)]
+    minibatches = [{**seen(4, seed=1), "learnt": torch.arange(4) < learnt}, seen(6, seed=2)]
 
     task_with(worn, 0, *minibatches)
 
@@ -173,7 +174,7 @@ def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_size_of_min
         torch.cat([(m["factor"].T @ m["observation"] / len(m["factor"])).flatten(), m["factor"].mean(dim=0)])
         for m in minibatches
     ]
-    expected = gradients[0].square() / 4 + gradients[1].square() / 6
+    expected = gradients[0].square() / learnt + gradients[1].square() / 6
     torch.testing.assert_close(worn.agent.method.importance, expected)
 
 
@@ -455,7 +456,7 @@ def test_the_target_network_gets_the_task_s_output_layers(compose):
 
 def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():
     with pytest.raises(
-        ValueError, match="Tiny has no output layers behind a trunk, so tasks cannot have their own: use heads"
+        ValueError, match="Tiny has no output layers behind a trunk, so tasks cannot have their own: take a method"
     ):
         tiny(L2(coeff=1, heads="multi"))
 

@@ -116,6 +116,20 @@ def cloning(compose, agent: str, **settings: float) -> tuple[Wearing, dict[str, 
     return worn, mixed, replayed
 
 
+def test_the_memory_that_replay_asks_for_is_that_of_its_images_and_states(compose, monkeypatch):
+    asked = []
+    monkeypatch.setattr("baselines.methods.clear.require_memory", lambda what, size, fix: asked.append((what, size)))
+
+    states = []
+    for agent in ("ppo", "lstm_ppo"):
+        worn = wearing(compose, agent, CLEAR(buffer_size=128, policy_coeff=1.0, value_coeff=1.0))
+        states.append(sum(each[0].nbytes for each in worn.agent.initial_state(3).values()))
+
+    image = batches(worn, ONE, 1)[0]["observation"][0, 0].nbytes
+    assert states[0] == 0 < states[1]
+    assert asked == [("replay of buffer_size=128 steps", 128 * (image + state)) for state in states]
+
+
 @pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
 def test_cloning_loses_nothing_right_after_storing(compose, agent):
     worn, mixed, replayed = cloning(compose, agent)

@@ -76,9 +76,10 @@ def test_an_error_passes_through_the_bar():
 def test_a_run_that_goes_on_says_so_at_once(terminal):
     console = written(terminal)
 
-    with ProgressBar(2, 6_000, console, done=2_500):
+    with ProgressBar(2, 6_000, console, done=2_500) as bar:
         pass
 
     said = console.file.getvalue()
     assert "goes on after 2.5k frames" in said
+    assert bar._bar.tasks[0].completed == 2_500
     assert "evaluating before training" not in said

@@ -118,6 +118,7 @@ def test_agents_are_told_apart_by_class_and_by_the_settings_that_differ(tmp_path
 
 
 def test_agents_of_one_name_are_in_the_order_of_their_settings(tmp_path):
+    make_run(tmp_path, 0, rate=None, heads="auto")
     for rate, heads in (
         (10, "single"),
         (1000, "multi"),
@@ -130,7 +131,15 @@ def test_agents_of_one_name_are_in_the_order_of_their_settings(tmp_path):
 
     agents = dict.fromkeys(row.agent for row in table(all_runs([tmp_path])))
 
-    expected = [("auto", 1000), ("multi", 9.5), ("multi", 10), ("multi", 1000), ("single", 9.5), ("single", 10)]
+    expected = [
+        ("auto", None),
+        ("auto", 1000),
+        ("multi", 9.5),
+        ("multi", 10),
+        ("multi", 1000),
+        ("single", 9.5),
+        ("single", 10),
+    ]
     assert list(agents) == [f"PPO heads={heads} rate={rate}" for heads, rate in expected]
 
 
@@ -146,6 +155,7 @@ def test_a_cell_that_did_not_begin_is_left_out_with_its_reason(tmp_path):
     assert [problem.reason for problem in problems] == [
         f"{refused} did not begin, failed: ValueError: it needs task ids"
     ]
+    assert find_runs([tmp_path, fine / ".." / refused.name])[1] == problems
 
 
 def test_agents_are_compared_seed_by_seed(tmp_path):

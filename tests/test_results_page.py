@@ -33,6 +33,29 @@ def test_the_page_is_what_its_raw_results_make(make):
     assert make.page() == make.PAGE.read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["baselines"], "invalid choice: 'baselines' (choose from"),
+        (["baselines_b1"], "no raw results of baselines_b1, whose file stays as it was: give the folder of its runs"),
+        (["main_job"], "no raw results of main_job, whose file stays as it was"),
+        (["masks_ct8"], "holds no finished run of masks_ct8: give the folder of its runs"),
+    ],
+)
+def test_what_cannot_be_collected_is_one_message_and_no_file_changes(
+    make, monkeypatch, capsys, tmp_path, arguments, message
+):
+    before = {path: path.read_bytes() for path in FOLDER.glob("*.csv")}
+    monkeypatch.setattr(sys, "argv", ["make.py", "collect", *arguments, str(tmp_path)])
+
+    with pytest.raises(SystemExit) as end:
+        make.main()
+
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in FOLDER.glob("*.csv")} == before
+
+
 def test_every_cell_of_the_small_configurations_has_five_seeds_that_finished(make):
     cells = make.groups(make.read("baselines_b1"), "configuration", "task", "agent")
 

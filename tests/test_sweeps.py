@@ -133,6 +133,36 @@ def test_a_setting_that_all_choices_of_a_swept_group_have_is_one_of_all_cells(wh
     assert (code, coeffs) == (0, [3, 3] if "3" in whole else [2.5, 2.5])
 
 
+@pytest.mark.parametrize("flag", ["-m", "--multi", "--multirun"])
+def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag):
+    as_they_are = [
+        "seed=3",
+        "agent.gamma=null",
+        "agent.optimiser='0.5'",
+        "agent.optimiser='true'",
+        r"agent.optimiser='it\'s (x)'",
+        "agent.num_envs=range(1,3)",
+        "agent.num_envs=1,2",
+        "agent.num_envs=[1,",
+        "other.num_envs=3",
+    ]
+
+    assert run_module.sweepable([flag, "method.coeff=2.5", "agent.layers=[8, 8]", *as_they_are]) == [
+        flag,
+        "method.coeff=choice(2.5)",
+        "agent.layers=choice([8, 8])",
+        *as_they_are,
+    ]
+    assert run_module.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
+
+
+def test_a_setting_of_a_group_can_be_swept_or_null(learned, monkeypatch):
+    code = sweep(monkeypatch, "agent.num_envs=range(1,3)", "evaluation.every=null", "seed=0")
+
+    envs = [json.loads((path / "run.jsonl").read_text())["config"]["agent"]["num_envs"] for path in learned]
+    assert (code, envs) == (0, [1, 2])
+
+
 def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anything_runs(learned, monkeypatch, capsys):
     code = sweep(monkeypatch, "method=ewc,finetune", "method.coeff=2.5")
 
@@ -162,9 +192,10 @@ def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, c
     assert learned == [] and not list(Path().rglob("run.jsonl"))
 
 
-def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch):
+@pytest.mark.parametrize("prefix", ["", "++"])
+def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch, prefix):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", "seed=3"])
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3"])
     monkeypatch.setattr(run_module, "show", lambda *_: None)
 
     run_module.main()
@@ -344,6 +375,23 @@ def test_a_failed_job_says_why_and_hydra_prints_nothing(capsys):
 
     assert why(job) == "ValueError: no"
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "setting", ["resume=foo", "checkpoint_seconds=-1", "overwrite=0", "overwrite=maybe", "report=ye", "num_threads=0"]
+)
+def test_a_bad_value_is_refused_by_a_run_that_is_finished_too(setting, learned, monkeypatch, capsys):
+    sweep(monkeypatch, "seed=0")
+    (done,) = learned
+    before = sorted(done.iterdir())
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={done}", setting])
+
+    with pytest.raises(SystemExit):
+        run_module.main()
+
+    assert f"error: {setting.partition('=')[0]} must be " in capsys.readouterr().err
+    assert sorted(done.iterdir()) == before
 
 
 def test_where_a_cell_stands_is_read_from_its_directory(tmp_path):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from baselines.compiled import total
 from baselines.learner import one_of, true_or_false
-from baselines.methods.importance import SampledImportance, of_learnt
+from baselines.methods.importance import SampledImportance, num_learnt, of_learnt
 from baselines.methods.weights import flat
 from baselines.networks import Data
 from ctgraph_rl.checks import fraction, require
@@ -69,5 +69,5 @@ class EWC(SampledImportance):
         for minibatch in self.samples.minibatches:
             loss = total(self.agent.loss(minibatch))
             gradients = torch.autograd.grad(loss, self.weights.parameters, materialize_grads=True)
-            squares += flat(gradients).square() / minibatch["action"].numel()
+            squares += flat(gradients).square() / num_learnt(minibatch)
         return squares

@@ -29,7 +29,7 @@ class Heads(TaskMethod):
         super().put_on(agent, weights, curriculum)
         self.inside = weights.in_heads
         message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
-        require((bool(self.inside.any()), f"{message}: use heads=single"))
+        require((bool(self.inside.any()), f"{message}: take a method that shares them, as some do with heads=single"))
         self.register_buffer("kept", weights.vector().detach()[self.inside].repeat(self.num_tasks, 1))
 
     @torch.no_grad()

@@ -154,7 +154,7 @@ class Samples:
     def restore(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Go back to what `state` gave."""
         self.clear()
-        for part in state["parts"]:
+        for part in state.get("parts", [state]):  # one alone, as once saved
             split = {key: value.to(device).split(part["sizes"]) for key, value in part["items"].items()}
             self.minibatches += [dict(zip(split, values, strict=True)) for values in zip(*split.values(), strict=True)]
         self.held = sum(map(num_learnt, self.minibatches))

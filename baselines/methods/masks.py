@@ -40,7 +40,8 @@ class Masks(TaskMethod):
         super().put_on(agent, weights, curriculum)
         named = zip(weights.names, weights.parameters, strict=True)
         vectors = [name for name, each in named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
-        require((not vectors, f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"))
+        rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
+        require((not vectors, f"{rule}: take another method, or a network without such layers"))
         self.ended = 0
         """Tasks whose scores are kept."""
 

@@ -28,7 +28,7 @@ class Scratch(TaskMethod):
         """See `Method`."""
         super().put_on(agent, weights, curriculum)
         layers = [(name, each) for name, each in agent.policy.named_modules() if list(each.parameters(recurse=False))]
-        fixed = [name for name, layer in layers if not hasattr(layer, "reset_parameters")]
+        fixed = [name or type(layer).__name__ for name, layer in layers if not hasattr(layer, "reset_parameters")]
         require((not fixed, f"Scratch draws weights anew by reset_parameters, which {', '.join(fixed)} lack: add it"))
         self.register_buffer("kept", torch.zeros(self.num_tasks, len(weights)))
 

@@ -43,7 +43,7 @@ def collect(name: str, folder: Path) -> None:
 
     Raises:
         ValueError: for two runs of one cell or two sets of experts of one seed, which differ in what is not in the raw
-            results, and another curriculum.
+            results, another curriculum, and a folder without finished runs.
     """
     kept, found, own = groups(read(name), *CELL), {}, curricula_of(name)
     for run_dir in sorted(path.parent for path in folder.rglob("metrics.json")):
@@ -56,6 +56,8 @@ def collect(name: str, folder: Path) -> None:
             if cell[0] not in own:
                 raise ValueError(f"{run_dir} learned {cell[0]}, and {name} is of {', '.join(own)}")
             found[cell] = lines
+    if not found:
+        raise ValueError(f"{folder} holds no finished run of {name}: give the folder of its runs")
     ordered = [line for _, lines in sorted({**kept, **found}.items()) for line in lines]
     width = max(sum(key.isdigit() for key in line) for line in ordered)
     write(name, [{**line, **{str(j): line.get(str(j), "") for j in range(1, width + 1)}} for line in ordered])

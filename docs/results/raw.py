@@ -22,7 +22,13 @@ def read(name: str) -> Raw:
 
 
 def write(name: str, lines: Sequence[dict[str, Any]]) -> None:
-    """Write the raw results of a table."""
+    """Write the raw results of a table.
+
+    Raises:
+        ValueError: where there are none, before the file is touched.
+    """
+    if not lines:
+        raise ValueError(f"no raw results of {name}, whose file stays as it was: give the folder of its runs")
     with open(HERE / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
