@@ -158,7 +158,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     with locked(run_dir):
         with marked_if_it_fails(run_dir) if in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
             check_values(cfg)
-        if is_finished(cfg, run_dir):
+            finished = is_finished(cfg, run_dir)
+        if finished:
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
         else:
             with Interrupt() as interrupt, marked_if_it_fails(run_dir):
@@ -245,13 +246,14 @@ def config_of(run_dir: Path) -> Mapping[str, Any] | None:
 
 @contextmanager
 def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
-    """Leave the reason in ``failed.txt`` where a run that had begun, or a cell of a sweep, ends by an error."""
+    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
     mark = run_dir / FAILURE
+    failed_before = mark.exists()
     mark.unlink(missing_ok=True)
     try:
         yield
     except Exception as error:
-        if (run_dir / LOG).exists() or in_sweep():
+        if failed_before or (run_dir / LOG).exists() or in_sweep():
             with suppress(OSError):
                 mark.write_text(f"{type(error).__name__}: {explain(error)}\n", encoding="utf-8")
         raise

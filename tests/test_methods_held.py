@@ -162,7 +162,7 @@ def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method)
     torch.testing.assert_close(worn.agent.method.importance - before, alone.agent.method.importance)
 
 
-@pytest.mark.parametrize("learnt", [4, 3])
+@pytest.mark.parametrize("learnt", [4, 3, 0])
 def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_minibatches(learnt):
     worn = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
     minibatches = [{**seen(4, seed=1), "learnt": torch.arange(4) < learnt}, seen(6, seed=2)]
@@ -174,7 +174,7 @@ def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_m
         torch.cat([(m["factor"].T @ m["observation"] / len(m["factor"])).flatten(), m["factor"].mean(dim=0)])
         for m in minibatches
     ]
-    expected = gradients[0].square() / learnt + gradients[1].square() / 6
+    expected = gradients[0].square() / max(learnt, 1) + gradients[1].square() / 6
     torch.testing.assert_close(worn.agent.method.importance, expected)
 
 

@@ -75,7 +75,7 @@ class Scaled(nn.Module):
 
 @every_mask
 def test_weights_that_are_no_matrix_are_refused(method):
-    with pytest.raises(ValueError, match=r"weight matrices, and module\.1\.weight are none"):
+    with pytest.raises(ValueError, match=r"weight matrices, and module\.1\.weight are none: take another"):
         Wearing(Normed(), method(), CURRICULUM)
 
 

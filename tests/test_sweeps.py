@@ -147,20 +147,33 @@ def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag
         "other.num_envs=3",
     ]
 
-    assert run_module.sweepable([flag, "method.coeff=2.5", "agent.layers=[8, 8]", *as_they_are]) == [
+    assert run_module.sweepable(
+        [flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]
+    ) == [
         flag,
         "method.coeff=choice(2.5)",
+        "method.heads=choice('multi')",
         "agent.layers=choice([8, 8])",
         *as_they_are,
     ]
     assert run_module.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
 
 
-def test_a_setting_of_a_group_can_be_swept_or_null(learned, monkeypatch):
-    code = sweep(monkeypatch, "agent.num_envs=range(1,3)", "evaluation.every=null", "seed=0")
+def configs(runs: list[Path]) -> list[dict[str, Any]]:
+    """What was run."""
+    return [json.loads((path / "run.jsonl").read_text())["config"] for path in runs]
 
-    envs = [json.loads((path / "run.jsonl").read_text())["config"]["agent"]["num_envs"] for path in learned]
-    assert (code, envs) == (0, [1, 2])
+
+def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
+    code = sweep(monkeypatch, "agent.num_envs=range(1,3)", "seed=0")
+
+    assert (code, [config["agent"]["num_envs"] for config in configs(learned)]) == (0, [1, 2])
+
+
+def test_null_is_a_setting_of_a_swept_group(learned, monkeypatch):
+    code = sweep(monkeypatch, "curriculum=ct20,ct28_mosaic_skips_d5", "++curriculum.agent=null", "seed=0")
+
+    assert (code, [config["curriculum"]["agent"] for config in configs(learned)]) == (0, [None, None])
 
 
 def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anything_runs(learned, monkeypatch, capsys):
@@ -392,6 +405,46 @@ def test_a_bad_value_is_refused_by_a_run_that_is_finished_too(setting, learned, 
 
     assert f"error: {setting.partition('=')[0]} must be " in capsys.readouterr().err
     assert sorted(done.iterdir()) == before
+
+
+def test_a_bad_value_marks_neither_a_finished_cell_nor_a_stopped_run_alone(learned, monkeypatch):
+    sweep(monkeypatch, "seed=0")
+    codes = [sweep(monkeypatch, "seed=0", "overwrite=true", "resume=foo")]
+    (cell,) = learned
+    marks = [(cell / "failed.txt").exists()]
+    (cell / "metrics.json").unlink()
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={cell}", "resume=foo"])
+    with pytest.raises(ValueError, match="resume must be"):
+        run_module.main()
+    marks.append((cell / "failed.txt").exists())
+    codes.append(sweep(monkeypatch, "seed=0", "resume=foo"))
+
+    assert codes == [1, 1] and marks == [False, False]
+    assert (cell / "failed.txt").read_text() == "ValueError: resume must be one of warn, strict, got 'foo'\n"
+
+
+def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, capsys):
+    sweep(monkeypatch, f"seed={UNLUCKY}")
+    (learned[0] / "run.jsonl").write_text("{broken\n{}\n")
+    sweep(monkeypatch, f"seed={UNLUCKY}")
+    capsys.readouterr()
+
+    sweep(monkeypatch, f"seed={UNLUCKY}", "hydra.sweeper.status=true")
+
+    assert "line 1 is no measurement" in (learned[0] / "failed.txt").read_text()
+    assert "sweep of 1 cells: 0 done, 1 failed, 0 in use, 0 missing" in capsys.readouterr().out
+
+
+def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
+    (tmp_path / "failed.txt").write_text("ValueError: before\n")
+
+    with pytest.raises(ValueError), run_module.marked_if_it_fails(tmp_path):
+        raise ValueError("again")
+    assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
+    with run_module.marked_if_it_fails(tmp_path):
+        pass
+
+    assert not (tmp_path / "failed.txt").exists()
 
 
 def test_where_a_cell_stands_is_read_from_its_directory(tmp_path):

@@ -69,5 +69,5 @@ class EWC(SampledImportance):
         for minibatch in self.samples.minibatches:
             loss = total(self.agent.loss(minibatch))
             gradients = torch.autograd.grad(loss, self.weights.parameters, materialize_grads=True)
-            squares += flat(gradients).square() / num_learnt(minibatch)
+            squares += flat(gradients).square() / max(num_learnt(minibatch), 1)
         return squares

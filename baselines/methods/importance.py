@@ -33,7 +33,8 @@ class Importance(Method):
     Args:
         coeff: weight of what is added.
         heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
-            own, which are not held; ``auto``: multi where the curriculum tells task ids, else single.
+            own, which are not held; ``auto``: multi where the curriculum tells task ids and each block has one task,
+            else single.
     """
 
     without_ids = ", or method.heads=single"
