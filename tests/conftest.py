@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
@@ -15,6 +16,7 @@ import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
+from sweeping import UNLUCKY
 
 from ctgraph_rl import run
 from ctgraph_rl.env import CTGraphEnv
@@ -86,3 +88,21 @@ def console_script(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("PATH", str(script.parent), prepend=os.pathsep)
     monkeypatch.setenv("PYTHONPATH", str(checkout))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture
+def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
+    """The cells that were run, in a folder of their own, by a learner that needs no time; it fails for one seed."""
+    cells: list[Path] = []
+
+    def learn(cfg, run_dir, interrupt):
+        cells.append(run_dir)
+        first = {"kind": "run", "config": run.plain(cfg)}
+        (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
+        if cfg.seed == UNLUCKY:
+            raise FloatingPointError("the loss is NaN")
+        (run_dir / "metrics.json").write_text("{}")
+
+    monkeypatch.setattr(run, "learn", learn)
+    monkeypatch.chdir(tmp_path)
+    return cells

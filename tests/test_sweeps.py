@@ -19,6 +19,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from rich.console import Console
+from sweeping import UNLUCKY, sweep
 
 from ctgraph_rl import run as run_module
 from ctgraph_rl.files import locked
@@ -28,41 +29,11 @@ from hydra_plugins.ctgraph_rl_sweeper import shortened, sigterm_exits, why
 
 SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
 ALL_DONE = "sweep of {0} cells: {0} done, 0 failed, 0 in use, 0 missing\n"
-UNLUCKY = 13
-
-
-@pytest.fixture
-def learned(monkeypatch, tmp_path) -> list[Path]:
-    """The cells that were run, in a folder of their own, by a learner that needs no time; it fails for one seed."""
-    cells: list[Path] = []
-
-    def learn(cfg, run_dir, interrupt):
-        cells.append(run_dir)
-        first = {"kind": "run", "config": run_module.plain(cfg)}
-        (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
-        if cfg.seed == UNLUCKY:
-            raise FloatingPointError("the loss is NaN")
-        (run_dir / "metrics.json").write_text("{}")
-
-    monkeypatch.setattr(run_module, "learn", learn)
-    monkeypatch.chdir(tmp_path)
-    return cells
 
 
 def plugin(name: str) -> Any:
     """One of Hydra's plugins as it uses it: it imports their modules a second time."""
     return Plugins.instance().class_name_to_class[name]
-
-
-def sweep(monkeypatch, *settings: str) -> int:
-    """The exit code of ``ctgraph-rl -m SETTINGS`` in this process."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "-m", *settings])
-    try:
-        run_module.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def test_a_second_start_does_only_what_is_missing(learned, monkeypatch, capsys):
@@ -119,101 +90,6 @@ def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monke
     lines = capsys.readouterr().out.splitlines()
     assert said == [1, 1]
     assert [sum(line.startswith(f"  {state}") for line in lines) for state in ("missing", "failed")] == [30, SHOWN]
-
-
-@pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
-def test_a_setting_that_all_choices_of_a_swept_group_have_is_one_of_all_cells(whole, learned, monkeypatch, tmp_path):
-    (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    own = "# @package _global_\nhydra:\n  sweeper:\n    params: {method: 'ewc,l2'}\n"
-    (tmp_path / "mine" / "experiment" / "own.yaml").write_text(own)
-
-    code = sweep(monkeypatch, "--config-dir", str(tmp_path / "mine"), "method.coeff=2.5", *whole.split(), "seed=0")
-
-    coeffs = [json.loads((path / "run.jsonl").read_text())["config"]["method"]["coeff"] for path in learned]
-    assert (code, coeffs) == (0, [3, 3] if "3" in whole else [2.5, 2.5])
-
-
-@pytest.mark.parametrize("flag", ["-m", "--multi", "--multirun"])
-def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag):
-    as_they_are = [
-        "seed=3",
-        "agent.gamma=null",
-        "agent.optimiser='0.5'",
-        "agent.optimiser='true'",
-        r"agent.optimiser='it\'s (x)'",
-        "agent.num_envs=range(1,3)",
-        "agent.num_envs=1,2",
-        "agent.num_envs=[1,",
-        "other.num_envs=3",
-    ]
-
-    assert run_module.sweepable(
-        [flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]
-    ) == [
-        flag,
-        "method.coeff=choice(2.5)",
-        "method.heads=choice('multi')",
-        "agent.layers=choice([8, 8])",
-        *as_they_are,
-    ]
-    assert run_module.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
-
-
-def configs(runs: list[Path]) -> list[dict[str, Any]]:
-    """What was run."""
-    return [json.loads((path / "run.jsonl").read_text())["config"] for path in runs]
-
-
-def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
-    code = sweep(monkeypatch, "agent.num_envs=range(1,3)", "seed=0")
-
-    assert (code, [config["agent"]["num_envs"] for config in configs(learned)]) == (0, [1, 2])
-
-
-def test_null_is_a_setting_of_a_swept_group(learned, monkeypatch):
-    code = sweep(monkeypatch, "curriculum=ct20,ct28_mosaic_skips_d5", "++curriculum.agent=null", "seed=0")
-
-    assert (code, [config["curriculum"]["agent"] for config in configs(learned)]) == (0, [None, None])
-
-
-def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anything_runs(learned, monkeypatch, capsys):
-    code = sweep(monkeypatch, "method=ewc,finetune", "method.coeff=2.5")
-
-    assert (code, learned) == (1, [])
-    assert "method.coeff" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (
-            ["experiment=masks_ct8"],
-            ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(5): add -m",
-        ),
-        (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(5): add -m"),
-        (["hydra.sweeper.status=true"], "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
-    ],
-)
-def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, capsys):
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *settings])
-
-    with pytest.raises(SystemExit):
-        run_module.main()
-
-    assert message in capsys.readouterr().err
-    assert learned == [] and not list(Path().rglob("run.jsonl"))
-
-
-@pytest.mark.parametrize("prefix", ["", "++"])
-def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch, prefix):
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3"])
-    monkeypatch.setattr(run_module, "show", lambda *_: None)
-
-    run_module.main()
-
-    assert [path.name.split("-")[:3] for path in learned] == [["ppo_published", "ewc", "seed3"]]
 
 
 def test_a_cell_that_another_process_runs_is_left_to_it(learned, monkeypatch, capsys):
@@ -388,63 +264,6 @@ def test_a_failed_job_says_why_and_hydra_prints_nothing(capsys):
 
     assert why(job) == "ValueError: no"
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(
-    "setting", ["resume=foo", "checkpoint_seconds=-1", "overwrite=0", "overwrite=maybe", "report=ye", "num_threads=0"]
-)
-def test_a_bad_value_is_refused_by_a_run_that_is_finished_too(setting, learned, monkeypatch, capsys):
-    sweep(monkeypatch, "seed=0")
-    (done,) = learned
-    before = sorted(done.iterdir())
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={done}", setting])
-
-    with pytest.raises(SystemExit):
-        run_module.main()
-
-    assert f"error: {setting.partition('=')[0]} must be " in capsys.readouterr().err
-    assert sorted(done.iterdir()) == before
-
-
-def test_a_bad_value_marks_neither_a_finished_cell_nor_a_stopped_run_alone(learned, monkeypatch):
-    sweep(monkeypatch, "seed=0")
-    codes = [sweep(monkeypatch, "seed=0", "overwrite=true", "resume=foo")]
-    (cell,) = learned
-    marks = [(cell / "failed.txt").exists()]
-    (cell / "metrics.json").unlink()
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={cell}", "resume=foo"])
-    with pytest.raises(ValueError, match="resume must be"):
-        run_module.main()
-    marks.append((cell / "failed.txt").exists())
-    codes.append(sweep(monkeypatch, "seed=0", "resume=foo"))
-
-    assert codes == [1, 1] and marks == [False, False]
-    assert (cell / "failed.txt").read_text() == "ValueError: resume must be one of warn, strict, got 'foo'\n"
-
-
-def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, capsys):
-    sweep(monkeypatch, f"seed={UNLUCKY}")
-    (learned[0] / "run.jsonl").write_text("{broken\n{}\n")
-    sweep(monkeypatch, f"seed={UNLUCKY}")
-    capsys.readouterr()
-
-    sweep(monkeypatch, f"seed={UNLUCKY}", "hydra.sweeper.status=true")
-
-    assert "line 1 is no measurement" in (learned[0] / "failed.txt").read_text()
-    assert "sweep of 1 cells: 0 done, 1 failed, 0 in use, 0 missing" in capsys.readouterr().out
-
-
-def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
-    (tmp_path / "failed.txt").write_text("ValueError: before\n")
-
-    with pytest.raises(ValueError), run_module.marked_if_it_fails(tmp_path):
-        raise ValueError("again")
-    assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
-    with run_module.marked_if_it_fails(tmp_path):
-        pass
-
-    assert not (tmp_path / "failed.txt").exists()
 
 
 def test_where_a_cell_stands_is_read_from_its_directory(tmp_path):

@@ -1,0 +1,29 @@
+"""Sweeps in the process of a test; the fixture `learned` of conftest.py learns their cells."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl import run as run_module
+
+UNLUCKY = 13
+"""A seed that fails."""
+
+
+def sweep(monkeypatch, *settings: str) -> int:
+    """The exit code of ``ctgraph-rl -m SETTINGS`` in this process."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "-m", *settings])
+    try:
+        run_module.main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def configs(runs: list[Path]) -> list[dict[str, Any]]:
+    """What was run."""
+    return [json.loads((path / "run.jsonl").read_text())["config"] for path in runs]
