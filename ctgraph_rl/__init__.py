@@ -11,69 +11,69 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ctgraph_rl import metrics as metrics
     from ctgraph_rl.agent import Agent as Agent
-    from ctgraph_rl.curriculum import Block as Block
-    from ctgraph_rl.curriculum import Curriculum as Curriculum
-    from ctgraph_rl.curriculum import Evaluation as Evaluation
-    from ctgraph_rl.curriculum import Protocol as Protocol
+    from ctgraph_rl.batch.rollout import Steps as Steps
+    from ctgraph_rl.batch.rollout import rollout as rollout
+    from ctgraph_rl.batch.rows import Rows as Rows
+    from ctgraph_rl.core.graph import CTGraph as CTGraph
+    from ctgraph_rl.core.graph import StateType as StateType
+    from ctgraph_rl.core.rewards import Gradient as Gradient
+    from ctgraph_rl.core.rewards import Needle as Needle
+    from ctgraph_rl.core.rewards import ReferenceLinear as ReferenceLinear
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
-    from ctgraph_rl.fast import Steps as Steps
-    from ctgraph_rl.fast import rollout as rollout
-    from ctgraph_rl.graph import CTGraph as CTGraph
-    from ctgraph_rl.graph import StateType as StateType
-    from ctgraph_rl.images import GroupedImages as GroupedImages
-    from ctgraph_rl.images import ImageFile as ImageFile
-    from ctgraph_rl.images import OneHot as OneHot
-    from ctgraph_rl.images import PaperImages as PaperImages
-    from ctgraph_rl.images import count_repeats as count_repeats
-    from ctgraph_rl.images import distances as distances
-    from ctgraph_rl.lifelong import evaluate as evaluate
-    from ctgraph_rl.lifelong import learn_curriculum as learn_curriculum
-    from ctgraph_rl.log import RunLog as RunLog
-    from ctgraph_rl.observations import Observations as Observations
-    from ctgraph_rl.recorder import Recorder as Recorder
-    from ctgraph_rl.reference import ReferenceImages as ReferenceImages
-    from ctgraph_rl.reference import ReferenceOneHot as ReferenceOneHot
-    from ctgraph_rl.rewards import Gradient as Gradient
-    from ctgraph_rl.rewards import Needle as Needle
-    from ctgraph_rl.rewards import ReferenceLinear as ReferenceLinear
-    from ctgraph_rl.rows import Rows as Rows
-    from ctgraph_rl.task import Task as Task
-    from ctgraph_rl.trained import Trained as Trained
-    from ctgraph_rl.trained import load as load
+    from ctgraph_rl.learn.lifelong import evaluate as evaluate
+    from ctgraph_rl.learn.lifelong import learn_curriculum as learn_curriculum
+    from ctgraph_rl.log.run_log import RunLog as RunLog
+    from ctgraph_rl.runs.load import Trained as Trained
+    from ctgraph_rl.runs.load import load as load
+    from ctgraph_rl.runs.recorder import Recorder as Recorder
+    from ctgraph_rl.tasks.curriculum import Block as Block
+    from ctgraph_rl.tasks.curriculum import Curriculum as Curriculum
+    from ctgraph_rl.tasks.curriculum import Evaluation as Evaluation
+    from ctgraph_rl.tasks.curriculum import Protocol as Protocol
+    from ctgraph_rl.tasks.images import GroupedImages as GroupedImages
+    from ctgraph_rl.tasks.images import ImageFile as ImageFile
+    from ctgraph_rl.tasks.images import OneHot as OneHot
+    from ctgraph_rl.tasks.images import PaperImages as PaperImages
+    from ctgraph_rl.tasks.images import count_repeats as count_repeats
+    from ctgraph_rl.tasks.images import distances as distances
+    from ctgraph_rl.tasks.observations import Observations as Observations
+    from ctgraph_rl.tasks.reference import ReferenceImages as ReferenceImages
+    from ctgraph_rl.tasks.reference import ReferenceOneHot as ReferenceOneHot
+    from ctgraph_rl.tasks.task import Task as Task
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Agent": "agent",
-    "Block": "curriculum",
-    "CTGraph": "graph",
+    "Block": "tasks.curriculum",
+    "CTGraph": "core.graph",
     "CTGraphEnv": "env",
-    "Curriculum": "curriculum",
-    "Evaluation": "curriculum",
-    "GroupedImages": "images",
-    "ImageFile": "images",
-    "Gradient": "rewards",
-    "Needle": "rewards",
-    "Recorder": "recorder",
-    "ReferenceImages": "reference",
-    "ReferenceLinear": "rewards",
-    "ReferenceOneHot": "reference",
-    "Observations": "observations",
-    "OneHot": "images",
-    "PaperImages": "images",
-    "Protocol": "curriculum",
-    "Rows": "rows",
-    "RunLog": "log",
-    "StateType": "graph",
-    "Steps": "fast",
-    "Task": "task",
-    "Trained": "trained",
-    "count_repeats": "images",
-    "distances": "images",
-    "evaluate": "lifelong",
-    "learn_curriculum": "lifelong",
-    "load": "trained",
-    "rollout": "fast",
+    "Curriculum": "tasks.curriculum",
+    "Evaluation": "tasks.curriculum",
+    "GroupedImages": "tasks.images",
+    "ImageFile": "tasks.images",
+    "Gradient": "core.rewards",
+    "Needle": "core.rewards",
+    "Recorder": "runs.recorder",
+    "ReferenceImages": "tasks.reference",
+    "ReferenceLinear": "core.rewards",
+    "ReferenceOneHot": "tasks.reference",
+    "Observations": "tasks.observations",
+    "OneHot": "tasks.images",
+    "PaperImages": "tasks.images",
+    "Protocol": "tasks.curriculum",
+    "Rows": "batch.rows",
+    "RunLog": "log.run_log",
+    "StateType": "core.graph",
+    "Steps": "batch.rollout",
+    "Task": "tasks.task",
+    "Trained": "runs.load",
+    "count_repeats": "tasks.images",
+    "distances": "tasks.images",
+    "evaluate": "learn.lifelong",
+    "learn_curriculum": "learn.lifelong",
+    "load": "runs.load",
+    "rollout": "batch.rollout",
 }
 
 __all__ = [*_HOMES, "metrics"]

@@ -28,13 +28,13 @@ from torchrl.collectors import Collector
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ctgraph_rl.batch.rollout import Steps, rollout
+from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.fast import Steps, rollout
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-from ctgraph_rl.paper import ct_co_b1, ct_su_b1
-from ctgraph_rl.rows import Rows
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
+from ctgraph_rl.tasks.task import Task
 
 MEMCPY, TRIVIAL, LEAN = "memcpy", "trivial environment: ", ", info=False"
 MAX_BUFFER = 2**26

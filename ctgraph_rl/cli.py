@@ -9,17 +9,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ctgraph_rl.curriculum import Curriculum
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
 COMMANDS = {
     "agents": "baselines.__main__",
     "curricula": "curricula.__main__",
-    "draw": "ctgraph_rl.pictures",
-    "export": "ctgraph_rl.export",
+    "draw": "ctgraph_rl.visualize.task_figure",
+    "export": "ctgraph_rl.log.export",
     "methods": "baselines.methods.__main__",
-    "play": "ctgraph_rl.play",
+    "play": "ctgraph_rl.visualize.play",
     "report": "ctgraph_rl.report.__main__",
-    "results": "ctgraph_rl.results",
+    "results": "ctgraph_rl.report.results",
 }
 """Commands and the modules whose ``main`` they are; each is imported when it is called."""
 

@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ctgraph_rl.batch.params import bank_bytes
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.params import bank_bytes
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.task import Task
 
 FRAMES_PER_SECOND = 18_000
 """What the LSTM-PPO agent of this package learns from on one core, roughly; for estimates of time."""
@@ -319,8 +319,8 @@ def _parser(prog: str | None) -> argparse.ArgumentParser:
 
 
 def _describe(curriculum: Curriculum, arguments: argparse.Namespace) -> None:
-    from ctgraph_rl.draw import draw_graphs
-    from ctgraph_rl.similarity import draw_similarity
+    from ctgraph_rl.tasks.similarity import draw_similarity
+    from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 
     _show(describe(curriculum, arguments.frames_per_second), arguments.format)
     if arguments.figure is not None:

@@ -11,14 +11,14 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ctgraph_rl import dynamics
+from ctgraph_rl.batch.render import render
+from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.checks import is_int, require, require_all
-from ctgraph_rl.dynamics import RowState, Shown
-from ctgraph_rl.graph import StateType
-from ctgraph_rl.render import render
-from ctgraph_rl.rows import Rows, seed_rule
-from ctgraph_rl.switch import Switch
-from ctgraph_rl.task import Task
+from ctgraph_rl.core import dynamics
+from ctgraph_rl.core.dynamics import RowState, Shown
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.tasks.switch import Switch
+from ctgraph_rl.tasks.task import Task
 
 
 class CTGraphEnv(EnvBase):

@@ -21,13 +21,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ctgraph_rl.batch.render import render
+from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
-from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.paper import CONFIGURATIONS, Json, make_task
-from ctgraph_rl.render import render
-from ctgraph_rl.rows import Rows, seed_rule
-from ctgraph_rl.task import Task
+from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
+from ctgraph_rl.tasks.task import Task
 
 Frame = NDArray[np.uint8] | str
 Array = NDArray[Any]

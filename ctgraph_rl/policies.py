@@ -11,8 +11,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.graph import WAIT_ACTION, StateType
 
 
 class RandomPolicy:

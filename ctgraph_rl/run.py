@@ -32,16 +32,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import is_int, positive, require
-from ctgraph_rl.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
+from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ctgraph_rl.checkpoints import Checkpoints
-    from ctgraph_rl.curriculum import Curriculum
-    from ctgraph_rl.experts import Expert
-    from ctgraph_rl.interrupt import Interrupt
-    from ctgraph_rl.trackers import Tracker
+    from ctgraph_rl.runs.checkpoints import Checkpoints
+    from ctgraph_rl.runs.experts import Expert
+    from ctgraph_rl.runs.interrupt import Interrupt
+    from ctgraph_rl.runs.trackers import Tracker
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
 SPECS = ("observation_spec", "action_spec", "folder")
 """Arguments that the run gives itself: to agents the environment's specs, to trackers where to write."""
@@ -150,8 +150,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
-    from ctgraph_rl.interrupt import Interrupt
     from ctgraph_rl.report.style import require_packages
+    from ctgraph_rl.runs.interrupt import Interrupt
 
     if cfg.report:
         require_packages()
@@ -210,7 +210,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     begun = None if cfg.overwrite else config_of(run_dir)
     if begun is None:
         return False
-    from ctgraph_rl.runs import flat
+    from ctgraph_rl.runs.read import flat
 
     before, now = dict(flat(begun)), dict(flat(plain(cfg)))
     changed = [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
@@ -230,8 +230,8 @@ def config_of(run_dir: Path) -> Mapping[str, Any] | None:
     Raises:
         FileExistsError: if it holds files that a run would replace, and that are of no run.
     """
-    from ctgraph_rl.log import RunLog
-    from ctgraph_rl.train import RESULTS
+    from ctgraph_rl.log.run_log import RunLog
+    from ctgraph_rl.runs.train import RESULTS
 
     there = [name for name in RESULTS if (run_dir / name).exists()]
     log = RunLog.read(run_dir / LOG) if LOG in there else RunLog()
@@ -263,9 +263,9 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     """The run itself: build, check, learn, measure, write; the experts before it, where they are asked for."""
     import torch
 
-    from ctgraph_rl.checkpoints import Checkpoints
-    from ctgraph_rl.experts import expert_curriculum
-    from ctgraph_rl.train import new_agent, remove_results, train, wearing
+    from ctgraph_rl.runs.checkpoints import Checkpoints
+    from ctgraph_rl.runs.experts import expert_curriculum
+    from ctgraph_rl.runs.train import new_agent, remove_results, train, wearing
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -305,8 +305,8 @@ def progress_console() -> Console | None:
 @contextmanager
 def tracking(cfg: DictConfig, run_dir: Path) -> Iterator[list[Tracker]]:
     """The tracker that ``logger`` names, if it does; closed at the end."""
-    from ctgraph_rl.runs import flat
-    from ctgraph_rl.trackers import FOLDER, Tracker
+    from ctgraph_rl.runs.read import flat
+    from ctgraph_rl.runs.trackers import FOLDER, Tracker
 
     if "logger" not in cfg:
         if cfg.overwrite:
@@ -319,9 +319,9 @@ def tracking(cfg: DictConfig, run_dir: Path) -> Iterator[list[Tracker]]:
 
 def train_experts(cfg: DictConfig, curriculum: Curriculum, checkpoints: Callable[[Path], Checkpoints]) -> list[Expert]:
     """The experts of a curriculum, found or trained with the run's own agent, seed and threads."""
-    from ctgraph_rl.experts import find_or_train
-    from ctgraph_rl.provenance import versions
-    from ctgraph_rl.train import train
+    from ctgraph_rl.log.provenance import versions
+    from ctgraph_rl.runs.experts import find_or_train
+    from ctgraph_rl.runs.train import train
 
     settings = {key: value for key, value in plain(cfg).items() if key in ("agent", "seed", "device", "num_threads")}
 
@@ -390,7 +390,7 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     Raises:
         ValueError: for values out of range.
     """
-    from ctgraph_rl.curriculum import Curriculum, Protocol
+    from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
 
     made = type(curriculum).__name__
     require((isinstance(curriculum, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {made}"))

@@ -14,7 +14,7 @@ from inspect import getdoc, signature
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ctgraph_rl.curriculum import Curriculum
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
 _MODULES = ("adaptation", "masks", "nested", "paper", "sharing")
 """Each has a table ``NAMED`` of its curricula by name."""

@@ -18,12 +18,12 @@ from math import prod
 from typing import Any
 
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
-from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.images import ImageSet, PaperImages
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.switch import Switch
-from ctgraph_rl.task import Task
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.images import ImageSet, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.switch import Switch
+from ctgraph_rl.tasks.task import Task
 
 Tasks = tuple[Task, ...]
 OneOrMore = Task | Iterable[Task]

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.checks import as_tuple, is_int, require
-from ctgraph_rl.curriculum import Curriculum
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift, Switch
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
+from ctgraph_rl.tasks.task import Task
 from curricula import axes
 from curricula.axes import Tasks
 from curricula.paper import KINDS, configured

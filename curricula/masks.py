@@ -8,7 +8,7 @@ x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
 from __future__ import annotations
 
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.axes import sequence
 from curricula.published import labelled, one_wait_image, pool_ids, words
 

@@ -21,9 +21,9 @@ from reprlib import repr as short
 from typing import Any
 
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.curriculum import Curriculum, Protocol
-from ctgraph_rl.reference import read_task
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
+from ctgraph_rl.tasks.reference import read_task
+from ctgraph_rl.tasks.task import Task
 from curricula.axes import MOST_TASKS, Tasks, sequence
 from curricula.published import one_id_each
 

@@ -12,13 +12,13 @@ from dataclasses import replace
 from functools import partial
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.curriculum import Curriculum
-from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.images import GroupedImages
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.paper import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, ct_su_b1
-from ctgraph_rl.rewards import Gradient
-from ctgraph_rl.task import Task
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rewards import Gradient
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, ct_su_b1
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import GroupedImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
 from curricula.axes import (
     OneOrMore,
     all_goals,

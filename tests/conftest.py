@@ -20,7 +20,7 @@ from sweeping import UNLUCKY
 
 from ctgraph_rl import run
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.task import Task
 
 SMALL_AGENT = {
     "lstm_ppo": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8"],

@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="decides the moments, as far as the machine lets it")
     arguments = parser.parse_args()
     agents = arguments.agents.split(",")
-    import ctgraph_rl.train  # noqa: F401, so that the copies have it
+    import ctgraph_rl.runs.train  # noqa: F401, so that the copies have it
 
     print(f"{'agent':12} {'kills':>6} {'starts':>6} {'runs':>6}  equal")
     counts = []

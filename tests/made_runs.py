@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctgraph_rl import RunLog, metrics
-from ctgraph_rl.log import write_metrics, write_performance
+from ctgraph_rl.log.run_log import write_metrics, write_performance
 
 LABELS = ("goal1", "goal2")
 FRAMES = 1000

@@ -10,11 +10,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.images import ImageSet, OneHot, PaperImages
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.images import ImageSet, OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl import CTGraph, Observations, OneHot, StateType, Task
-from ctgraph_rl.rewards import Arrival
+from ctgraph_rl.core.rewards import Arrival
 
 F64 = torch.float64
 

@@ -12,8 +12,8 @@ from torchrl.modules import set_recurrent_mode
 from baselines.prioritized import PrioritySampler
 from baselines.qrdqn_lstm import QRDQNLSTM
 from ctgraph_rl import CTGraphEnv, evaluate
-from ctgraph_rl.dynamics import OUTCOME_GOAL
-from ctgraph_rl.lifelong import collect
+from ctgraph_rl.core.dynamics import OUTCOME_GOAL
+from ctgraph_rl.learn.lifelong import collect
 from curricula.paper import ct_su_b1
 
 

@@ -12,7 +12,7 @@ from torchrl.envs.utils import set_exploration_type
 
 from baselines.rl2 import episodes_to_goal
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, evaluate, learn_curriculum
-from ctgraph_rl.curriculum import Evaluation
+from ctgraph_rl.tasks.curriculum import Evaluation
 from curricula.paper import ct_su_b1
 
 TWO_GOALS = replace(ONE_HOT_TASK, graph=CTGraph(2, 1), goal=(1,), goal_change=(4, 4))

@@ -19,10 +19,10 @@ from oracles import DECISION, END, FAIL, HOME, WAIT, TreeState, act, optimal, pl
 from tensordict import TensorDictBase
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, Needle, Observations, OneHot, PaperImages, ReferenceLinear, Task
-from ctgraph_rl.curriculum import Block, Curriculum, Evaluation
-from ctgraph_rl.graph import StateType
-from ctgraph_rl.images import GroupedImages
+from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.policies import OptimalPolicy
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation
+from ctgraph_rl.tasks.images import GroupedImages
 
 KINDS, NAN, INF = (WAIT, DECISION, END), math.nan, math.inf
 DEEP = [(2, 40), (3, 30), (2, 60), (4, 29)]

@@ -21,7 +21,7 @@ from probability_tables import (
 from torch import Tensor
 
 from ctgraph_rl import StateType, Task
-from ctgraph_rl.values import MAX_ENUMERATED_STATES
+from ctgraph_rl.tasks.values import MAX_ENUMERATED_STATES
 from curricula.paper import ct_su_b1
 
 

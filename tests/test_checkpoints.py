@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctgraph_rl.checkpoints import KEPT, BrokenCheckpoint, Checkpoints, decoded, encoded
+from ctgraph_rl.runs.checkpoints import KEPT, BrokenCheckpoint, Checkpoints, decoded, encoded
 
 
 def state(frames: int, size: int = 8) -> dict:
@@ -229,7 +229,7 @@ def test_a_state_that_could_not_be_read_back_is_refused_when_it_is_first_saved(t
 
 def test_they_are_saved_after_the_first_update_at_block_ends_and_when_time_has_passed(tmp_path, monkeypatch):
     now, kept = [0.0], []
-    monkeypatch.setattr("ctgraph_rl.checkpoints.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("ctgraph_rl.runs.checkpoints.time.monotonic", lambda: now[0])
     checkpoints = Checkpoints(tmp_path / "checkpoints", seconds=10)
 
     for frames, (seconds, at_block_end) in enumerate([(1, False), (5, False), (6, True), (15, False), (16, False)]):
@@ -245,7 +245,7 @@ def full(file: Path, *_) -> None:
 
 def test_a_full_disk_names_the_sizes_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     checkpoints = saved(tmp_path, 64)
-    monkeypatch.setattr("ctgraph_rl.files.os.fsync", full)
+    monkeypatch.setattr("ctgraph_rl.log.files.os.fsync", full)
 
     with pytest.raises(OSError, match=r"No space left .* cannot write 0\.0 MB to .*128\.pt, .* MB are free") as error:
         checkpoints.save(state(128))

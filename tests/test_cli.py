@@ -12,8 +12,8 @@ from made_runs import write_run
 
 import curricula
 from ctgraph_rl import cli, run
-from ctgraph_rl.curriculum import Curriculum
 from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
+from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.__main__ import main as curricula_main
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "curricula.md"
@@ -125,7 +125,7 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
     code, _, err = call(cli.main, command, str(tmp_path), *(["--out", "out"] if command == "export" else []))
 
     assert code == 2
-    assert f"ctgraph_rl.{command}" in err and str(tmp_path) in err
+    assert f"ctgraph-rl {command}" in err and str(tmp_path) in err
 
 
 def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):

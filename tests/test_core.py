@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
-from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, OneHot, ReferenceLinear, dynamics
+from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, OneHot, ReferenceLinear
+from ctgraph_rl.core import dynamics
 from ctgraph_rl.policies import OptimalPolicy
 
 EVERYTHING = replace(

@@ -13,7 +13,9 @@ from torch import Tensor
 
 import curricula
 from ctgraph_rl import describe as module
-from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.batch.params import shared_bank
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.core.tree import State, is_done, transition, tree_params
 from ctgraph_rl.describe import (
     Sheet,
     describe,
@@ -27,13 +29,11 @@ from ctgraph_rl.describe import (
     to_latex,
     to_markdown,
 )
-from ctgraph_rl.draw import draw_graphs, goals_by_graph
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.graph import StateType
-from ctgraph_rl.params import shared_bank
-from ctgraph_rl.switch import Drift
-from ctgraph_rl.task import Task
-from ctgraph_rl.tree import State, is_done, transition, tree_params
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.switch import Drift
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.curriculum_figure import draw_graphs, goals_by_graph
 
 A, B = surjective(goal=(1, 1)), surjective(goal=(1, 2))
 SHAPES = [(2, 1, 0.0), (2, 2, 0.5), (3, 2, 0.25), (2, 1, 0.9), (2, 4, 0.25), (4, 3, 0.0)]

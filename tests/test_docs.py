@@ -13,7 +13,7 @@ from reference_files import DELETED, FILES, SHIPPED_2023, TRACES, changed
 
 from ctgraph_rl import CTGraphEnv, Needle, Observations, PaperImages, Task
 from ctgraph_rl.gym import CTGraphGymEnv
-from ctgraph_rl.paper import ct_su_b1
+from ctgraph_rl.tasks.configurations import ct_su_b1
 
 TEXT = (Path(__file__).resolve().parents[1] / "docs" / "coming_from_ct_graph.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ctgraph_rl.dot import to_dot
+from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.layout import decision_to, end_of, in_digits, lay_out, parent, way_to
-from ctgraph_rl.paper import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, make_task
-from ctgraph_rl.transitions import Edge, edges, ids_at, ids_text, states
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, make_task
+from ctgraph_rl.visualize.dot import to_dot
+from ctgraph_rl.visualize.layout import decision_to, end_of, in_digits, lay_out, parent, way_to
+from ctgraph_rl.visualize.states import Edge, edges, ids_at, ids_text, states
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

@@ -5,15 +5,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ctgraph_rl.curriculum import Block, Curriculum
+from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.episode import Player
-from ctgraph_rl.gif import save_gif
-from ctgraph_rl.graph import StateType
-from ctgraph_rl.lifelong import evaluate
-from ctgraph_rl.paper import ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
+from ctgraph_rl.learn.lifelong import evaluate
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
-from ctgraph_rl.visits import visits
+from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
+from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.visualize.gif import save_gif
+from ctgraph_rl.visualize.player import Player
+from ctgraph_rl.visualize.visits import visits
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

@@ -5,11 +5,20 @@ import pytest
 import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT, node_numbers, tree_states, tree_step
 
-from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.philox import STREAM_IMAGES, STREAM_NOISE, STREAM_STEP, by_tensors, draw, philox, randint, splitmix64
-from ctgraph_rl.reading import _NOISE_ROWS, add_noise, by_parts
-from ctgraph_rl.tree import State, stays, transition
-from ctgraph_rl.tree import tree_params as make_tree
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.philox import (
+    STREAM_IMAGES,
+    STREAM_NOISE,
+    STREAM_STEP,
+    by_tensors,
+    draw,
+    philox,
+    randint,
+    splitmix64,
+)
+from ctgraph_rl.core.reading import _NOISE_ROWS, add_noise, by_parts
+from ctgraph_rl.core.tree import State, stays, transition
+from ctgraph_rl.core.tree import tree_params as make_tree
 
 SHAPES = list(product((2, 3), (1, 2, 3)))
 

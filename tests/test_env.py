@@ -28,7 +28,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv, check_env_specs
 
 from ctgraph_rl import CTGraphEnv, OneHot, PaperImages
-from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_GOAL, OUTCOME_RUNNING
+from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_GOAL, OUTCOME_RUNNING
 
 MIXED = [
     surjective(2, 1, goal=(2,)),

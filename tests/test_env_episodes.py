@@ -23,7 +23,7 @@ from oracles import (
 )
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.dynamics import NO_LEAF, OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_RUNNING
+from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END, OUTCOME_RUNNING
 from curricula.paper import ct_su_b1
 
 

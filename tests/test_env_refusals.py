@@ -18,7 +18,7 @@ from oracles import (
 )
 
 from ctgraph_rl import CTGraphEnv, PaperImages
-from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
+from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 
 
 @pytest.mark.parametrize(

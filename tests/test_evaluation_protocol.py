@@ -19,10 +19,10 @@ from torch import Tensor
 
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, OneHot, RunLog, evaluate, learn_curriculum, run
-from ctgraph_rl.curriculum import Protocol
-from ctgraph_rl.dynamics import OUTCOME_GOAL
-from ctgraph_rl.lifelong import Examiner, make_env
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.core.dynamics import OUTCOME_GOAL
+from ctgraph_rl.learn.lifelong import Examiner, make_env
+from ctgraph_rl.tasks.curriculum import Protocol
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 THREE, FOUR = (replace(ONE, goal_reward=reward) for reward in (3.0, 4.0))
 

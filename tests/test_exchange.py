@@ -11,13 +11,16 @@ from hypothesis import strategies as st
 from oracles import confounding, one_hot, surjective
 
 import curricula
-from ctgraph_rl import exchange, images, params, reference, rewards, switch
-from ctgraph_rl.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.images import GroupedImages, ImageFile, OneHot
-from ctgraph_rl.reference import ReferenceImages
-from ctgraph_rl.rewards import Gradient, Needle, ReferenceLinear
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.batch import params
+from ctgraph_rl.core import rewards
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
+from ctgraph_rl.tasks import curriculum_json as exchange
+from ctgraph_rl.tasks import images, reference, switch
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot
+from ctgraph_rl.tasks.reference import ReferenceImages
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 A, B, C = (surjective(goal=goal) for goal in ((1, 1), (1, 2), (2, 1)))
 

@@ -10,11 +10,12 @@ import pytest
 from test_lifelong import ONE, TWO
 from test_run import command_line
 
-from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, files
-from ctgraph_rl.checkpoints import Checkpoints
-from ctgraph_rl.experts import _key, expert_curriculum, find_or_train
-from ctgraph_rl.provenance import versions
+from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
+from ctgraph_rl.log import files
+from ctgraph_rl.log.provenance import versions
 from ctgraph_rl.run import run, train_experts
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.experts import _key, expert_curriculum, find_or_train
 
 SETTINGS = {"agent": {"gamma": 0.9}, "seed": 0}
 
@@ -150,7 +151,7 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
 
 def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch):
     asked = []
-    monkeypatch.setattr("ctgraph_rl.experts.find_or_train", lambda *arguments: asked.append(arguments[3]))
+    monkeypatch.setattr("ctgraph_rl.runs.experts.find_or_train", lambda *arguments: asked.append(arguments[3]))
 
     cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3")
     train_experts(cfg, curriculum(), Checkpoints)

@@ -13,8 +13,9 @@ import pytest
 import torch
 from test_log import learned
 
-from ctgraph_rl import RunLog, export
-from ctgraph_rl.export import numbered, task_names, write_l2logger
+from ctgraph_rl import RunLog
+from ctgraph_rl.log import export
+from ctgraph_rl.log.export import numbered, task_names, write_l2logger
 from ctgraph_rl.metrics import Regime
 
 

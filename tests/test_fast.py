@@ -9,7 +9,9 @@ import torch
 from oracles import confounding, fully_observable, one_hot, record, scripts, surjective
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, fast, philox, rollout
+from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, rollout
+from ctgraph_rl.batch import rollout as fast
+from ctgraph_rl.core import philox
 
 FILE = {
     "general_seed": 3,

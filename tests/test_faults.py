@@ -15,10 +15,10 @@ from test_checkpoints import with_header
 from test_lifelong import ONE
 
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Observations, OneHot, RunLog
-from ctgraph_rl.checkpoints import decoded
-from ctgraph_rl.files import locked
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.run import checked_device, run, run_name
-from ctgraph_rl.runs import find_runs
+from ctgraph_rl.runs.checkpoints import decoded
+from ctgraph_rl.runs.read import find_runs
 from curricula.paper import ct_su_b1
 
 TESTS = Path(__file__).parent

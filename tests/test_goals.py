@@ -9,7 +9,7 @@ import torch
 from oracles import act, optimal, surjective
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.philox import STREAM_GOAL, draw, randint_wide
+from ctgraph_rl.core.philox import STREAM_GOAL, draw, randint_wide
 
 
 def goals_of_episodes(env: CTGraphEnv, num_episodes: int) -> torch.Tensor:

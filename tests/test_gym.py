@@ -19,7 +19,7 @@ from oracles import confounding, one_hot, surjective
 
 from ctgraph_rl import ReferenceOneHot
 from ctgraph_rl.gym import CONFIGURATIONS, CTGraphGymEnv, CTGraphVectorEnv, make_task
-from ctgraph_rl.paper import ct_su_b1
+from ctgraph_rl.tasks.configurations import ct_su_b1
 
 
 def test_a_running_episode_ends_with_its_own_task():

@@ -14,8 +14,9 @@ from gym_steps import MODES, assert_equal
 from gymnasium.vector import AutoresetMode
 from oracles import one_hot, surjective
 
-from ctgraph_rl import Task, paper
+from ctgraph_rl import Task
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv, make_task
+from ctgraph_rl.tasks import configurations as paper
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from oracles import confounding, fully_observable, one_hot, record, scripts, sur
 
 from ctgraph_rl import CTGraphEnv, Gradient
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-from ctgraph_rl.paper import ct_su_b1
+from ctgraph_rl.tasks.configurations import ct_su_b1
 
 VARIED = {
     "deterministic": surjective(),

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from ctgraph_rl.curriculum import Block, Curriculum
-from ctgraph_rl.graph import CTGraph
-from ctgraph_rl.images import UNRELATED, GroupedImages, ImageFile, OneHot, PaperImages, distances
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.rotation import rotate
-from ctgraph_rl.task import Task
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rotation import rotate
+from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.tasks.images import UNRELATED, GroupedImages, ImageFile, OneHot, PaperImages, distances
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
 
 FIVE_IDS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
 SQUARE_PER_CELL = (255 + 1) / (6 * (255 - 1))  # E[((x - y) / 254)^2] of two levels uniform over 0..254

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from ctgraph_rl.checkpoints import Checkpoints
-from ctgraph_rl.interrupt import Interrupt
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.interrupt import Interrupt
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from kill_runs import command, differences
 
-from ctgraph_rl.checkpoints import Checkpoints
+from ctgraph_rl.runs.checkpoints import Checkpoints
 
 
 def kill_runs(checkout: Path, *arguments: str) -> None:

@@ -11,8 +11,8 @@ import torch
 
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Task, evaluate, learn_curriculum
-from ctgraph_rl.dynamics import OUTCOME_GOAL
-from ctgraph_rl.paper import ct_fo_b1, ct_fo_b2
+from ctgraph_rl.core.dynamics import OUTCOME_GOAL
+from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_fo_b2
 from curricula.paper import ct_su_b1
 
 pytestmark = pytest.mark.slow

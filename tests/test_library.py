@@ -10,7 +10,9 @@ import torch
 from oracles import confounding, surjective
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ctgraph_rl import Rows, library, philox, reading
+from ctgraph_rl import Rows
+from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core import philox, reading
 
 
 @pytest.fixture

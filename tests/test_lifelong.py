@@ -23,9 +23,9 @@ from ctgraph_rl import (
     Task,
     evaluate,
     learn_curriculum,
-    lifelong,
 )
-from ctgraph_rl.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
+from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
+from ctgraph_rl.learn import lifelong
 
 DECISION_ID = 2
 OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))

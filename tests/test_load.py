@@ -19,10 +19,10 @@ from test_lifelong import ONE, TWO
 from baselines.a2c import A2C
 from baselines.methods.l2 import L2
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, evaluate, learn_curriculum
-from ctgraph_rl.checkpoints import Checkpoints
 from ctgraph_rl.run import conf_dir
-from ctgraph_rl.train import new_agent, train
-from ctgraph_rl.trained import load
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.load import load
+from ctgraph_rl.runs.train import new_agent, train
 
 SETTINGS = {
     **OmegaConf.to_container(OmegaConf.load(f"{conf_dir()}/agent/a2c.yaml")),

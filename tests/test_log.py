@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ctgraph_rl import RunLog, metrics
-from ctgraph_rl import log as log_module
-from ctgraph_rl.log import write_metrics, write_performance
+from ctgraph_rl.log import run_log as log_module
+from ctgraph_rl.log.run_log import write_metrics, write_performance
 
 TRAINED = [(0,), (1,)]
 

@@ -9,8 +9,9 @@ import textwrap
 import pytest
 from test_lifelong import Scripted, curriculum, task
 
-from ctgraph_rl import Block, RunLog, learn_curriculum, tables
-from ctgraph_rl.tables import EVALUATIONS, TRAINING, write_tables
+from ctgraph_rl import Block, RunLog, learn_curriculum
+from ctgraph_rl.log import tables
+from ctgraph_rl.log.tables import EVALUATIONS, TRAINING, write_tables
 
 
 @pytest.fixture

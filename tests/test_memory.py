@@ -14,7 +14,7 @@ from ctgraph_rl import CTGraph, Observations, PaperImages, Rows, Task
 MEASURE = """
 import resource, torch
 from ctgraph_rl import Rows
-from ctgraph_rl.paper import ct_co_b1
+from ctgraph_rl.tasks.configurations import ct_co_b1
 
 def peak():
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

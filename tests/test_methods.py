@@ -18,7 +18,7 @@ from baselines.methods.importance import Samples
 from baselines.methods.method import Method
 from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, RunLog, learn_curriculum, run
-from ctgraph_rl.train import new_agent
+from ctgraph_rl.runs.train import new_agent
 
 AGENTS = {"a2c": [], "dqn": REPLAY, "drqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
 

@@ -20,7 +20,7 @@ from baselines.methods.__main__ import main, methods
 from baselines.methods.method import Method
 from ctgraph_rl import Protocol, RunLog, cli, load
 from ctgraph_rl.run import conf_dir, target
-from ctgraph_rl.train import new_agent
+from ctgraph_rl.runs.train import new_agent
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 TEXT = (CHECKOUT / "docs" / "methods.md").read_text(encoding="utf-8")

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ctgraph_rl import CTGraph, CTGraphEnv, evaluate, metrics
-from ctgraph_rl.paper import ct_su_b1
 from ctgraph_rl.policies import OptimalPolicy, RandomPolicy
+from ctgraph_rl.tasks.configurations import ct_su_b1
 
 NAN = math.nan
 

@@ -13,11 +13,12 @@ import torch
 from test_lifelong import curriculum, task
 
 import curricula
-from ctgraph_rl import Block, RunLog, metrics, tables
-from ctgraph_rl.experts import Expert
-from ctgraph_rl.log import write_metrics
-from ctgraph_rl.provenance import provenance
-from ctgraph_rl.recorder import Recorder
+from ctgraph_rl import Block, RunLog, metrics
+from ctgraph_rl.log import tables
+from ctgraph_rl.log.provenance import provenance
+from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.runs.experts import Expert
+from ctgraph_rl.runs.recorder import Recorder
 
 TEXT = (Path(__file__).resolve().parents[1] / "docs" / "metrics.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)

@@ -19,12 +19,14 @@ from test_switches import SWITCHED, VECTORS
 from torch import Tensor
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, library, native, rollout
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, rollout
+from ctgraph_rl.batch import native
+from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-from ctgraph_rl.lifelong import collect, make_env
+from ctgraph_rl.learn.lifelong import collect, make_env
 from ctgraph_rl.policies import RandomPolicy
-from ctgraph_rl.rewards import Arrival
-from ctgraph_rl.switch import AtRandom, ByEpisode
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
 
 WIDE = replace(surjective(70, 1, 0.2), goal_change=(1, 2))
 DEEP = replace(surjective(2, 40), goal_change=(1, 1), step_reward=-0.0)

@@ -24,7 +24,7 @@ from oracles import (
 )
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Observations, OneHot, PaperImages, StateType, Task
-from ctgraph_rl.rotation import rotate
+from ctgraph_rl.core.rotation import rotate
 
 RANGES = {"wait_ids": (2, 2), "decision_ids": (3, 3), "end_ids": (4, 4)}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import ctgraph_rl
-from ctgraph_rl.train import RESULTS
+from ctgraph_rl.runs.train import RESULTS
 
 TINY = ["curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8"]
 
@@ -45,7 +45,7 @@ def test_the_wheel_holds_the_packages_and_the_configuration_and_nothing_else(whe
     rest = {name for name in found - code - conf if ".dist-info/" not in name}
     typed = {f"{package}/py.typed" for package in ("ctgraph_rl", "curricula", "baselines")}
     report = {f"ctgraph_rl/report/{name}" for name in ("report.html.j2", "report.md.j2", "style.mplstyle")}
-    assert report <= rest <= {*typed, *report, "curricula/fingerprints.json", "ctgraph_rl/native.c"}
+    assert report <= rest <= {*typed, *report, "curricula/fingerprints.json", "ctgraph_rl/core/kernel.c"}
 
 
 def test_the_wheel_declares_version_licence_and_console_script(wheel):

@@ -6,9 +6,9 @@ import torch
 from oracles import DECISION, END, FAIL, HOME, WAIT
 
 from ctgraph_rl import CTGraph
-from ctgraph_rl.paper import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_posr_b1, ct_su_b1
-from ctgraph_rl.tree import State, transition
-from ctgraph_rl.tree import tree_params as make_tree
+from ctgraph_rl.core.tree import State, transition
+from ctgraph_rl.core.tree import tree_params as make_tree
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_posr_b1, ct_su_b1
 
 TABLE = [
     (2, 1, "0"),

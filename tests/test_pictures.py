@@ -16,13 +16,13 @@ from reference_files import SHIPPED_2023
 
 import curricula
 from ctgraph_rl import cli
-from ctgraph_rl.graph import StateType
-from ctgraph_rl.image_classes import image_figure
-from ctgraph_rl.images import ImageFile
-from ctgraph_rl.paper import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
-from ctgraph_rl.pictures import draw_task, main, task_figure
+from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.policies import NavigationPolicy, RandomPolicy
-from ctgraph_rl.visits import visits
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
+from ctgraph_rl.tasks.images import ImageFile
+from ctgraph_rl.visualize.image_figure import image_figure
+from ctgraph_rl.visualize.task_figure import draw_task, main, task_figure
+from ctgraph_rl.visualize.visits import visits
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 

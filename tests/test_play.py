@@ -13,11 +13,11 @@ import pytest
 from rich.console import Console
 
 from ctgraph_rl import cli
-from ctgraph_rl.episode import Player
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.paper import ct_fo_b1
-from ctgraph_rl.play import SHADES, Game, has_colours, keyboard, main, picture, truth
+from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.policies import OptimalPolicy
+from ctgraph_rl.tasks.configurations import ct_fo_b1
+from ctgraph_rl.visualize.play import SHADES, Game, has_colours, keyboard, main, picture, truth
+from ctgraph_rl.visualize.player import Player
 
 TO_GOAL_12 = "0 0 1 0 2 0"
 
@@ -213,7 +213,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are of P
 IN_A_TERMINAL = """
 import termios
 before = termios.tcgetattr(0)
-from ctgraph_rl.play import main
+from ctgraph_rl.visualize.play import main
 main(["CT-SU-B1", "--goal", "1.2"])
 print("RESTORED", termios.tcgetattr(0) == before)
 """

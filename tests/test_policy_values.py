@@ -20,7 +20,7 @@ from probability_tables import (
 from torch import Tensor
 
 from ctgraph_rl import Needle, Task
-from ctgraph_rl.rewards import Arrival
+from ctgraph_rl.core.rewards import Arrival
 from curricula.paper import ct_su_b1
 
 

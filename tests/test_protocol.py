@@ -14,10 +14,10 @@ from test_switch import RICH, env_of
 from torchrl.envs import check_env_specs
 
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, Rows, Steps, learn_curriculum, rollout
-from ctgraph_rl.curriculum import Protocol
-from ctgraph_rl.dynamics import OUTCOME_GOAL, OUTCOME_OTHER_END
-from ctgraph_rl.lifelong import make_env
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_OTHER_END
+from ctgraph_rl.learn.lifelong import make_env
+from ctgraph_rl.tasks.curriculum import Protocol
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 THREE = replace(ONE, goal_reward=3.0)
 

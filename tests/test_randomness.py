@@ -18,7 +18,7 @@ from oracles import (
 )
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.philox import STREAM_STEP, draw
+from ctgraph_rl.core.philox import STREAM_STEP, draw
 
 RANDOM = confounding(2, 2, 0.5, goal=(1, 2), read_noise=50, read_rotation=40)
 """A task with everything that is random: waits, ids, noise and rotation."""

@@ -15,9 +15,9 @@ from test_lifelong import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
 from ctgraph_rl.policies import NavigationPolicy
-from ctgraph_rl.recorder import Recorder
+from ctgraph_rl.runs.recorder import Recorder
+from ctgraph_rl.runs.train import RESULTS
 from ctgraph_rl.sb3 import SB3VecEnv
-from ctgraph_rl.train import RESULTS
 
 TASKS = curriculum(Block(ONE, 12), Block(TWO, 24))
 

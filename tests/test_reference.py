@@ -14,7 +14,7 @@ from ctgraph_rl import (
     Task,
     count_repeats,
 )
-from ctgraph_rl.rotation import rotate
+from ctgraph_rl.core.rotation import rotate
 
 RECORDED = np.load(DATA / "reference_images.npz")
 

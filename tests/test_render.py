@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.images import OneHot, PaperImages
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.render import STATE_COLOURS, render
-from ctgraph_rl.task import Task
+from ctgraph_rl.batch.render import STATE_COLOURS, render
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
 
 OBSERVATIONS = Observations(wait_ids=(2, 2), decision_ids=(3, 3), end_ids=(4, 4))
 SMALL = Task(CTGraph(2, 2), (1, 2), OBSERVATIONS, PaperImages(5))

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from ctgraph_rl import RunLog, metrics
-from ctgraph_rl.log import write_metrics, write_performance
+from ctgraph_rl.log.run_log import write_metrics, write_performance
 from ctgraph_rl.report.terminal import print_summary, sparklines
 
 LABELS = ("goal1.1", "goal1.2")

@@ -11,15 +11,16 @@ import pytest
 from made_runs import write_run
 
 import curricula
-from ctgraph_rl import RunLog, visits
+from ctgraph_rl import RunLog
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.pictures import Gallery
 from ctgraph_rl.report.sections import evaluation_curve, sections, training_curve
 from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
-from ctgraph_rl.runs import find_runs
-from ctgraph_rl.trained import Trained
+from ctgraph_rl.runs.load import Trained
+from ctgraph_rl.runs.read import find_runs
+from ctgraph_rl.visualize import visits
 
 for package in ("matplotlib", "jinja2", "scipy"):
     pytest.importorskip(package)

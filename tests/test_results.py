@@ -11,11 +11,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ctgraph_rl import RunLog, metrics, results
-from ctgraph_rl.experts import EXPERT
-from ctgraph_rl.log import write_metrics
-from ctgraph_rl.results import comparisons, selected, table
-from ctgraph_rl.runs import Problem, find_runs, grouped
+from ctgraph_rl import RunLog, metrics
+from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.report import results
+from ctgraph_rl.report.results import comparisons, selected, table
+from ctgraph_rl.runs.experts import EXPERT
+from ctgraph_rl.runs.read import Problem, find_runs, grouped
 
 pytest.importorskip("scipy")
 

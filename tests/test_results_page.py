@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ctgraph_rl.paper import CONFIGURATIONS
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "results"
 WITHOUT_MEMORY = ("a2c", "dqn", "ppo", "ppo_count", "reinforce")

@@ -15,11 +15,11 @@ from test_agents_rl2 import TWO_GOALS
 from test_lifelong import ONE, TWO, task
 
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
-from ctgraph_rl.checkpoints import decoded, encoded
-from ctgraph_rl.lifelong import Checkpoint
+from ctgraph_rl.learn.lifelong import Checkpoint
 from ctgraph_rl.run import target
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift
-from ctgraph_rl.train import new_agent
+from ctgraph_rl.runs.checkpoints import decoded, encoded
+from ctgraph_rl.runs.train import new_agent
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 ROWS, STEPS = 8, 4
 SMALL = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size=4"]

@@ -11,8 +11,8 @@ import torch
 from oracles import ALPHA, act, optimal, play, surjective
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, Needle, ReferenceLinear, Task
-from ctgraph_rl.philox import STREAM_REWARD, draw, normal, normal_table
-from ctgraph_rl.rewards import Arrival
+from ctgraph_rl.core.philox import STREAM_REWARD, draw, normal, normal_table
+from ctgraph_rl.core.rewards import Arrival
 
 CLT_BOUND = 5.0
 """A mean of many draws is further than 5 standard errors from its expectation less than once in 1 / ALPHA times."""

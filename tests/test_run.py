@@ -17,10 +17,10 @@ import torch
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
 from ctgraph_rl import run as run_module
+from ctgraph_rl.log.provenance import named
 from ctgraph_rl.metrics import definitions
-from ctgraph_rl.provenance import named
 from ctgraph_rl.run import run, target, with_changes
-from ctgraph_rl.train import RESULTS
+from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_log_and_another_seed_another(finished, com
 
 def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, tmp_path):
     seeds = []
-    learn = "ctgraph_rl.train.learn_curriculum"
+    learn = "ctgraph_rl.runs.train.learn_curriculum"
     monkeypatch.setattr(learn, lambda curriculum, agent, seed, log, *_: seeds.append(seed))
 
     run(compose("seed=7"), tmp_path)
@@ -337,7 +337,7 @@ def test_a_full_disk_is_one_message_with_sizes_after_the_first_update(monkeypatc
 
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr("ctgraph_rl.files.os.fsync", full)
+        patch.setattr("ctgraph_rl.log.files.os.fsync", full)
         code = command_line(monkeypatch, *SHORT, "hydra.run.dir=out")
 
     error = capsys.readouterr().err

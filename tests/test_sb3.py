@@ -19,9 +19,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from ctgraph_rl import paper
 from ctgraph_rl.gym import CTGraphGymEnv, make_task
 from ctgraph_rl.sb3 import SB3VecEnv
+from ctgraph_rl.tasks import configurations as paper
 
 GOAL = (1, 2)
 

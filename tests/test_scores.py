@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, metrics
-from ctgraph_rl.paper import ct_su_b1
-from ctgraph_rl.scores import optimal_values, scores
+from ctgraph_rl.log.scores import optimal_values, scores
+from ctgraph_rl.tasks.configurations import ct_su_b1
 
 TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
 CURRICULUM = Curriculum("two", 1, "here", (Block(TASKS[0], 200), Block(TASKS[1], 200)), Evaluation(every=100))
@@ -208,7 +208,7 @@ def test_a_regret_against_different_optima_in_one_block_is_unknown(log):
 
 
 def test_an_optimum_that_is_not_known_is_said(log, monkeypatch):
-    monkeypatch.setattr("ctgraph_rl.values.MAX_ENUMERATED_STATES", 1)
+    monkeypatch.setattr("ctgraph_rl.tasks.values.MAX_ENUMERATED_STATES", 1)
     from ctgraph_rl import Gradient
 
     large = replace(TASKS[1], reward_fn=Gradient())

@@ -11,14 +11,14 @@ from oracles import confounding, fully_observable, scripts, surjective, tree_sta
 from torch import Tensor
 
 import curricula
-from ctgraph_rl.curriculum import Block, Curriculum
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.core.rewards import Arrival, Gradient
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.graph import CTGraph, StateType
-from ctgraph_rl.images import OneHot, PaperImages
-from ctgraph_rl.observations import Observations
-from ctgraph_rl.reference import ReferenceImages
-from ctgraph_rl.rewards import Arrival, Gradient
-from ctgraph_rl.similarity import (
+from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.reference import ReferenceImages
+from ctgraph_rl.tasks.similarity import (
     MEASURES,
     draw_similarity,
     graph_containment,
@@ -27,7 +27,7 @@ from ctgraph_rl.similarity import (
     shared_images,
     state_agreement,
 )
-from ctgraph_rl.task import Task
+from ctgraph_rl.tasks.task import Task
 
 WAIT, DECISION = StateType.WAIT, StateType.DECISION
 GOALS = ((1, 1), (1, 2), (2, 1))

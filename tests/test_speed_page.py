@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, reading, rollout
-from ctgraph_rl.paper import ct_co_b1
+from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, rollout
+from ctgraph_rl.core import reading
+from ctgraph_rl.tasks.configurations import ct_co_b1
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "speed.md"
 

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from ctgraph_rl import statistics
-from ctgraph_rl.statistics import compare, interquartile_mean, mean, seeds_needed, solved_rate
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import compare, interquartile_mean, mean, seeds_needed, solved_rate
 
 pytest.importorskip("scipy")
 

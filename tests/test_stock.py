@@ -12,8 +12,9 @@ from oracles import WAIT, act, confounding, is_uniform, one_hot, optimal, script
 from test_switches import SWITCHED, VECTORS, read, seen
 from torch import Tensor
 
-from ctgraph_rl import CTGraphEnv, dynamics
-from ctgraph_rl.rows import MAX_STOCK, Rows
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.batch.rows import MAX_STOCK, Rows
+from ctgraph_rl.core import dynamics
 
 NOISY = replace(confounding(p=0.5, read_rotation=5), reward_std=0.3, goal_change=(1, 3), step_reward=0.5)
 TASKS = [*SWITCHED[:4], confounding(p=0.5), NOISY]
@@ -58,7 +59,7 @@ def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps
 
 @pytest.mark.parametrize("room", [0, 5, 6, 11, 12, 18, 6 * 256 + 5, 6 * 500])
 def test_a_stock_of_any_size_gives_the_same_draws(monkeypatch, room):
-    monkeypatch.setattr("ctgraph_rl.rows.MAX_STOCK", room)
+    monkeypatch.setattr("ctgraph_rl.batch.rows.MAX_STOCK", room)
     rows, twin = (Rows(TASKS, seed=4) for _ in range(2))
 
     play(rows, twin, calls(30, 6, seed=room))

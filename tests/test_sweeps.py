@@ -22,9 +22,9 @@ from rich.console import Console
 from sweeping import UNLUCKY, sweep
 
 from ctgraph_rl import run as run_module
-from ctgraph_rl.files import locked
+from ctgraph_rl.log.files import locked
 from ctgraph_rl.run import explain
-from ctgraph_rl.sweep import SHOWN, Standing, SweepProgress, lock_holder, report, standing
+from ctgraph_rl.runs.sweep import SHOWN, Standing, SweepProgress, lock_holder, report, standing
 from hydra_plugins.ctgraph_rl_sweeper import shortened, sigterm_exits, why
 
 SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -328,7 +328,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
 
 def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     shown = io.StringIO()
-    monkeypatch.setattr("ctgraph_rl.sweep.SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("ctgraph_rl.runs.sweep.SECONDS_BETWEEN_LINES", 0.0)
 
     (tmp_path / "metrics.json").touch()  # done before, so it tells nothing of the rate
 

@@ -27,9 +27,10 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from ctgraph_rl import CTGraphEnv, Gradient, Rows, philox
-from ctgraph_rl.switch import AtRandom, ByEpisode, Drift, Switch
-from ctgraph_rl.task import Task
+from ctgraph_rl import CTGraphEnv, Gradient, Rows
+from ctgraph_rl.core import philox
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
+from ctgraph_rl.tasks.task import Task
 
 FORKS = [one_hot(2, 2, goal=goal) for goal in ((1, 1), (1, 2), (2, 1), (2, 2))]
 """Tasks without draws or images, for counting."""

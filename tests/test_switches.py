@@ -38,11 +38,11 @@ from ctgraph_rl import (
     ReferenceLinear,
     ReferenceOneHot,
     Task,
-    dynamics,
 )
-from ctgraph_rl.philox import STREAM_GOAL, STREAM_NOISE, STREAM_STEP, draw
-from ctgraph_rl.rotation import rotate
-from ctgraph_rl.rows import Rows
+from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.core import dynamics
+from ctgraph_rl.core.philox import STREAM_GOAL, STREAM_NOISE, STREAM_STEP, draw
+from ctgraph_rl.core.rotation import rotate
 
 LEGACY = {"legacy_index": True, "noise_before_rotation": True, "reward_cue": True, "cue_wraps": True}
 

@@ -12,10 +12,10 @@ import pytest
 import torch
 from torchrl.record.loggers.common import Logger
 
-from ctgraph_rl.log import RunLog
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.run import plain, run, run_name, target
-from ctgraph_rl.runs import flat
-from ctgraph_rl.trackers import FOLDER, Tracker, csv_logger, scalars
+from ctgraph_rl.runs.read import flat
+from ctgraph_rl.runs.trackers import FOLDER, Tracker, csv_logger, scalars
 
 SHORT = ("agent=dqn", "curriculum.num_frames=256", "agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8")
 PACKAGES = ("tensorboard", "wandb", "mlflow", "trackio")

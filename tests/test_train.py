@@ -16,9 +16,9 @@ from test_checkpoints import flip_bit
 from test_load import LEARNED, Stopped, StopsAfter, learn_into, make_agent, stopped_run
 
 from ctgraph_rl import Block, RunLog
-from ctgraph_rl.checkpoints import Checkpoints
-from ctgraph_rl.curriculum import Evaluation
-from ctgraph_rl.train import new_agent, train
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.tasks.curriculum import Evaluation
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def newest(run_dir: Path) -> Path:
 def about(monkeypatch, **changes) -> None:
     """Let the machine and versions of this process seem others."""
     provenance = test_load.train.__globals__["provenance"]
-    monkeypatch.setattr("ctgraph_rl.train.provenance", lambda curriculum: {**provenance(curriculum), **changes})
+    monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda curriculum: {**provenance(curriculum), **changes})
 
 
 def test_a_stopped_run_ends_as_if_never_stopped_and_leaves_no_checkpoint(stopped, whole):
@@ -87,7 +87,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(stopped, whole):
 def test_a_run_that_is_stopped_while_its_results_are_written_ends_the_same(stopped, whole, monkeypatch, name):
     writes = {"agent.pt": "write_whole", "evaluations.csv": "write_tables", "performance.csv": "write_performance"}
     with monkeypatch.context() as patch:
-        patch.setattr(f"ctgraph_rl.train.{writes.get(name, 'write_metrics')}", lambda *_, **__: 1 / 0)
+        patch.setattr(f"ctgraph_rl.runs.train.{writes.get(name, 'write_metrics')}", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             learn_into(stopped)
     assert not (stopped / "metrics.json").exists()

@@ -19,8 +19,8 @@ from probability_tables import (
 from torch import Tensor
 
 from ctgraph_rl import CTGraph, StateType, Task
-from ctgraph_rl.tree import State, transition
-from ctgraph_rl.tree import tree_params as make_tree
+from ctgraph_rl.core.tree import State, transition
+from ctgraph_rl.core.tree import tree_params as make_tree
 
 REWARDS = [(1.0, 0.0), (2.5, -0.5), (1.0, 0.3), (-1.0, 0.0), (-1.0, -0.25), (0.0, 2.0)]
 """goal_reward and fail_reward."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from baselines.methods.method import Method
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Finetune(Method):

@@ -10,7 +10,7 @@ from torch import Tensor
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

@@ -18,7 +18,7 @@ from baselines.methods.method import Method, blocks_of_several
 from baselines.methods.weights import Weights, flat
 from baselines.networks import Data
 from ctgraph_rl.checks import at_least_one, positive, require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

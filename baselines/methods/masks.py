@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights, flat
 from ctgraph_rl.checks import require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from baselines.networks import Data
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

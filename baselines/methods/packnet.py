@@ -16,7 +16,7 @@ from baselines.methods.heads import Heads
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import is_real, require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

@@ -14,7 +14,7 @@ from torch import Tensor
 from baselines.methods.importance import Importance
 from baselines.methods.weights import Weights, flat
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

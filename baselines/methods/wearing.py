@@ -15,7 +15,7 @@ from baselines.methods.method import Method
 from baselines.methods.weights import Weights
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
-from ctgraph_rl.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Wearing(nn.Module):

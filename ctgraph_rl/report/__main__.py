@@ -6,14 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from ctgraph_rl.files import METRICS
+from ctgraph_rl.log.files import METRICS
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_summary
 
 
 def main() -> None:
     """Write the report, and say what is in it; the exit code is 1 if something was left out."""
-    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.report", description=__doc__)
+    parser = argparse.ArgumentParser(prog="ctgraph-rl report", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
     arguments = parser.parse_args()

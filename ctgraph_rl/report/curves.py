@@ -8,7 +8,7 @@ from typing import Any
 
 from ctgraph_rl.report.sections import Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, short
-from ctgraph_rl.runs import Curve
+from ctgraph_rl.runs.read import Curve
 
 MOST_TASKS = 32
 """Tasks that have a panel."""

@@ -12,12 +12,23 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.report import pictures
 from ctgraph_rl.report.heatmaps import MOST_NAMES
 from ctgraph_rl.report.pictures import Gallery, Written
+from ctgraph_rl.report.results import (
+    LEGEND,
+    MEANS,
+    Page,
+    Row,
+    latex,
+    latex_text,
+    latex_value,
+    markdown_text,
+    pages,
+    selected,
+)
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
+from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
 from ctgraph_rl.report.trees import Trees, find_trees
-from ctgraph_rl.results import LEGEND, MEANS, Page, Row, latex, latex_text, latex_value, markdown_text, pages, selected
-from ctgraph_rl.runs import Problem, Run, find_runs, flat
-from ctgraph_rl.statistics import Estimate
+from ctgraph_rl.runs.read import Problem, Run, find_runs, flat
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""

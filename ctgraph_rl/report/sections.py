@@ -13,9 +13,9 @@ from functools import cached_property
 from itertools import accumulate, pairwise, zip_longest
 from typing import NamedTuple
 
-from ctgraph_rl.results import AT_END, Row, table
-from ctgraph_rl.runs import BySeed, Curve, History, Run, grouped
-from ctgraph_rl.statistics import Estimate, mean
+from ctgraph_rl.report.results import AT_END, Row, table
+from ctgraph_rl.report.statistics import Estimate, mean
+from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped
 
 Matrix = list[list[Estimate]]
 """Estimates over seeds, [blocks][tasks]."""

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctgraph_rl.files import METRICS
-from ctgraph_rl.runs import Curve, read_run
+from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.runs.read import Curve, read_run
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
 WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")

@@ -6,12 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ctgraph_rl.report.style import WIDTH, short
-from ctgraph_rl.runs import Run
+from ctgraph_rl.runs.read import Run
 
 if TYPE_CHECKING:
-    from ctgraph_rl.curriculum import Curriculum
-    from ctgraph_rl.trained import Trained
-    from ctgraph_rl.visits import Visits
+    from ctgraph_rl.runs.load import Trained
+    from ctgraph_rl.tasks.curriculum import Curriculum
+    from ctgraph_rl.visualize.visits import Visits
 
 MOST_TREES = 8
 COLUMNS = 2
@@ -30,8 +30,8 @@ def draw_trees(trees: Trees, seed: int) -> Any:
     """A panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     from matplotlib.figure import Figure
 
-    from ctgraph_rl.pictures import draw_task
-    from ctgraph_rl.visits import Visits
+    from ctgraph_rl.visualize.task_figure import draw_task
+    from ctgraph_rl.visualize.visits import Visits
 
     assert trees.curriculum is not None
     tasks = list(zip(trees.curriculum.tasks, trees.curriculum.labels, strict=True))[:MOST_TREES]
@@ -55,9 +55,9 @@ def _height(depth: int) -> float:
 
 def find_trees(run: Run) -> Trees:
     """The agent and the curriculum of a run as far as its directory has them."""
-    from ctgraph_rl.curriculum import Curriculum
-    from ctgraph_rl.files import AGENT, CURRICULUM
-    from ctgraph_rl.trained import load
+    from ctgraph_rl.log.files import AGENT, CURRICULUM
+    from ctgraph_rl.runs.load import load
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
     reason = f"{run.path} has no {AGENT}, the weights of its agent"
     try:
@@ -73,7 +73,7 @@ def find_trees(run: Run) -> Trees:
 
 
 def _visits(trained: Trained, task: Any, seed: int) -> Visits:
-    from ctgraph_rl.visits import visits
+    from ctgraph_rl.visualize.visits import visits
 
     curriculum, state = trained.curriculum, trained.agent.initial_state
     per_row = curriculum.evaluation.episodes_per_row

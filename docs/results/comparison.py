@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from raw import HERE, Raw, groups, mean_of, read, table, write
 
 from ctgraph_rl import metrics
-from ctgraph_rl.log import RunLog
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves
 
 EXPERT = "expert"

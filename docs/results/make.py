@@ -95,7 +95,7 @@ def both_ways(lines: Raw) -> str:
 
 def ceilings(configuration: str, goal: str) -> list[str]:
     """The best mean return without memory, of a policy that always does the same and of any."""
-    from ctgraph_rl.paper import CONFIGURATIONS
+    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
     name = "CT-" + configuration.upper().replace("_", "-")
     task = CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))

@@ -45,7 +45,7 @@ def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
 
 def mean_of(values: Sequence[float | None]) -> str:
     """Mean over seeds with half of its interval; seeds without a value are counted, not averaged."""
-    from ctgraph_rl import statistics
+    from ctgraph_rl.report import statistics
 
     found = statistics.mean(values)
     if found.value is None:

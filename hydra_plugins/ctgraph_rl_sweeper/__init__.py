@@ -60,7 +60,7 @@ class CellSweeper(BasicSweeper):
         Raises:
             SystemExit: with code 1 if some are not done.
         """
-        from ctgraph_rl.sweep import DONE, SHOWN, SweepProgress, report, standing
+        from ctgraph_rl.runs.sweep import DONE, SHOWN, SweepProgress, report, standing
 
         assert self.config is not None
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import torch
 
-from ctgraph_rl.export import task_names, write_l2logger
-from ctgraph_rl.log import RunLog
+from ctgraph_rl.log.export import task_names, write_l2logger
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Regime
 
 PROGRAM = "import numpy, runpy; numpy.NaN = numpy.nan; runpy.run_module('l2metrics', run_name='__main__')"

@@ -1,0 +1,221 @@
+"""Steps as a small C kernel, `kernel.c`: the bits of `dynamics` at the speed of memory, on CPUs."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.dynamics import STATE_DTYPES, ObservationParams, RewardParams, RowState, Shown, Uses
+from ctgraph_rl.core.kernel import is_available, library, num_threads
+from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear, RewardFn
+from ctgraph_rl.core.tree import TreeParams
+
+if TYPE_CHECKING:
+    from ctgraph_rl.batch.rows import Rows
+
+REWARDS = (Needle, Gradient, ReferenceLinear)
+"""The rewards that the kernel knows, in its order; a user's own are Python and need the tensor code."""
+
+
+def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> None:
+    """Refuse what the kernel cannot run, and a machine that cannot compile it.
+
+    Raises:
+        ValueError: saying which.
+    """
+    other = _unknown(reward_fns)
+    names = ", ".join(reward.__name__ for reward in REWARDS)
+    require(
+        (not other, f"compiled=True knows the rewards {names}, got {other[:3]}; use compiled=False"),
+        (torch.device(device or "cpu").type == "cpu", f"compiled=True runs on a CPU, got {device}; use compiled=False"),
+    )
+    library()
+
+
+def is_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> bool:
+    """Whether the kernel can be made here, and knows these rewards."""
+    return torch.device(device or "cpu").type == "cpu" and not _unknown(reward_fns) and is_available()
+
+
+def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
+    return [fn for fn in reward_fns if type(fn) not in REWARDS]
+
+
+class Native:
+    """The kernel for the rows of one batch; copies of it start without what it has prepared."""
+
+    def __init__(self) -> None:
+        self._params: Any = None
+        self._state: RowState | None = None
+
+    def __reduce__(self) -> tuple[type[Native], tuple[()]]:
+        return Native, ()
+
+    def show(
+        self, rows: Rows, action: Tensor | None = None, mask: Tensor | None = None, shown: Tensor | None = None
+    ) -> tuple[RowState, Shown]:
+        """`dynamics.step`, `reset` or `step_or_reset`: the next states, and what they show.
+
+        Args:
+            rows: the batch, which stays as it is.
+            action: int64 [N], or None for no step.
+            mask: bool [N], the rows that start an episode instead, or None.
+            shown: uint8 [N, *shape], what the rows that do neither show, if it is at hand.
+        """
+        n, device = rows.num_rows, rows.device
+        made = Shown(
+            torch.empty(n, *rows.image_shape, dtype=torch.uint8, device=device),
+            torch.empty(n, dtype=torch.uint8, device=device),
+            torch.empty(n, dtype=torch.int64, device=device),
+            torch.empty(n, dtype=torch.bool, device=device),
+        )
+        return self.run(rows, rows.state, action=action, mask=mask, shown=shown, **made._asdict()), made
+
+    @torch.compiler.disable
+    def run(
+        self, rows: Rows, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Tensor | None
+    ) -> RowState:
+        """Call the kernel: the states that it leads to.
+
+        Args:
+            rows: the batch, which stays as it is.
+            state: where to start.
+            num_steps: T.
+            restarts: rows that a step finishes start anew within it.
+            arrays: those of ``_ARRAYS``, filled or read.
+
+        Raises:
+            ValueError: for arrays of a wrong shape or dtype, and for states that are none of the rows' tasks.
+        """
+        if self._params is not rows.params:
+            self._prepare(rows)
+        n, call = rows.num_rows, self._call
+        before = self._own(state)
+        after = RowState(*map(torch.empty_like, before))
+        call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
+        call.num_steps, call.restarts = num_steps, restarts
+        call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
+        kept = [self._set(name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
+        wrong = library().ctgraph_run(ctypes.byref(call))
+        del kept
+        require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
+        self._state = after
+        return after
+
+    def _set(self, name: str, array: Tensor | None, num_steps: int) -> Tensor | None:
+        """Put an array into the call, if it fits; it must be kept until then."""
+        if array is None:
+            setattr(self._call, name, None)
+            return None
+        call, (dtype, is_image, is_read) = self._call, _ARRAYS[name]
+        array = array.contiguous() if is_read else array
+        length = call.num_rows * num_steps * (call.num_pixels if is_image else 1)
+        if array.dtype != dtype or array.numel() != length or not array.is_contiguous() or not array.is_cpu:
+            got = f"{array.dtype} {list(array.shape)} on {array.device}"
+            raise ValueError(f"{name} must be {dtype} with {length} elements in a row on the CPU, got {got}")
+        setattr(call, name, array.data_ptr())
+        return array
+
+    def _own(self, state: RowState) -> RowState:
+        """States that the kernel can read: its own are, others are checked."""
+        last = self._state
+        if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
+            return state
+        shape = (self._call.num_rows,)
+        for (name, dtype), value in zip(STATE_DTYPES.items(), state, strict=True):
+            got = f"{value.dtype} {list(value.shape)} on {value.device}"
+            fits = value.dtype == dtype and value.shape == shape and value.is_cpu
+            require((fits, f"{name} of a state must be {dtype} {list(shape)} on the CPU, got {got}"))
+        return RowState(*(value.contiguous() for value in state))
+
+    def _prepare(self, rows: Rows) -> None:
+        """All of a call that stays the same between two changes of tasks."""
+        require_native(rows.uses.reward_fns, rows.device)
+        (tree, x, g), index = rows.tables
+        params, uses, n = rows.params, rows.uses, rows.num_rows
+        streams = len(params.seed) in (1, n) and params.row.shape == (n,)
+        require((streams, f"rows need a seed and a number each, got {len(params.seed)} and {len(params.row)} for {n}"))
+        tables = {
+            "tasks": _packed(tree, x, g, uses),
+            "task": index,
+            "seed": params.seed,
+            "row": params.row,
+            "bank": params.bank,
+            "noises": params.noise_bank,
+            "normal_table": params.normal_table,
+        }
+        if x.legacy is not None:
+            tables |= {"level_first": x.legacy.level_first, "level_shift": x.legacy.level_shift}
+        if x.taps is not None:
+            tables |= {"tap_index": x.taps[0], "tap_weight": x.taps[1]}
+        self._tables = {name: value.contiguous() for name, value in tables.items()}  # keeps them alive
+        self._call = _Call(
+            num_rows=n,
+            num_tasks=len(tables["tasks"]),
+            bank_rows=len(params.bank),
+            num_pixels=params.bank[0].numel(),
+            width=params.bank.shape[-1],
+            is_vector=params.bank.ndim == 2,
+            num_levels=0 if x.legacy is None else x.legacy.level_first.shape[1],
+            own_seeds=len(params.seed) > 1,
+            **{name: int(getattr(uses, name)) for name in _USES},
+            **{name: value.data_ptr() for name, value in self._tables.items()},
+        )
+        self._params, self._state = params, None
+
+
+def _packed(tree: TreeParams, x: ObservationParams, g: RewardParams, uses: Uses) -> Tensor:
+    """The different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
+    count = len(tree.first_leaf)
+    extra = torch.zeros(count) if tree.extra_end_step is None else tree.extra_end_step
+    reward_fn = torch.tensor([REWARDS.index(type(fn)) for fn in uses.reward_fns])[g.reward_fn]
+    legacy = torch.ones_like(x.num_ids) if x.legacy is None else x.legacy.num_ids
+    plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra]
+    plain += [x.num_views, x.num_angles, x.read_noise, x.reward_cue, x.cue_wraps, x.cue_element, x.noise_start]
+    plain += [_bits(x.white), g.depth, g.num_leaves, reward_fn, g.multiplicative]
+    plain += [g.change_first, g.change_last, g.legacy_change]
+    plain += map(_bits, (g.goal_reward, g.fail_reward, g.step_reward, g.reward_std))
+    by_kind = [table.view(count, -1) for table in (x.first_view, x.views_per_node, x.num_ids, legacy)]
+    return torch.cat([torch.stack([column.long() for column in plain], 1), *by_kind], 1)
+
+
+def _bits(value: Tensor) -> Tensor:
+    return value.double().view(torch.int64)
+
+
+_BLOCK = 64
+_USES = ("draws", "pixel_noise", "noise_bank", "reward_noise", "fail_reward", "step_reward", "goal_change")
+_SIZES = ("num_rows", "num_steps", "num_threads", "num_tasks", "bank_rows", "num_pixels", "width", "is_vector")
+_TABLES = ("tasks", "task", "seed", "row", "bank", "noises", "normal_table")
+_OPTIONAL_TABLES = ("level_first", "level_shift", "tap_index", "tap_weight")
+_ARRAYS = {
+    "action": (torch.int64, False, True),
+    "mask": (torch.bool, False, True),
+    "shown": (torch.uint8, True, True),
+    "observation": (torch.uint8, True, False),
+    "done": (torch.bool, False, False),
+    "outcome": (torch.uint8, False, False),
+    "leaf": (torch.int64, False, False),
+    "reward": (torch.float32, False, False),
+}
+"""Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
+_OF_ROWS = ("mask", "shown")
+"""Those of [N, ...]."""
+_Pointers = ctypes.c_void_p * len(RowState._fields)
+
+
+class _Call(ctypes.Structure):
+    """``Call`` of `kernel.c`."""
+
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in (*_SIZES, "num_levels", *_USES, "own_seeds", "restarts")),
+        *((name, ctypes.c_void_p) for name in (*_TABLES, *_OPTIONAL_TABLES)),
+        ("before", _Pointers),
+        ("after", _Pointers),
+        *((name, ctypes.c_void_p) for name in _ARRAYS),
+    ]

@@ -1,0 +1,230 @@
+"""From tasks to tensors: the parameters of rows, and the bank of images that they share."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.dynamics import LegacyIndex, ObservationParams, RewardParams, Uses
+from ctgraph_rl.core.graph import MAX_STATES, StateType
+from ctgraph_rl.core.rewards import RewardFn
+from ctgraph_rl.core.rotation import taps_of
+from ctgraph_rl.core.tree import TreeParams, tree_params
+from ctgraph_rl.tasks.images import ImageSet, white_level
+from ctgraph_rl.tasks.task import Task
+
+MakeTensor = Callable[..., Tensor]
+"""Makes a tensor on the right device from a list with one entry per different task, and a dtype (int64)."""
+
+
+def make_params(
+    tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int
+) -> tuple[TreeParams, ObservationParams, RewardParams, Uses]:
+    """The parameters of different tasks, and what they have use for; `Rows` hands them out to the rows."""
+    reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
+    observations = [task.observations for task in tasks]
+    uses = Uses(
+        waits=any(task.graph.wait_prob > 0 for task in tasks),
+        unique_ids=any(x.is_unique(kind) and not x.legacy_index for x in observations for kind in StateType),
+        drawn_ids=any(x.draws_ids for x in observations),
+        views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
+        pixel_noise=any(x.read_noise for x in observations),
+        noise_bank=noise_bank if any(x.read_noise for x in observations) else 0,
+        reward_noise=any(task.reward_std for task in tasks),
+        multiplicative=any(task.reward_std and task.reward_noise == "multiplicative" for task in tasks),
+        fail_reward=any(task.fail_reward for task in tasks),
+        step_reward=any(task.step_reward for task in tasks),
+        reward_cue=any(x.reward_cue for x in observations),
+        goal_change=any(task.goal_change for task in tasks),
+        max_depth=max(task.graph.depth for task in tasks),
+        reward_fns=reward_fns,
+    )
+    reward_params = _reward_params(tasks, each, reward_fns)
+    return _tree_params(tasks, each), _observation_params(tasks, each, bank, noise_bank), reward_params, uses
+
+
+def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
+    graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
+    return tree_params(
+        branching_factor=each([graph.branching_factor for graph in graphs]),
+        first_leaf=each([graph.num_decision_states for graph in graphs]),
+        stay_below=each([int(graph.wait_prob * 2**63) for graph in graphs]),
+        extra_end_step=each(extra, torch.bool) if any(extra) else None,
+    )
+
+
+def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int) -> ObservationParams:
+    observations = [task.observations for task in tasks]
+    by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
+    views, starts = [_num_views(task) for task in tasks], [bank.start[_bank_key(task)] for task in tasks]
+
+    def first_view(i: int, kind: StateType) -> int:
+        skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
+        return starts[i] + (observations[i].ids(kind)[0] - skipped) * views[i]
+
+    def num_ids(x: Any, kind: StateType) -> int:
+        return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
+
+    def table(values: list) -> Tensor:
+        return torch.tensor(values, device=bank_start.device).flatten()
+
+    bank_start, angles = each(starts), max(map(_num_angles, tasks))
+    taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
+    return ObservationParams(
+        first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
+        first_view=table([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
+        views_per_node=table([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
+        num_ids=table([[num_ids(x, kind) for kind in StateType] for x in observations]),
+        bank_start=bank_start,
+        num_views=each(views),
+        num_angles=each([_num_angles(task) for task in tasks]),
+        read_noise=each([x.read_noise for x in observations]),
+        reward_cue=each([x.reward_cue for x in observations], torch.bool),
+        cue_wraps=each([x.cue_wraps for x in observations], torch.bool),
+        cue_element=each([task.images.shape[-1] - 1 for task in tasks]),
+        white=each([white_level(task.images) for task in tasks], torch.float64),
+        noise_start=each([bank.noise_levels.index(x.read_noise) * noise_bank for x in observations]),
+        legacy=_legacy_index(tasks, each, table) if any(x.legacy_index for x in observations) else None,
+        taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
+    )
+
+
+def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[list], Tensor]) -> LegacyIndex:
+    """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
+
+    def level(task: Task, k: int) -> tuple[int, int]:
+        if k > task.graph.depth:
+            return MAX_STATES, 0
+        number = task.graph.branching_factor**k - 1
+        first = number // (task.graph.branching_factor - 1)
+        return first, number - first
+
+    def num_ids(task: Task, kind: StateType) -> int:
+        first, last = task.observations.ids(kind)
+        return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
+
+    levels = range(max(task.graph.depth for task in tasks) + 1)
+    by_level = [[level(task, k) for k in levels] for task in tasks]
+    return LegacyIndex(
+        level_first=each([[first for first, _ in pairs] for pairs in by_level]),
+        level_shift=each([[shift for _, shift in pairs] for pairs in by_level]),
+        num_ids=table([[num_ids(task, kind) for kind in StateType] for task in tasks]),
+    )
+
+
+def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
+    changes = [task.goal_change or (0, 0) for task in tasks]
+    pairs = list(zip(tasks, changes, strict=True))
+    return RewardParams(
+        depth=each([task.graph.depth for task in tasks]),
+        num_leaves=each([task.graph.num_end_states for task in tasks]),
+        reward_fn=each([reward_fns.index(task.reward_fn) for task in tasks]),
+        goal_reward=each([task.goal_reward for task in tasks], torch.float32),
+        fail_reward=each([task.fail_reward for task in tasks], torch.float32),
+        step_reward=each([task.step_reward for task in tasks], torch.float32),
+        reward_std=each([task.reward_std for task in tasks], torch.float32),
+        multiplicative=each([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
+        change_first=each([first for first, _ in changes]),
+        change_last=each([last for _, last in changes]),
+        legacy_change=each([task.legacy_goal_change and change[0] > 0 for task, change in pairs], torch.bool),
+    )
+
+
+def _turns_late(task: Task) -> bool:
+    """Whether rotations come after noise, so that they cannot be in the bank; without noise the order is the same."""
+    return task.observations.noise_before_rotation and task.observations.read_noise > 0
+
+
+def _num_angles(task: Task) -> int:
+    return task.observations.read_rotation + 1 if _turns_late(task) else 1
+
+
+def _num_views(task: Task) -> int:
+    """Bank rows that one id of a task has."""
+    return task.images.num_variants * (_bank_key(task)[1] + 1)
+
+
+def _bank_key(task: Task) -> tuple[ImageSet, int]:
+    """The images of a task and the rotation that is in the bank."""
+    return task.images, 0 if _turns_late(task) else task.observations.read_rotation
+
+
+def bank_bytes(tasks: Iterable[Task]) -> int:
+    """Bytes of the images that an environment holds for tasks: each different set once, one-hot vectors padded."""
+    sets = {_bank_key(task): math.prod(task.images.shape) for task in tasks}
+    shown = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
+    return shown * max(sets.values())
+
+
+def require_memory(what: str, needed: int, fewer: str) -> None:
+    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
+
+    Args:
+        what: needs memory.
+        needed: bytes at least.
+        fewer: of what to use fewer.
+    """
+    if not hasattr(os, "sysconf"):
+        return
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    require((needed < memory, f"{what} need {needed:,} bytes, this machine has {memory:,}; use fewer {fewer}"))
+
+
+class Bank(NamedTuple):
+    """All images that a pool of tasks can show, each different set of them once."""
+
+    images: Tensor  # uint8 [rows, *shape]
+    shape: tuple[int, ...]  # of an observation
+    start: dict[tuple[ImageSet, int], int]  # the first row of each image set and rotation
+    noise_levels: tuple[int, ...]  # the different values of ``read_noise``
+
+
+def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
+    """The bank of a pool.
+
+    Raises:
+        ValueError: for observations of different shapes, and for more than the machine can hold.
+    """
+    shapes = list(dict.fromkeys(task.images.shape for task in pool))
+    one_hot = all(len(shape) == 1 for shape in shapes)
+    require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
+    shape = max(shapes)
+    needed = bank_bytes(pool) + 2 * num_rows * math.prod(shape)  # a step holds two observations of every row
+    require_memory("images and observations", needed, "images or rows")
+    levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
+    banks, starts, rows = [], {}, 0
+    for key in dict.fromkeys(map(_bank_key, pool)):
+        images, rotation = key
+        bank = images.bank(rotation)
+        if one_hot:
+            bank = torch.nn.functional.pad(bank, (0, shape[0] - bank.shape[1]))
+        banks.append(bank)
+        starts[key] = rows
+        rows += len(bank)
+    return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts, levels)  # one may be large
+
+
+def of_rows(part: Any, index: Tensor) -> Any:
+    """Parameters of rows from those of their tasks; what is a table of all tasks stays one."""
+    rows = {}
+    for name, value in part._asdict().items():
+        if isinstance(value, LegacyIndex):
+            rows[name] = of_rows(value, index)
+        elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
+            rows[name] = value.index_select(0, index)
+    return part._replace(**rows)
+
+
+_TABLES: dict[type, tuple[str, ...]] = {
+    TreeParams: ("next_kind", "decides"),
+    ObservationParams: ("first_view", "views_per_node", "num_ids"),
+    LegacyIndex: ("num_ids",),
+    RewardParams: (),
+}
+"""What has not one entry for each task."""

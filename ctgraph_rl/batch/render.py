@@ -1,0 +1,249 @@
+"""Pictures of the rows of a batch: the current observation on the left, the tree and the position in it on the right.
+
+Nothing here knows an environment: `render` is a function of its arguments alone. Trees are placed in pixels, drawn at
+twice the size in palette numbers, and brought to size and to RGB by the mean of 2x2 pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.task import Task
+
+STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
+    StateType.HOME: (0, 114, 178),
+    StateType.WAIT: (86, 180, 233),
+    StateType.DECISION: (230, 159, 0),
+    StateType.END: (0, 158, 115),
+    StateType.FAIL: (213, 94, 0),
+}
+"""Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito: told apart with any colour vision."""
+
+BACKGROUND, EDGE, GOAL, OUTLINE, WAY = range(5, 10)
+EXTRA_COLOURS = (255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0)
+PALETTE = np.array([*STATE_COLOURS.values(), *EXTRA_COLOURS], np.uint16)  # a state type's number is its value
+PANEL_GREY, OFF_GREY = 208, 64  # around an observation, and where a one-hot vector is 0
+MIN_SIZE, SCALE = 48, 2  # of a picture in pixels, and of its canvas relative to it
+LEAF_WIDTH = 6  # a tree with more than size // LEAF_WIDTH end states is drawn as a summary
+MAX_STUBS = 9  # most branches that a summary draws at one decision state
+HOME_KEY, FAIL_KEY = -1, -2  # home and fail among the nodes; home is (node - 1) // b of the root
+
+
+class Mark(NamedTuple):
+    """Centre and radius of a drawn state in pixels."""
+
+    x: float
+    y: float
+    radius: float
+
+
+Pixels = NDArray[np.uint8]
+Line = tuple[Mark, Mark]
+Places = dict[int, Mark]
+
+
+def render(
+    tasks: Sequence[Task], state_type: Tensor, node: Tensor, goal_leaf: Tensor, observation: Tensor, size: int = 192
+) -> Tensor:
+    """Draw every row: its observation and its tree with the goal and the current position.
+
+    The goal has a star below it; the way so far is a thick dark line, and the current state has a black outline. On
+    failure the outline is around the fail mark, top right, and a cross is where it happened: at a decision state, which
+    stands for the wait state before it too, or at the wait state before an end. Of a tree too large for the width only
+    the paths to the current node and to the goal are drawn, with stubs for other branches.
+
+    Args:
+        tasks: the rows' tasks, N in all.
+        state_type: int64 [N], values of `StateType`.
+        node: int64 [N], heap indices of the positions.
+        goal_leaf: int64 [N], numbers of the end states with the goal.
+        observation: uint8 [N, 1, r, r], or [N, K] when one-hot.
+        size: height of a picture in pixels, at least 48.
+
+    Returns:
+        uint8 [N, size, 2 * size, 3] on the CPU.
+
+    Raises:
+        ValueError: for no rows, rows of different numbers, and a wrong shape or size.
+    """
+    n, lengths = len(tasks), [len(tensor) for tensor in (state_type, node, goal_leaf, observation)]
+    require(
+        (n > 0 and all(length == n for length in lengths), f"render needs N >= 1 rows of each, got {n} and {lengths}"),
+        (observation.ndim in (2, 4), f"observation must be [N, 1, r, r] or [N, K], got {list(observation.shape)}"),
+        (is_int(size, MIN_SIZE), f"size must be an integer >= {MIN_SIZE}, got {size!r}"),
+    )
+    pictures = np.full((n, size, 2 * size, 3), PANEL_GREY, np.uint8)
+    _show(pictures[:, :, :size], observation.detach().cpu().numpy())
+    states = zip(state_type.tolist(), node.tolist(), goal_leaf.tolist(), strict=True)
+    for picture, task, state in zip(pictures, tasks, states, strict=True):
+        picture[:, size:] = _to_rgb(_draw_row(task.graph, *state, size))
+    return torch.from_numpy(pictures)
+
+
+def _show(panels: Pixels, observation: Pixels) -> None:
+    """Put grey images in the middle of [N, size, size, 3]; cells are repeated, or shrunk by their maximum."""
+    one_hot, size = observation.ndim == 2, panels.shape[1]
+    images = _grid(observation) if one_hot else observation[:, 0]
+    room, longest = size - 2 * (size // 16), max(images.shape[1:])
+    for axis, length in enumerate(images.shape[1:], 1):
+        if longest > room:
+            images = np.maximum.reduceat(images, np.arange(length * room // longest) * longest // room, axis)
+        images = images.repeat(max(room // longest, 1), axis)
+    if one_hot and room >= 4 * longest:
+        images[:, :: room // longest] = images[:, :, :: room // longest] = PANEL_GREY
+    top, left = ((size - length) // 2 for length in images.shape[1:])
+    panels[:, top : top + images.shape[1], left : left + images.shape[2]] = images[..., None]
+
+
+def _grid(vectors: Pixels) -> Pixels:
+    """One-hot [N, K] as [N, rows, columns]: the entries row by row in a nearly square grid."""
+    n, entries = vectors.shape
+    columns = math.ceil(math.sqrt(entries))
+    grid = np.full((n, -(-entries // columns) * columns), PANEL_GREY, np.uint8)
+    grid[:, :entries] = np.where(vectors != 0, 255, OFF_GREY)
+    return grid.reshape(n, -1, columns)
+
+
+def _draw_row(graph: CTGraph, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
+    """The right half of a row's picture in palette numbers."""
+    first_leaf, unit = graph.num_decision_states, size / 192
+    goal, whole = first_leaf + goal_leaf, graph.num_end_states <= size // LEAF_WIDTH
+    base, marks, waits = _picture(graph, size, () if whole else (node, goal))
+    canvas, failed = base.copy(), kind == StateType.FAIL
+    at_wait = kind == StateType.WAIT or (failed and node >= first_leaf)
+    place = waits[node] if at_wait else marks[HOME_KEY if kind == StateType.HOME else node]
+    way = [marks[key] for key in (HOME_KEY, *_path(graph, node)[:-1])]
+    _lines(canvas, list(pairwise([*way, place])), 2 * unit, WAY)
+    _star(canvas, marks[goal], unit)
+    if failed:
+        _lines(canvas, _cross(place, place.radius + 2.5 * unit), 2 * unit, kind)
+    x, y, radius = marks[FAIL_KEY] if failed else place
+    _fill(canvas, np.array([(x, y)]), _ring(radius + 2 * unit, radius + 4.5 * unit), OUTLINE)
+    return canvas
+
+
+@lru_cache(maxsize=128)
+def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, Places, Places]:
+    """The canvas of the whole tree or of the paths to two nodes, the places of all but wait states, and of those."""
+    gap = 0.785 * size / (graph.depth + 1)
+    home, fail = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap)), Mark(size * 0.925, size * 0.075, size / 25)
+    marks = {HOME_KEY: home, FAIL_KEY: fail}
+    stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
+    edges = {node: (marks[(node - 1) // graph.branching_factor], mark) for node, mark in marks.items() if node >= 0}
+    waits = {node: _middle(*edge) for node, edge in edges.items()}
+    canvas = np.full((SCALE * size, SCALE * size), BACKGROUND, np.uint8)
+    _lines(canvas, [*edges.values(), *stubs], size / 192, EDGE)
+    _discs(canvas, [*waits.values(), *(end for _, end in stubs)], StateType.WAIT)
+    _discs(canvas, [mark for node, mark in marks.items() if 0 <= node < graph.num_decision_states], StateType.DECISION)
+    _discs(canvas, [mark for node, mark in marks.items() if node >= graph.num_decision_states], StateType.END)
+    _discs(canvas, [home], StateType.HOME)
+    _discs(canvas, [fail], StateType.FAIL)
+    _lines(canvas, _cross(fail, size / 60), size / 96, BACKGROUND)
+    return canvas, marks, waits
+
+
+def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Line]:
+    """Add every node of a small tree, each level spread over the width. No branch is a stub."""
+    b = graph.branching_factor
+    for level in range(graph.depth + 1):
+        first, width, y = (b**level - 1) // (b - 1), size / b**level, marks[HOME_KEY].y + gap * (level + 1)
+        radius = min(size / 32, 0.3 * gap, 0.39 * width)
+        marks |= {first + i: Mark((i + 0.5) * width, y, radius) for i in range(b**level)}
+    return []
+
+
+def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[Line]:
+    """Add the paths to two nodes, one column that parts where they do. Returns stubs for the other branches."""
+    b, home, radius, fan = graph.branching_factor, marks[HOME_KEY], min(size / 32, 0.3 * gap), 1.6 * gap
+    paths, stubs = [_path(graph, node) for node in nodes], []
+    marks[0] = Mark(home.x, home.y + gap, radius)
+    for level in range(1, graph.depth + 1):
+        drawn = sorted({path[level] for path in paths if len(path) > level})
+        for child in drawn:
+            start = marks[(child - 1) // b]
+            column = start.x if len(drawn) == 1 else size * (0.28 if child == drawn[0] else 0.72)
+            marks[child] = Mark(start.x + min(max(column - start.x, -fan), fan), start.y + gap, radius)
+        for parent in {path[level - 1] for path in paths if len(path) >= level}:
+            children = {child - b * parent - 1: marks[child] for child in drawn if (child - 1) // b == parent}
+            stubs += _stubs(b, marks[parent], children, gap, min(fan, size / 3 / (b - 1)))
+    return stubs
+
+
+def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> list[Line]:
+    """Short lines towards the branches that are not drawn, in their order among those that are."""
+    known: list[float] = list(children) or [(b - 1) / 2]
+    places, stubs = [child.x for child in children.values()] or [parent.x], []
+    for branch in sorted({*range(0, b, -(-b // MAX_STUBS))} - {*children}):
+        beyond = min(branch - known[0], 0) + max(branch - known[-1], 0)
+        x = float(np.interp(branch, known, places)) + beyond * fan
+        stubs.append((parent, _middle(parent, Mark(x, parent.y + gap, parent.radius))))
+    return stubs
+
+
+def _middle(a: Mark, z: Mark) -> Mark:
+    return Mark((a.x + z.x) / 2, (a.y + z.y) / 2, 0.6 * min(a.radius, z.radius))
+
+
+def _path(graph: CTGraph, node: int) -> list[int]:
+    """The nodes from the root to a node."""
+    return [*_path(graph, (node - 1) // graph.branching_factor), node] if node > 0 else [node]
+
+
+def _cross(mark: Mark, reach: float) -> list[Line]:
+    return [(Mark(mark.x - x, mark.y - reach, 0), Mark(mark.x + x, mark.y + reach, 0)) for x in (-reach, reach)]
+
+
+def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
+    """A pentagram below a state, its middle filled."""
+    x, y = mark.x, mark.y + mark.radius + 10.5 * unit
+    turns = [0.8 * math.pi * k for k in range(6)]
+    points = [Mark(x + 5.5 * unit * math.sin(turn), y - 5.5 * unit * math.cos(turn), 0) for turn in turns]
+    _lines(canvas, list(pairwise(points)), 1.5 * unit, GOAL)
+    _discs(canvas, [Mark(x, y, 2 * unit)], GOAL)
+
+
+@lru_cache(maxsize=1024)
+def _ring(inner: float, outer: float) -> NDArray[np.int64]:
+    """Offsets on the canvas between two circles, [m, 2]; those of a disc for a negative inner radius."""
+    reach = math.ceil(outer * SCALE)
+    axis = np.arange(-reach, reach + 1) / SCALE
+    distance = np.hypot(axis[:, None], axis)
+    return np.argwhere((distance > inner) & (distance <= outer)) - reach
+
+
+def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int64], colour: int) -> None:
+    """Colour the offsets around every centre (x, y) that lie on the canvas; the way goes beneath the states."""
+    points = ((centres * SCALE).round().astype(np.int64)[:, None] + offsets).reshape(-1, 2).T
+    x, y = points[:, (points.min(0) >= 0) & (points.max(0) < len(canvas))]
+    canvas[y, x] = np.where(canvas[y, x] < BACKGROUND, canvas[y, x], colour) if colour == WAY else colour
+
+
+def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
+    for radius in {mark.radius for mark in marks}:
+        _fill(canvas, np.array([mark[:2] for mark in marks if mark.radius == radius]), _ring(-1, radius), colour)
+
+
+def _lines(canvas: Pixels, lines: list[Line], width: float, colour: int) -> None:
+    ends = np.array(lines)[..., :2]
+    steps = math.ceil(SCALE * abs(ends[:, 1] - ends[:, 0]).max()) + 1
+    points = ends[:, 0] + np.linspace(0, 1, steps)[:, None, None] * (ends[:, 1] - ends[:, 0])
+    _fill(canvas, points.reshape(-1, 2), _ring(-1, width / 2), colour)
+
+
+def _to_rgb(canvas: Pixels) -> Pixels:
+    """Colours [size, size, 3], the mean of each pixel's parts; a colour's channels are looked up and added as one."""
+    packed = np.pad(PALETTE, ((0, 0), (0, 1))).view(np.uint64)[:, 0]
+    parts = packed[canvas].reshape(len(canvas) // SCALE, SCALE, -1, SCALE)
+    total = parts[:, 0, :, 0] + parts[:, 0, :, 1] + parts[:, 1, :, 0] + parts[:, 1, :, 1]
+    return (total.view(np.uint16).reshape(*total.shape, 4)[..., :3] // SCALE**2).astype(np.uint8)

@@ -1,0 +1,197 @@
+"""The fast path: steps of many rows into buffers that are allocated once, without TensorDict or Gymnasium."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from functools import cache, partial
+from types import FunctionType
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.core import dynamics, reading
+from ctgraph_rl.core.dynamics import RowParams, RowState, Seen, Uses, Words
+
+Policy = Callable[[Tensor, Tensor], Tensor]
+"""What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
+
+
+class Steps(NamedTuple):
+    """T steps of N rows. Finished rows start anew at once, so every entry is a step that was taken.
+
+    What was seen at the end of an episode is not kept: it is terminal, so nothing is to be learned from it.
+    """
+
+    observation: Tensor  # uint8 [T + 1, N, *shape]; number t is seen before action t, number T comes after the last one
+    is_init: Tensor  # bool [T + 1, N]: the observation is the first of an episode
+    action: Tensor  # int64 [T, N]
+    reward: Tensor  # float32 [T, N]
+    done: Tensor  # bool [T, N]: the step ended an episode
+    outcome: Tensor  # uint8 [T, N]: 0 running, 1 fail, 2 another end state, 3 the goal
+
+    @classmethod
+    def empty(cls, rows: Rows, num_steps: int, device: torch.device | str | None = None) -> Steps:
+        """Buffers for ``num_steps`` steps, for `rollout` to fill again and again; by default on the rows' device."""
+        require(*at_least_one(num_steps=num_steps))
+        t, n, device = num_steps, rows.num_rows, rows.device if device is None else device
+        return cls(
+            torch.empty(t + 1, n, *rows.image_shape, dtype=torch.uint8, device=device),
+            torch.empty(t + 1, n, dtype=torch.bool, device=device),
+            torch.empty(t, n, dtype=torch.int64, device=device),
+            torch.empty(t, n, device=device),
+            torch.empty(t, n, dtype=torch.bool, device=device),
+            torch.empty(t, n, dtype=torch.uint8, device=device),
+        )
+
+
+@torch.no_grad()
+def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = False) -> Steps:
+    """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
+
+    The steps are those that `CTGraphEnv` and the Gymnasium environments take with the same seeds and actions, bit for
+    bit.
+
+    Args:
+        rows: the batch. It is left where the last step led.
+        policy: what acts, or the actions, int64 [T, N].
+        steps: the buffers, from `Steps.empty`; filled in place.
+        compiled: the same bits, several times faster. On a CPU a C kernel takes the steps, as in ``Rows(...,
+            compiled=True)``, all in one call where actions are given; elsewhere ``torch.compile`` compiles the step and
+            the noise, for seconds for each batch size and kind of task.
+
+    Returns:
+        ``steps``.
+
+    Raises:
+        ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what cannot be compiled;
+            the rows stay where they were.
+    """
+    _check_buffers(rows, steps)
+    require(
+        (not rows.tasks_change, "rollout needs rows that keep their tasks; step rows with `Rows.act` and `restart`")
+    )
+    is_policy = isinstance(policy, Tensor) or callable(policy)
+    require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
+    if isinstance(policy, Tensor):
+        _check_actions(rows, policy, steps.action.shape)
+    if rows.device.type == "cpu" and (compiled or rows.compiled):
+        rows.state = _native(rows, policy, steps)
+    else:
+        rows.state = _tensors(rows, policy, steps, compiled)
+    return steps
+
+
+def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
+    """Fill buffers by the C kernel; the states that the last step led to."""
+    start = rows.state
+    state = rows.native.run(rows, start, mask=rows.is_done, observation=steps.observation[0])
+    torch.eq(state.step_count, 0, out=steps.is_init[0])
+    if isinstance(policy, Tensor):
+        steps.action.copy_(policy)
+        return _fill(rows, state, steps, slice(None))
+    for t in range(len(steps.action)):
+        steps.action[t] = _chosen(rows, policy, steps, t, start)
+        state = _fill(rows, state, steps, slice(t, t + 1))
+    return state
+
+
+def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
+    """Take the steps of a part of the buffers, whose actions are there; the states that they lead to."""
+    outputs = {name: getattr(steps, name)[part] for name in ("action", "reward", "done", "outcome")}
+    seen, is_init = steps.observation[1:][part], steps.is_init[1:][part]
+    state = rows.native.run(rows, state, len(is_init), restarts=True, observation=seen, **outputs)
+    is_init.copy_(outputs["done"])
+    return state
+
+
+def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool) -> RowState:
+    """Fill buffers by the tensor code; the states that the last step led to."""
+    params, uses, start = rows.params, rows.uses, rows.state
+    advance, noisy = (
+        _compiled(uses, rows.num_rows, str(rows.device)) if compiled else (step_and_reset, reading.add_noise)
+    )
+    state = dynamics.begin(start, rows.is_done, params, uses)
+    words = dynamics.words_of(state.tick, params, uses)
+    steps.observation[0] = dynamics.observe(state, words, params, uses)
+    torch.eq(state.step_count, 0, out=steps.is_init[0])
+    plain = not (uses.pixel_noise or uses.reward_cue or params.x.taps)
+    for t in range(len(steps.action)):
+        action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
+        state, words, reward, done, outcome, seen = advance(state, action, words, params, uses)
+        steps.action[t], steps.reward[t], steps.done[t], steps.outcome[t] = action, reward, done, outcome
+        steps.is_init[t + 1] = done
+        if plain:
+            torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
+        else:
+            steps.observation[t + 1] = dynamics.read(seen, state, params, uses, noisy)
+    return state
+
+
+def _chosen(rows: Rows, policy: Policy, steps: Steps, t: int, start: RowState) -> Tensor:
+    """What a policy does at step t; it must leave the rows as they are at the start."""
+    params = rows.params
+    action = policy(steps.observation[t], steps.is_init[t])
+    same = rows.params is params and all(map(operator.is_, rows.state, start))
+    require((same, "a policy must leave the rows as they are during a rollout: change them between two rollouts"))
+    _check_actions(rows, action, steps.action.shape[1:])
+    return action
+
+
+def step_and_reset(
+    state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses
+) -> tuple[RowState, Words, Tensor, Tensor, Tensor, Seen]:
+    """One step of every row, and the reset of those that it finishes; a pure function.
+
+    Args:
+        state: the rows' states, none of them finished.
+        action: int64 [N].
+        words: the draws of the present tick.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+
+    Returns:
+        The states after the resets and the draws of their tick; the step's reward, done and outcome; and what is seen
+        after the resets.
+    """
+    state = dynamics.advance(state, action, words, params, uses, absorbing=False)
+    done, reward = dynamics.is_done(state, params.tree), state.reward
+    outcome = dynamics.arrivals(state, done, params)[0]
+    state = dynamics.begin(state, done, params, uses)
+    words = dynamics.words_of(state.tick, params, uses)
+    return state, words, reward, done, outcome, dynamics.look(state, words, params, uses)
+
+
+@cache
+def _compiled(uses: Uses, num_rows: int, device: str) -> tuple[Callable, Callable]:
+    """The step and the noise as functions that ``torch.compile`` compiles, for one kind of batch.
+
+    Each kind compiles code objects of its own, as the number of compilations of one is limited. The option is for the
+    tests, which run this on CPUs: with inductor's own vectors the noise comes out wrong there, see `reading`.
+    """
+    compiler = partial(torch.compile, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1})
+    parts = (step_and_reset, reading.noisy)
+    return tuple(compiler(FunctionType(part.__code__.replace(), part.__globals__)) for part in parts)  # type: ignore[return-value]
+
+
+def _check_buffers(rows: Rows, steps: Steps) -> None:
+    t = len(steps.action)
+    wanted = Steps.empty(rows, t, "meta")
+    for name, buffer, like in zip(Steps._fields, steps, wanted, strict=True):
+        fits = buffer.shape == like.shape and buffer.dtype == like.dtype and buffer.device == rows.device
+        got = f"{buffer.dtype} {list(buffer.shape)} on {buffer.device}"
+        require((fits, f"buffers must be those of Steps.empty(rows, {t}), got {name} {got}"))
+
+
+def _check_actions(rows: Rows, action: Tensor, shape: torch.Size) -> None:
+    """Refuse what is no action. The range is checked on the CPU only: elsewhere the host would have to wait."""
+    spec = f"actions must be int64 of shape {list(shape)} with values in 0..{rows.max_branching}"
+    require((isinstance(action, Tensor), f"{spec}, got {type(action).__name__}"))
+    got = f"{action.dtype} {list(action.shape)}"
+    require((action.dtype == torch.int64 and action.shape == shape, f"{spec}, got {got}"))
+    if action.device.type == "cpu":
+        low, high = (int(value) for value in action.aminmax())
+        require((low >= 0 and high <= rows.max_branching, f"{spec}, got {low}..{high}"))

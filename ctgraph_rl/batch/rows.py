@@ -1,0 +1,472 @@
+"""Rows: a batch of CT-graphs as plain tensors, which every face of the environment wraps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from ctgraph_rl.batch.draw_ahead import Stock
+from ctgraph_rl.batch.native import Native, require_native
+from ctgraph_rl.batch.params import make_params, of_rows, shared_bank
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.core import dynamics, philox, reading
+from ctgraph_rl.core.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Words
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.tasks.images import white_level
+from ctgraph_rl.tasks.switch import Switch, switch_rule
+from ctgraph_rl.tasks.task import Task
+
+T = TypeVar("T")
+
+
+class Rows(nn.Module):
+    """A batch of CT-graphs without TorchRL or Gymnasium: one task, one random stream and one state per row.
+
+    ``state`` is replaced at every step and never written into, so whoever holds it keeps it. Its fields are buffers:
+    they are in ``state_dict()`` and follow ``to()``.
+
+    Args:
+        tasks: one task per row.
+        seed: decides all that is random, in [0, 2**63).
+        first_row: number of the first row, for a batch that is split.
+        task_pool: the tasks that `set_tasks` may be given; the images are fixed by it. Default: ``tasks``.
+        device: where the tensors live.
+        noise_bank: 0 draws the noise of every pixel of every observation. A number M >= 1 takes each observation's
+            noise from M that were drawn in advance, which is faster; two observations then have the same noise with
+            probability 1 / M, where the first way hardly ever repeats noise.
+        compiled: run steps as a C kernel, with the same bits; see `native`. It needs a CPU, a C compiler, and tasks
+            whose rewards are this package's own.
+
+    Raises:
+        ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.
+    """
+
+    seed: Tensor
+    row: Tensor
+    bank: Tensor
+    noises: Tensor
+    normal_table: Tensor
+    state_type: Tensor
+    node: Tensor
+    tick: Tensor
+    step_count: Tensor
+    episode_reward: Tensor
+    goal_leaf: Tensor
+    episodes_left: Tensor
+    reward: Tensor
+    paid: Tensor
+    task: Tensor
+    choice: Tensor
+    episodes: Tensor
+    tasks_change: bool
+    """Whether rows go over to other tasks where they start episodes."""
+
+    def __init__(
+        self,
+        tasks: Iterable[Task],
+        seed: int = 0,
+        first_row: int = 0,
+        task_pool: Iterable[Task] | None = None,
+        device: torch.device | str | None = "cpu",
+        noise_bank: int = 0,
+        compiled: bool = False,
+    ) -> None:
+        tasks = require_all(Task, "tasks", tasks)
+        pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
+        self.num_rows = len(tasks)
+        require(
+            seed_rule(seed),
+            (is_int(first_row, 0, 2**32 - self.num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
+            (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
+            (isinstance(compiled, bool), f"compiled must be true or false, got {compiled!r}"),
+        )
+        if compiled:
+            require_native((task.reward_fn for task in pool), device)
+        super().__init__()
+        self.compiled, self.native = compiled, Native()
+        self.pool = pool
+        self._number = {task: number for number, task in enumerate(pool)}
+        self.max_branching = max(task.graph.branching_factor for task in pool)
+        bank = shared_bank(pool, self.num_rows)
+        no_images = bank.images.new_empty(0, *bank.shape)
+        self._bank, self.image_shape = bank._replace(images=no_images), bank.shape
+        self.white = max(int(white_level(task.images)) for task in pool)
+        self.register_buffer("seed", torch.tensor([seed], device=device))
+        self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
+        self.register_buffer("bank", bank.images.to(device), persistent=False)
+        has_noise = noise_bank > 0 and max(bank.noise_levels) > 0
+        noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else no_images
+        self._noise_bank = noise_bank
+        self.register_buffer("noises", noises.to(device), persistent=False)
+        self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
+        zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
+        for field, dtype in dynamics.STATE_DTYPES.items():
+            self.register_buffer(field, zeros.to(dtype, copy=True))
+        for field in _PLACES:
+            self.register_buffer(field, zeros.clone())
+        self._stock: Stock | None = None
+        self._now: Words | None = None
+        self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
+        self.set_tasks(tasks)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        return self.row.device
+
+    @property
+    def state(self) -> RowState:
+        """The state of all rows."""
+        buffers = self._buffers
+        return RowState(*(buffers[field] for field in RowState._fields))  # type: ignore[arg-type]
+
+    @state.setter
+    def state(self, state: RowState) -> None:
+        self._stock = self._now = None
+        self._buffers.update(zip(RowState._fields, state, strict=True))
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """The task of each row."""
+        return tuple(self.pool[number] for number in self.task.tolist())
+
+    def set_tasks(self, tasks: Iterable[Task], at_episode_end: bool = False) -> None:
+        """Give every row a task, in place.
+
+        Args:
+            tasks: one task of the pool per row.
+            at_episode_end: every row ends its episode first, and has the new task from its next reset on. False: all
+                episodes end at once: `reset` before the next step.
+
+        Raises:
+            ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
+        """
+        tasks, n = require_all(Task, "tasks", tasks), self.num_rows
+        require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
+        self._plan(self._whole_pool(), self._numbers(tasks), None, at_episode_end)
+
+    def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
+        """Let the rows change between tasks from episode to episode, all of them beginning with the first.
+
+        Args:
+            tasks: at least two tasks of the pool.
+            switch: decides the task of each episode; its clock starts now.
+            at_episode_end: as in `set_tasks`.
+
+        Raises:
+            ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
+        """
+        choices = self._numbers(require_all(Task, "tasks", tasks))
+        enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
+        require(enough, switch_rule(switch))
+        self._plan(choices, torch.zeros_like(self.row), switch, at_episode_end)
+
+    def _numbers(self, tasks: tuple[Task, ...]) -> Tensor:
+        """Where tasks stand in the pool, int64."""
+        unknown = [task for task in dict.fromkeys(tasks) if task not in self._number]
+        message = f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"
+        require((not unknown, message))
+        return torch.tensor([self._number[task] for task in tasks], device=self.device)
+
+    def _whole_pool(self) -> Tensor:
+        """The pool's numbers, int64: what rows choose from without a switch."""
+        return torch.arange(len(self.pool), device=self.device)
+
+    def _plan(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
+        """Which of the choices the rows have from now on, or from their next episodes on."""
+        self._choices, self._switch = choices, switch
+        self.choice, self.episodes = choice, torch.zeros_like(choice)
+        if not at_episode_end:
+            self.task = self._planned()
+        self.tasks_change = self._may_change()
+        self._make_params()
+        self._stock = self._now = None
+        if not at_episode_end:
+            self._begin()
+
+    def _planned(self) -> Tensor:
+        """The pool's numbers of the tasks that the rows were last to have."""
+        return self._choices.index_select(0, self.choice)
+
+    def _may_change(self) -> bool:
+        """Whether a row that starts an episode may go over to another task."""
+        return self._switch is not None or bool((self.task != self._planned()).any())
+
+    def _make_params(self) -> None:
+        """The parameters of all tasks that the rows have or may go over to, and of each row."""
+        following = self._planned() if self._switch is None else self._choices
+        self._in_use = torch.cat([self.task, following]).unique()
+        different = tuple(self.pool[number] for number in self._in_use.tolist())
+
+        def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
+            return torch.tensor(values, dtype=dtype, device=self.device)
+
+        tree, x, g, self.uses = make_params(different, each, self._bank, self._noise_bank)
+        self._tables = tree, x, g
+        self._goals = each([task.goal_leaf for task in different])
+        self._take_params()
+
+    def _take_params(self) -> None:
+        """Each row's parameters, from those of its task."""
+        tables, index = self.tables
+        self.params = self._row_params(*(of_rows(part, index) for part in tables))
+        self._task_goals = self._goals.index_select(0, index)
+
+    @property
+    def tables(self) -> tuple[tuple[TreeParams, ObservationParams, RewardParams], Tensor]:
+        """The parameters of the different tasks in use, and which of these each row has, int64 [N]."""
+        return self._tables, torch.searchsorted(self._in_use, self.task)
+
+    def _start_episodes(self, mask: Tensor | None) -> None:
+        """Before the rows of a mask, or all, start an episode: go over to the tasks that are planned for them.
+
+        Only while a change is planned; the host then waits for the device.
+        """
+        if not self.tasks_change:
+            return
+        mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
+        begun = self.episodes + mask
+        if self._switch is not None:
+            self._change_choice(self._switch, begun)
+        task = torch.where(mask, self._planned(), self.task)
+        changed, self.task, self.episodes = task != self.task, task, begun
+        if changed.any():
+            self._take_params()
+            self.goal_leaf = torch.where(changed, self._task_goals, self.goal_leaf)
+            self.episodes_left = torch.where(changed, 0, self.episodes_left)
+        self.tasks_change = self._may_change()
+
+    def _change_choice(self, switch: Switch, begun: Tensor) -> None:
+        """Ask a switch for the tasks of rows that have begun so many episodes."""
+        if switch.together:
+            clock, past = ((count.sum() // self.num_rows - 1).expand_as(count) for count in (begun, self.episodes))
+            place = self.seed[:1], self.row[:1], self.tick.amax(0, keepdim=True)
+        else:
+            clock, past, place = begun - 1, self.episodes - 1, (self.seed, self.row, self.tick)
+        words = philox.draw(*place, philox.STREAM_TASK)
+        following = switch.next_task(self.choice, clock.clamp_min(1), len(self._choices), words)
+        self.choice = torch.where((clock > past) & (clock > 0), following, self.choice)
+
+    def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
+        """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
+
+        ``goal_leaf`` changes and ``tasks`` does not: `set_tasks` and `set_seed` go back to the tasks' own goals.
+
+        Args:
+            goals: for every row its decisions in 1..b, or the numbers of end states, int64 [N].
+
+        Raises:
+            ValueError: if a goal is not one of its row's tree.
+        """
+        if not isinstance(goals, Tensor):
+            goals = list(goals)
+            n = self.num_rows
+            require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
+            flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
+            require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
+            changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, map(tuple, goals), strict=True)]
+            goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
+        fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
+        require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
+        outside = (goals < 0) | (goals >= self.params.g.num_leaves)
+        require((not outside.any(), f"goals must be end states of the rows' trees, got {goals[outside][:5].tolist()}"))
+        self.goal_leaf = goals.to(self.device, copy=True)
+
+    def set_seed(self, seed: int) -> None:
+        """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
+        require(seed_rule(seed))
+        self.set_streams(torch.tensor([seed], device=self.device), self.row)
+
+    def set_streams(self, seed: Tensor, row: Tensor) -> None:
+        """Start all rows anew with random streams of their own.
+
+        Args:
+            seed: int64 [N], or [1] for all.
+            row: int64 [N], the numbers that tell rows of one seed apart.
+        """
+        self.seed, self.row = seed.clone(), row.clone()
+        self.tick = torch.zeros_like(self.row)
+        self._stock = self._now = None
+        if self.tasks_change:
+            start = self.choice if self._switch is None else torch.zeros_like(self.choice)
+            self._plan(self._choices, start, self._switch, at_episode_end=False)
+        self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
+        self._begin()
+
+    def reset(self, mask: Tensor | None = None) -> Shown:
+        """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
+        mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
+        self._start_episodes(mask)
+        if self.compiled:
+            return self._keep(*self.native.show(self, mask=mask), None)
+        words = self._draw(self.tick + mask)
+        return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
+
+    def step(self, action: Tensor) -> Shown:
+        """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
+        if self.compiled:
+            return self._keep(*self.native.show(self, action), None)
+        words = self._draw_next()
+        return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
+
+    def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
+
+        `result` tells more.
+        """
+        if self.compiled:
+            shown = self.step(action)
+            return shown.observation, shown.done
+        now, then = self._draw_next()
+        state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
+        observation = dynamics.observe(state, then, self.params, self.uses)
+        return self._keep(state, (observation, dynamics.is_done(state, self.params.tree)), then)
+
+    def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
+        """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
+        self._start_episodes(mask)
+        if self.compiled:
+            return self._keep(*self.native.show(self, action, mask), None)
+        words = self._draw_next()
+        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
+
+    def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
+        """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
+        return dynamics.outcome(self.state, done, self.params)
+
+    def restart(self, mask: Tensor | None = None, shown: Tensor | None = None) -> Tensor:
+        """`reset` of all rows, or of all finished ones, the mask: what all rows observe.
+
+        ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
+        """
+        self._start_episodes(mask)
+        if self.compiled:
+            mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
+            return self._keep(*self.native.show(self, None, mask, shown), None).observation
+        words = self._draw(self.tick + (1 if mask is None else mask))
+        return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
+
+    def _keep(self, state: RowState, result: T, words: Words | None) -> T:
+        """Go over to a state and the draws of its ticks, if there are any; the result is passed on."""
+        self._buffers.update(zip(RowState._fields, state, strict=True))
+        self._now = words
+        return result
+
+    def _draw_next(self) -> tuple[Words, Words]:
+        """The draws of the present and of the next tick."""
+        now = self._draw(self.tick) if self._now is None else self._now
+        return now, self._draw(self.tick + 1)
+
+    def _draw(self, tick: Tensor) -> Words:
+        """The draws of ticks, at most one ahead of the present."""
+        if self._stock_ticks < 2 or not (self.uses.draws or self.uses.reward_noise):
+            return dynamics.words_of(tick, self.params, self.uses)
+        if self._stock is None or self._stock.left == 0:
+            self._stock = Stock(self.params, self.uses, self.tick, self._stock_ticks)
+        return self._stock.at(tick)
+
+    def show(self) -> Shown:
+        """What all rows show now."""
+        return dynamics.show(self.state, self.params, self.uses)
+
+    @property
+    def observation_id(self) -> Tensor:
+        """The ids that the rows show now, int64 [N]."""
+        return dynamics.observation_id(self.state, self.params, self.uses)
+
+    @property
+    def is_done(self) -> Tensor:
+        """bool [N]: rows whose episode is over."""
+        return dynamics.is_done(self.state, self.params.tree)
+
+    @property
+    def branching_factor(self) -> Tensor:
+        """b of each row, int64 [N]."""
+        return self.params.tree.branching_factor
+
+    @property
+    def first_leaf(self) -> Tensor:
+        """Heap index of each row's first end state, int64 [N]."""
+        return self.params.tree.first_leaf
+
+    @property
+    def num_end_states(self) -> Tensor:
+        """b^d of each row, int64 [N]."""
+        return self.params.g.num_leaves
+
+    @property
+    def max_depth(self) -> int:
+        """The largest depth of the rows."""
+        return self.uses.max_depth
+
+    def check_actions(self, action: Tensor | None) -> None:
+        """Refuse actions of a wrong shape, dtype or range, and steps of finished rows.
+
+        Raises:
+            ValueError: saying which.
+        """
+        spec = f"action must be int64 of shape [{self.num_rows}] with values in 0..{self.max_branching}"
+        require((action is not None, f"{spec}, got none: a policy must write it before a step"))
+        assert action is not None
+        require(
+            (action.dtype == torch.int64, f"{spec}, got dtype {action.dtype}"),
+            (action.shape == (self.num_rows,), f"{spec}, got shape {list(action.shape)}"),
+        )
+        outside, finished = (action < 0) | (action > self.max_branching), self.is_done
+        if (outside | finished).any():
+            require(
+                (not outside.any(), f"{spec}, got {action[outside][:5].tolist()}"),
+                (not finished.any(), f"rows {finished.nonzero().flatten()[:5].tolist()} are done: reset them first"),
+            )
+
+    def _begin(self) -> None:
+        """End all episodes; the next one of every row is the first with its task's goal."""
+        self.goal_leaf = self._task_goals.clone()
+        self.state_type = torch.full_like(self.state_type, int(StateType.FAIL))
+        self.episodes_left = torch.zeros_like(self.episodes_left)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
+        self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
+        self.seed, self.row = self.seed.clone(), self.row.clone()
+        for field in _PLACES:
+            setattr(self, field, getattr(self, field).clone())
+        super()._load_from_state_dict(*args, **kwargs)
+        self.tasks_change = self._may_change()
+        self._make_params()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
+        """Move what is no buffer along with the buffers."""
+        super()._apply(fn, recurse)
+        self._stock = self._now = None
+
+        def moved(part: Any) -> Any:
+            if isinstance(part, tuple):
+                return type(part)(*map(moved, part)) if hasattr(part, "_fields") else tuple(map(moved, part))
+            return fn(part) if isinstance(part, Tensor) else part
+
+        for name in ("_choices", "_in_use", "_goals", "_tables"):
+            setattr(self, name, moved(getattr(self, name)))
+        self._take_params()
+        return self
+
+    def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
+        return RowParams(self.seed, self.row, tree, x, g, self.bank, self.noises, self.normal_table)
+
+
+_PLACES = ("task", "choice", "episodes")
+"""Where each row is among the tasks: its task's number in the pool, the place of the task that it is to have next among
+those that it changes between (without a switch, the pool), and the episodes that it has begun since the last change of
+plan; int64."""
+
+MAX_STOCK = 2**14
+MAX_STOCK_TICKS = 256
+
+
+def seed_rule(seed: object) -> tuple[bool, str]:
+    """The rule for seeds of environments."""
+    return is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"

@@ -1,0 +1,420 @@
+"""The functional core: pure tensor functions, without TorchRL, that every face of the environment wraps.
+
+The tree's own dynamics are in `ctgraph_rl.core.tree`; here are observations, rewards, goals and episodes.
+
+Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is drawn by counter, see `philox`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.core.philox import (
+    STREAM_GOAL,
+    STREAM_NOISE,
+    STREAM_REWARD,
+    STREAM_STEP,
+    draw,
+    normal,
+    randint,
+    randint_wide,
+)
+from ctgraph_rl.core.reading import add_cue, add_noise, add_saturating, cue_level, turn
+from ctgraph_rl.core.rewards import Arrival, RewardFn
+from ctgraph_rl.core.tree import State, TreeParams, is_done, stays, transition
+
+_HOME, _WAIT, _DECISION, _END, _FAIL = map(int, StateType)  # plain integers: torch.compile knows no IntEnum
+
+
+class LegacyIndex(NamedTuple):
+    """How `Observations.legacy_index` numbers the states of each row's task; int64."""
+
+    level_first: Tensor  # [N, D + 1]: first node of a level, in rows of less depth 2**63 - 1 beyond it
+    level_shift: Tensor  # [N, D + 1]: what is added to a node of the level
+    num_ids: Tensor  # [U * 5]: the number is taken modulo it; 1 where ids are not unique or not legacy
+
+
+class ObservationParams(NamedTuple):
+    """What the observation process X and the reading of images need to know of each row's task; int64 if not said.
+
+    An image is a row of the bank: the first view of the state's kind, plus the node's where ids are unique, plus a draw
+    of an id, plus a draw of a view, which is one of the id's instances in one of its rotations. Tables [U * 5] have an
+    entry for each of U different tasks and each state type.
+    """
+
+    first_kind: Tensor | None  # where the row's task begins in the tables; None for U = 1
+    first_view: Tensor  # [U * 5]: bank row of the first id; where unique, of node 0
+    views_per_node: Tensor  # [U * 5]: bank rows from one node to the next, 0 where ids are not unique
+    num_ids: Tensor  # [U * 5]: how many ids are drawn from; 1 where they are unique
+    bank_start: Tensor  # first bank row of the task's image set
+    num_views: Tensor  # bank rows of one id
+    num_angles: Tensor  # rotations that are not in the bank but come after the noise, at least 1
+    read_noise: Tensor
+    reward_cue: Tensor  # bool: end states show the reward
+    cue_wraps: Tensor  # bool
+    cue_element: Tensor  # which element of a vector shows it
+    white: Tensor  # float64: brightness of the cue for the goal's reward
+    noise_start: Tensor  # first row of the noise bank with the row's noise
+    legacy: LegacyIndex | None = None
+    taps: tuple[Tensor, Tensor] | None = None  # of `num_angles` rotations, see `rotation.taps_of`
+
+
+class RewardParams(NamedTuple):
+    """What rewards and goals need to know of each row's task."""
+
+    depth: Tensor  # int64
+    num_leaves: Tensor  # int64
+    reward_fn: Tensor  # int64: which of `Uses.reward_fns`
+    goal_reward: Tensor  # float32
+    fail_reward: Tensor  # float32
+    step_reward: Tensor  # float32
+    reward_std: Tensor  # float32
+    multiplicative: Tensor  # bool: the noise is a share of the reward
+    change_first: Tensor  # int64: a goal lasts at least so many episodes; 0 for ever
+    change_last: Tensor  # int64: and at most so many
+    legacy_change: Tensor  # bool: the first goal lasts one episode less
+
+
+class RowParams(NamedTuple):
+    """Everything that stays the same between two changes of tasks."""
+
+    seed: Tensor  # int64 [1], or [N] for rows with seeds of their own
+    row: Tensor  # numbers of the rows
+    tree: TreeParams
+    x: ObservationParams
+    g: RewardParams
+    bank: Tensor  # uint8 [B, *shape]
+    noise_bank: Tensor  # uint8 [B', *shape]; empty for noise of its own for every observation
+    normal_table: Tensor
+
+
+class Uses(NamedTuple):
+    """What the rows of a batch have use for, as plain Python values; the rest is not computed."""
+
+    waits: bool = True  # p > 0
+    unique_ids: bool = True
+    drawn_ids: bool = True
+    views: bool = True
+    pixel_noise: bool = True
+    noise_bank: int = 0  # how many noises an observation's is chosen from
+    reward_noise: bool = True
+    multiplicative: bool = True  # some of that noise is a share of the reward
+    fail_reward: bool = True
+    step_reward: bool = True
+    reward_cue: bool = True
+    goal_change: bool = True
+    max_depth: int = 63
+    reward_fns: tuple[RewardFn, ...] = ()
+
+    @property
+    def draws(self) -> bool:
+        """Whether a tick needs random words."""
+        return self.waits or self.drawn_ids or self.views
+
+
+class RowState(NamedTuple):
+    """All that changes in a row; int64 if not said."""
+
+    state_type: Tensor  # uint8
+    node: Tensor
+    tick: Tensor  # observations so far, of all episodes
+    step_count: Tensor
+    episode_reward: Tensor  # float32
+    goal_leaf: Tensor
+    episodes_left: Tensor  # episodes with this goal, the present one included; 0 before the first
+    reward: Tensor  # float32: the last step's reward
+    paid: Tensor  # float32: the part of it that an end or fail state paid
+
+
+STATE_DTYPES = dict.fromkeys(RowState._fields, torch.int64) | {
+    "state_type": torch.uint8,
+    "episode_reward": torch.float32,
+    "reward": torch.float32,
+    "paid": torch.float32,
+}
+
+
+class Shown(NamedTuple):
+    """What a row shows."""
+
+    observation: Tensor  # uint8 [N, *shape]
+    outcome: Tensor  # uint8
+    leaf: Tensor  # int64
+    done: Tensor  # bool
+
+
+OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)
+"""Values of ``("next", "outcome")``. Success means `OUTCOME_GOAL`, never a reward threshold."""
+
+NO_LEAF = -1
+"""Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
+
+
+def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
+    """X: the first view in the bank of the id that a state shows, by its node or drawn with a word."""
+    kind = state.state_type.long() if x.first_kind is None else x.first_kind + state.state_type
+    rows = x.first_view.index_select(0, kind)
+    if uses.unique_ids:
+        rows = rows + state.node * x.views_per_node.index_select(0, kind)
+    if x.legacy is not None:
+        level = (state.node.unsqueeze(-1) >= x.legacy.level_first).sum(-1, keepdim=True) - 1
+        number = state.node + x.legacy.level_shift.gather(-1, level).squeeze(-1)
+        rows = rows + number % x.legacy.num_ids.index_select(0, kind) * x.num_views
+    if uses.drawn_ids:
+        rows = rows + randint(word, x.num_ids.index_select(0, kind)) * x.num_views
+    return rows
+
+
+def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """The ids that rows show, int64 [N]."""
+    rows = bank_rows(state, words_of(state.tick, params, uses)[2], params.x, uses)
+    return (rows - params.x.bank_start) // params.x.num_views
+
+
+def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Tensor:
+    """The images that rows show: a random view of the id, with noise, late rotation and reward cue. uint8 [N, *shape].
+
+    Args:
+        state: the rows' states.
+        words: the small draws of the states' ticks; word 2 draws the id and word 3 the view.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+    """
+    return read(look(state, words, params, uses), state, params, uses)
+
+
+class Seen(NamedTuple):
+    """What there is to see, before it is read from the bank; int64."""
+
+    rows: Tensor  # of the bank
+    angle: Tensor  # degrees by which the images are still to be turned
+    noise: Tensor  # start of the noise, or its row in the noise bank
+
+
+def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
+    """The view in the bank that each row sees and the draws of what is not in the bank; arguments as above."""
+    x, rows = params.x, bank_rows(state, words[2], params.x, uses)
+    angle = noise = torch.zeros_like(rows)
+    if uses.views:
+        view = randint(words[3], x.num_views * x.num_angles)
+        rows, angle = rows + view // x.num_angles, view % x.num_angles
+    if uses.pixel_noise:
+        upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
+        noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
+    return Seen(rows, angle, noise)
+
+
+def read(seen: Seen, state: RowState, params: RowParams, uses: Uses, noisy: Callable = add_noise) -> Tensor:
+    """The images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape].
+
+    ``noisy`` stands for `reading.add_noise`.
+    """
+    x, images = params.x, params.bank.index_select(0, seen.rows)
+    if uses.noise_bank:
+        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
+    elif uses.pixel_noise:
+        images = noisy(images, seen.noise, x.read_noise)
+    if x.taps is not None:
+        images = turn(images, seen.angle, x.taps)
+    if uses.reward_cue:
+        level = cue_level(state.paid.double() / params.g.goal_reward, x.white, x.cue_wraps)
+        images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
+    return images
+
+
+Words = tuple[Tensor, ...]
+"""The small draws of a tick: two for a wait that begins there, one for the id and one for the view that are shown
+there, and, where rewards have noise, a normal number for the reward of the step that begins there."""
+
+
+def step(
+    state: RowState, action: Tensor, params: RowParams, uses: Uses, words: tuple[Words, Words] | None = None
+) -> tuple[RowState, Shown]:
+    """One step of every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
+
+    Args:
+        state: the rows' states.
+        action: int64, see `transition`.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+        words: the draws of the present and of the next tick, if they are at hand.
+
+    Returns:
+        The next states, with the step's reward, and what they show.
+    """
+    now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
+    state = advance(state, action, now, params, uses)
+    return state, _show(state, then, params, uses)
+
+
+def advance(
+    state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses, absorbing: bool = True
+) -> RowState:
+    """The step without what it shows, with the draws of the present tick: the next states, with the step's reward."""
+    stay = stays(words, params.tree) if uses.waits else None
+    after = transition(State(state.state_type, state.node), action, stay, params.tree)
+    entered = after.state_type != state.state_type if absorbing else None
+    paid = reward = _paid(after, entered, state.goal_leaf, words, params, uses)
+    if uses.step_reward:
+        reward = (paid.double() + params.g.step_reward).float()
+    return state._replace(
+        state_type=after.state_type,
+        node=after.node,
+        tick=state.tick + 1,
+        step_count=state.step_count + 1,
+        episode_reward=state.episode_reward + reward,
+        reward=reward,
+        paid=paid,
+    )
+
+
+def reset(
+    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Shown]:
+    """Start an episode in the rows of a mask; a pure function like `step`.
+
+    Args:
+        state: the rows' states.
+        mask: bool, the rows that start anew; the others stay as they are.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+        words: the draws of the ticks after the reset, if they are at hand.
+
+    Returns:
+        The states, and what all rows show (the others show what they showed before).
+    """
+    state = begin(state, mask, params, uses)
+    return state, show(state, params, uses, words)
+
+
+def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -> RowState:
+    """The reset without what it shows, in the rows of a mask or in all."""
+    if mask is None:
+        zeros = RowState(*map(torch.zeros_like, state))
+        state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
+        mask = torch.ones_like(state.node, dtype=torch.bool)
+    else:
+        state = _cleared(state, mask, uses)
+    return _count_episode(state, mask, params) if uses.goal_change else state
+
+
+def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
+    """Back to the home state in the rows of a mask."""
+    starts = mask.long()
+    goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
+    reward = torch.where(mask, nothing, state.reward)
+    return state._replace(
+        state_type=state.state_type * goes_on.to(torch.uint8),  # the home state is 0; faster than filling by a mask
+        node=state.node * goes_on,
+        tick=state.tick + starts,
+        step_count=state.step_count * goes_on,
+        episode_reward=torch.where(mask, nothing, state.episode_reward),
+        reward=reward,
+        paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
+    )
+
+
+def restart(
+    state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Tensor]:
+    """`reset` when it leaves no row finished: the states, and the observations alone."""
+    state = begin(state, mask, params, uses)
+    words = words_of(state.tick, params, uses) if words is None else words
+    return state, observe(state, words, params, uses)
+
+
+def step_or_reset(
+    state: RowState,
+    action: Tensor,
+    mask: Tensor,
+    params: RowParams,
+    uses: Uses,
+    words: tuple[Words, Words] | None = None,
+) -> tuple[RowState, Shown]:
+    """Start an episode in the rows of a mask, whatever their action, and step the others; else as `step`."""
+    now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
+    stepped = advance(state, action, now, params, uses)
+    state = begin(stepped._replace(tick=state.tick + ~mask), mask, params, uses)
+    return state, _show(state, then, params, uses)
+
+
+def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = None) -> Shown:
+    """What rows show in given states; a pure function like `step`."""
+    return _show(state, words_of(state.tick, params, uses) if words is None else words, params, uses)
+
+
+def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
+    """The small draws of a tick, of its shape; zeros without use."""
+    words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
+    if not uses.reward_noise:
+        return words
+    return *words, normal(draw(params.seed, params.row, tick, STREAM_REWARD)[0], params.normal_table)
+
+
+def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
+    """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
+    g, left = params.g, state.episodes_left
+    words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
+    span = g.change_last - g.change_first + 1
+    first, second = (g.change_first + randint(word, span) for word in (words[0], words[3]))
+    begins = mask & (left == 0)
+    left = torch.where(begins, first - g.legacy_change.long(), left - mask.long())
+    over = mask & (left == 0) & (g.change_first > 0)
+    goal = torch.where(over, randint_wide((words[1], words[2]), g.num_leaves), state.goal_leaf)
+    return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
+
+
+def _paid(
+    after: State, entered: Tensor | None, goal_leaf: Tensor, words: Words, params: RowParams, uses: Uses
+) -> Tensor:
+    """float32: what is paid on entering an end or a fail state.
+
+    Sums are of float32 numbers and their products in float64, hence exact: fused multiply-add changes nothing.
+    """
+    g = params.g
+    paid = _share(after, goal_leaf, params, uses) * g.goal_reward
+    if uses.reward_noise:
+        noise = (words[4] * g.reward_std).float()
+        share = torch.where(g.multiplicative, paid, 1.0) * noise.double() if uses.multiplicative else noise
+        paid = paid.double() + share
+    at_end = after.state_type == _END
+    reward = torch.where(at_end if entered is None else at_end & entered, paid, 0.0)
+    if uses.fail_reward:
+        failed = after.state_type == _FAIL
+        reward = torch.where(failed if entered is None else failed & entered, g.fail_reward, reward)
+    return reward.float()
+
+
+def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
+    """float32: the reward functions' shares, as if every row were at an end state."""
+    tree, g = params.tree, params.g
+    arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
+    share = uses.reward_fns[0](arrival)
+    for i, reward_fn in enumerate(uses.reward_fns[1:], 1):
+        share = torch.where(g.reward_fn == i, reward_fn(arrival), share)
+    return share
+
+
+def _show(state: RowState, words: Words, params: RowParams, uses: Uses) -> Shown:
+    """Observation, outcome, leaf and done of states."""
+    done = is_done(state, params.tree)
+    return Shown(observe(state, words, params, uses), *outcome(state, done, params), done)
+
+
+def outcome(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor]:
+    """The ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
+    result, arrived, leaf = arrivals(state, done, params)
+    return result, leaf.masked_fill(~arrived, NO_LEAF)
+
+
+def arrivals(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor, Tensor]:
+    """The ``OUTCOME_*`` of rows, uint8, whether they arrived at an end state, and if so at which."""
+    arrived = done & (state.state_type != _FAIL)
+    leaf = state.node - params.tree.first_leaf
+    hits = arrived & (leaf == state.goal_leaf)
+    return done.to(torch.uint8) + arrived.to(torch.uint8) + hits.to(torch.uint8), arrived, leaf

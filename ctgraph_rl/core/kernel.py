@@ -1,0 +1,173 @@
+"""The C code of the package, `kernel.c`, as a library, and the functions of it that work on tensors.
+
+It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. What
+the functions give are the bits of the tensor code, so it does not matter which of the two has run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import stat
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+
+ROWS_A_THREAD = 2048
+"""Rows for which another thread pays."""
+
+
+def num_threads(num_rows: int, most: int) -> int:
+    """How many threads to use for so many rows, at most so many."""
+    return max(1, min(torch.get_num_threads(), most, num_rows // ROWS_A_THREAD))
+
+
+def takes(*tensors: Tensor) -> bool:
+    """Whether the functions below can have these tensors: plain int64 or uint8 ones on the CPU, and a library is there.
+
+    Where something looks on, as ``torch.compile``, ``torch.vmap`` and other transforms do, it must see tensor code.
+    """
+    return (
+        not torch.compiler.is_compiling()
+        and not torch.jit.is_tracing()
+        and torch._C._functorch.peek_interpreter_stack() is None
+        and torch._C._len_torch_dispatch_stack() == 0
+        and all(type(each) is Tensor and each.is_cpu and each.dtype in _DTYPES for each in tensors)
+        and is_available()
+    )
+
+
+_DTYPES = (torch.int64, torch.uint8)
+
+
+def philox(words: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """`philox.philox` of the four words of the counter and the two of the key, int64 that broadcast."""
+    shape = torch.broadcast_shapes(*(word.shape for word in words))
+    given = [word.long() if word.numel() == 1 else word.long().expand(shape).contiguous() for word in words]
+    made = torch.empty(4, *shape, dtype=torch.int64, device="cpu")
+    count = made[0].numel()
+    library().ctgraph_philox(
+        (ctypes.c_void_p * 6)(*(word.data_ptr() for word in given)),
+        (ctypes.c_int64 * 6)(*(int(word.numel() > 1) for word in given)),
+        ctypes.c_void_p(made.data_ptr()),
+        ctypes.c_int64(count),
+        ctypes.c_int64(num_threads(count, most=-(-count // _BLOCK))),
+    )
+    return made.unbind()
+
+
+def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """`reading.add_noise`."""
+    images, start, read_noise = images.contiguous(), start.long().contiguous(), read_noise.long().contiguous()
+    made, count = torch.empty_like(images), len(images)
+    library().ctgraph_noise(
+        *(ctypes.c_void_p(each.data_ptr()) for each in (made, images, start, read_noise)),
+        ctypes.c_int64(count),
+        ctypes.c_int64(images[0].numel()),
+        ctypes.c_int64(num_threads(count, most=count)),
+    )
+    return made
+
+
+@cache
+def is_available() -> bool:
+    """Whether the library is there, or can be made; what fails is tried once a process."""
+    try:
+        library()
+    except ValueError:
+        return False
+    return True
+
+
+_BLOCK = 64
+_FLAGS = ("-O3", "-march=native", "-std=gnu11", "-ffp-contract=off", "-fwrapv", "-shared", "-fPIC")
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The functions, compiled if they were not before.
+
+    Raises:
+        ValueError: where they cannot be, saying why.
+    """
+    try:
+        return _made()
+    except (OSError, RuntimeError, AttributeError) as error:
+        raise ValueError(f"compiled=True cannot make or load its kernel: {error}; use compiled=False") from error
+
+
+def _made() -> ctypes.CDLL:
+    source = Path(__file__).with_suffix(".c")
+    compiler = shlex.split(os.environ.get("CC", "cc"))
+    path = _cache_folder() / f"native-{_key(source, compiler)}.so"
+    if not path.exists():
+        _compile(source, compiler, path)
+    _require_own(path)
+    made = ctypes.CDLL(str(path))
+    made.ctgraph_run.restype = ctypes.c_int64
+    made.ctgraph_philox.restype = made.ctgraph_noise.restype = None
+    return made
+
+
+def _key(source: Path, compiler: list[str]) -> str:
+    """What decides the machine code, hashed: the source, the flags, the compiler and the CPU."""
+    try:
+        version = subprocess.run([*compiler, "--version"], capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        fix = "install one (gcc or clang), name it in the environment variable CC, or use compiled=False"
+        raise ValueError(f"compiled=True needs a C compiler, {shlex.join(compiler)!r} does not run; {fix}") from error
+    parts = (source.read_bytes(), repr((compiler, _FLAGS)).encode(), version, _cpu().encode())
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
+
+
+def _cpu() -> str:
+    """The CPU's model and instructions."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    wanted = ("model name", "flags", "Features", "CPU part")
+    return repr((platform.machine(), platform.processor(), sorted({x for x in lines if x.startswith(wanted)})))
+
+
+def _cache_folder() -> Path:
+    """The user's own folder for compiled kernels."""
+    parent = os.environ.get("XDG_CACHE_HOME")
+    folder = (Path(parent) if parent else Path.home() / ".cache") / "ctgraph_rl"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        fix = "name a folder of yours in the environment variable XDG_CACHE_HOME"
+        message = f"compiled=True keeps its kernel in {folder}, which cannot be made ({error}); {fix}"
+        raise ValueError(message) from error
+    _require_own(folder)
+    return folder
+
+
+def _require_own(path: Path) -> None:
+    """Refuse what another user could have put there."""
+    found = path.stat()
+    own = found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    require((own, f"{path} must belong to this user and be writable by no other; remove it or set XDG_CACHE_HOME"))
+
+
+def _compile(source: Path, compiler: list[str], path: Path) -> None:
+    """Compile into a file of its own that then takes the place; without OpenMP where the compiler has none."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        for openmp in (["-fopenmp"], []):
+            command = [*compiler, *_FLAGS, *openmp, str(source), "-o", str(made), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode == 0:
+                break
+        require((done.returncode == 0, f"compiled=True: {shlex.join(command)} failed: {done.stderr[-2000:]}"))
+        made.chmod(0o700)
+        made.replace(path)

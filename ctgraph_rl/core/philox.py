@@ -1,0 +1,135 @@
+"""Random numbers by counter, as pure tensor functions: Philox4x32-10 (Salmon et al. 2011).
+
+The 128-bit counter holds (ticks of the row, row, stream and block), the 64-bit key holds the seed. Different (seed,
+row, stream, tick) are different inputs of a bijection per key, so no two rows share a block by construction, and a
+row's draws depend on nothing but its seed, its number and how many observations it has had. Unsigned 32-bit words are
+held in int64.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.core import kernel as library
+
+_WORD = 0xFFFFFFFF
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_ROUNDS = 10
+
+STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL, STREAM_TASK = range(6)
+"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal."""
+_STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
+
+
+def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+    """Philox4x32-10: four random words for a counter of four words and a key of two.
+
+    Args:
+        counter: four int64 tensors of broadcastable shapes with values in [0, 2**32).
+        key: two int64 tensors, likewise.
+
+    Returns:
+        Four int64 tensors with values in [0, 2**32).
+    """
+    return library.philox((*counter, *key)) if library.takes(*counter, *key) else by_tensors(counter, key)
+
+
+def by_tensors(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+    """`philox` where there is no C code."""
+    c0, c1, c2, c3 = counter
+    k0, k1 = key
+    for _ in range(_ROUNDS):
+        (even_high, even_low), (odd_high, odd_low) = _product(c0, _MULTIPLIERS[0]), _product(c2, _MULTIPLIERS[1])
+        c0, c1 = (odd_high ^ c1 ^ k0) & _WORD, odd_low
+        c2, c3 = (even_high ^ c3 ^ k1) & _WORD, even_low
+        k0, k1 = (k0 + _KEY_STEPS[0]) & _WORD, (k1 + _KEY_STEPS[1]) & _WORD
+    return c0, c1, c2, c3
+
+
+def _product(a: Tensor, b: Tensor | int) -> tuple[Tensor, Tensor]:
+    """The words of a 64-bit product of two words: the upper one in the low 32 bits of a number, and the lower one.
+
+    Compiled, no number may leave the range of int64: that is undefined in C++, where compilers make use of it.
+    """
+    if not torch.compiler.is_compiling():
+        product = a * b  # the low 64 bits are exact
+        return product >> 32, product & _WORD
+    rest = (a & 1) * b
+    half = (a >> 1) * b + (rest >> 1)
+    return half >> 31, ((half & 0x7FFFFFFF) << 1) | (rest & 1)
+
+
+def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | int = 0) -> tuple[Tensor, ...]:
+    """Four random words per element for (seed, row, tick, stream, block).
+
+    Args:
+        seed: int64 >= 0, any shape that broadcasts with the others.
+        row: int64 in [0, 2**32).
+        tick: int64 >= 0.
+        stream: one of the ``STREAM_*`` constants.
+        block: number of the block in [0, 2**28), for uses that need more than four words.
+    """
+    last = torch.as_tensor(block, device=tick.device) + (stream << _STREAM_SHIFT)
+    return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
+
+
+_GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 and the two factors as signed 64-bit integers
+_MIX = (-0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)
+
+
+def splitmix64(start: Tensor, count: int) -> Tensor:
+    """The first numbers of SplitMix64 (Steele, Lea and Flood 2014) for each start: cheap, for much noise at once.
+
+    Args:
+        start: int64 [...], the seed of each sequence.
+        count: how many numbers.
+
+    Returns:
+        int64 [..., count], all 64 bits random.
+    """
+    z = start.unsqueeze(-1) + _GOLDEN * torch.arange(1, count + 1, device=start.device)
+    z.bitwise_xor_((z >> 30).bitwise_and_(0x3FFFFFFFF)).mul_(_MIX[0])
+    z.bitwise_xor_((z >> 27).bitwise_and_(0x1FFFFFFFFF)).mul_(_MIX[1])
+    return z.bitwise_xor_((z >> 31).bitwise_and_(0x1FFFFFFFF))
+
+
+def randint(word: Tensor, high: Tensor | int) -> Tensor:
+    """A word as an integer in [0, high); each value's probability is off by less than 2**-32."""
+    return (word * high) >> 32
+
+
+def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
+    """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
+    upper, lower = words
+    high_upper, high_lower = high >> 32, high & _WORD
+    middle_high, middle_low = _product(upper, high_lower)
+    carry = (_product(lower, high_lower)[0] & _WORD) + middle_low + lower * high_upper
+    return upper * high_upper + (middle_high & _WORD) + (carry >> 32)
+
+
+_NORMAL_CELLS = 256
+_NORMAL_UNIT = 2.0**-20
+
+
+def normal_table() -> Tensor:
+    """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30, for `normal`; float64."""
+    cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64)
+    octave = (cell / _NORMAL_CELLS).floor()
+    tail = (1 + cell / _NORMAL_CELLS - octave) * 2 ** (octave - 1 - 32)
+    return (-torch.special.ndtri(tail) / _NORMAL_UNIT).round() * _NORMAL_UNIT
+
+
+def normal(word: Tensor, table: Tensor) -> Tensor:
+    """A word as a standard normal number, a multiple of 2**-20 up to 6.3 in size; float64.
+
+    The inverse distribution function by linear interpolation in 256 cells per octave of the tail probability. Every
+    operation is exact in float64, so devices and compiled code agree bit by bit.
+    """
+    tail = ((word >> 1).to(torch.float64) + 0.5).view(torch.int64)  # the bits of a double: octave, cell, place in it
+    cell = (tail >> 44) - (1022 << 8)
+    place = (tail & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
+    low, high = table[cell], table[cell + 1]
+    size = ((low + (high - low) * place) / _NORMAL_UNIT).round() * _NORMAL_UNIT
+    return torch.where((word & 1).bool(), size, -size)

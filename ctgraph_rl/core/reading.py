@@ -1,0 +1,123 @@
+"""What changes an image when it is read: noise, late rotation and the reward cue, as pure tensor functions.
+
+Shapes: N rows; every tensor is [N] unless said otherwise.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core.philox import STREAM_NOISE, draw, splitmix64
+
+
+def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """Add to each pixel an independent integer drawn from 0..read_noise, saturating at 255.
+
+    A pixel has 16 bits of the SplitMix64 sequence of its observation, so each value's probability is off by less than
+    2**-16.
+
+    Args:
+        images: uint8 [N, 1, r, r].
+        start: int64, a random start of the sequence for each observation.
+        read_noise: largest addition per row, 0..255.
+
+    Returns:
+        uint8 [N, 1, r, r].
+    """
+    return _opaque(images, start, read_noise) if torch.compiler.is_compiling() else _added(images, start, read_noise)
+
+
+_NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
+
+
+def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    given = images, start, read_noise
+    fits = images.dtype == torch.uint8 and start.shape == read_noise.shape == images.shape[:1]
+    return library.add_noise(*given) if fits and library.takes(*given) else by_parts(*given)
+
+
+def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """`add_noise` where there is no C code."""
+    parts = zip(*(part.split(_NOISE_ROWS) for part in (images, start, read_noise)), strict=True)
+    noised = [noisy(*part) for part in parts]
+    return noised[0] if len(noised) == 1 else torch.cat(noised)
+
+
+def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """`add_noise` in one piece."""
+    pixels, high = images[0].numel(), (read_noise + 1).to(torch.int32).unsqueeze(-1)
+    bits = splitmix64(start, (pixels + 3) // 4).view(torch.uint16)[:, :pixels].to(torch.int32)
+    noise = bits.mul_(high).bitwise_right_shift_(16).to(torch.uint8)
+    return add_saturating(images, noise.view_as(images))
+
+
+# Inductor of torch 2.13 writes beyond its buffers when it fuses the noise with what comes before it. As an operator of
+# its own it stays whole; `fast` compiles it alone, in a way that is right.
+_opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
+_opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
+
+
+def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Tensor:
+    """Noise drawn in advance: for each largest addition so many noises, uint8 [levels * size, *shape]."""
+    numbers = torch.arange(len(levels) * size)
+    upper, lower, *_ = draw(torch.tensor(0), numbers, torch.tensor(0), STREAM_NOISE)
+    black = torch.zeros(len(numbers), *shape, dtype=torch.uint8)
+    return add_noise(black, (upper << 32) | lower, torch.tensor(levels).repeat_interleave(size))
+
+
+def add_saturating(images: Tensor, noise: Tensor) -> Tensor:
+    """The sum of two uint8 tensors of the same shape, at most 255."""
+    return images + torch.minimum(noise, 255 - images)
+
+
+def cue_level(share: Tensor, white: Tensor, wraps: Tensor) -> Tensor:
+    """The brightness of a reward: white for the goal's, 0 for none, in between cut off; uint8.
+
+    Args:
+        share: float64, the reward as a share of the goal's.
+        white: float64.
+        wraps: bool, the rows where a level out of range is taken modulo 256; in the others it saturates.
+    """
+    level = (share * white).trunc()
+    saturated = torch.minimum(level.clamp_min(0), white.trunc())
+    return torch.where(wraps, level.remainder(256), saturated).to(torch.uint8)
+
+
+def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Tensor:
+    """Show a brightness as a square in the middle half of images, or as an element of vectors.
+
+    Args:
+        images: uint8 [N, 1, r, r] or [N, K].
+        level: uint8.
+        shows: bool, the rows that show it.
+        element: int64, which element of a vector shows it.
+
+    Returns:
+        uint8 of the shape of ``images``.
+    """
+    size, ones = images.shape[-1], (1,) * (images.ndim - 1)
+    place = torch.arange(size, device=images.device)
+    if images.ndim == 2:
+        inside = place == element.unsqueeze(-1)
+    else:
+        middle = (place >= size // 4) & (place < size - size // 4)
+        inside = middle & middle.unsqueeze(-1)
+    return torch.where(shows.view(-1, *ones) & inside, level.view(-1, *ones), images)
+
+
+def turn(images: Tensor, angle: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
+    """Rotate each image by its own angle, as `rotation.rotate` does.
+
+    Args:
+        images: uint8 [N, 1, r, r].
+        angle: int64, whole degrees in [0, A).
+        taps: `rotation.taps_of` A angles, int64 [A, r * r, 4] each.
+
+    Returns:
+        uint8 [N, 1, r, r].
+    """
+    index, weight = (table[angle] for table in taps)
+    sources = images.flatten(1).to(torch.int64).gather(1, index.flatten(1)).view(index.shape)
+    return (((sources * weight).sum(-1) + (1 << 15)) >> 16).to(torch.uint8).view(images.shape)

@@ -1,0 +1,116 @@
+"""A run in another program's format.
+
+``--format parquet`` writes the tidy tables of a run as Parquet and CSV, see `ctgraph_rl.log.tables`.
+
+``ctgraph-rl export RUN --format l2logger --out DIR`` writes what l2metrics reads: log format 1.1 of l2logger.
+A training interval, and an evaluation of a task, is one experience with its mean return as ``reward``. Time stamps
+count experiences, so that equal runs give equal files; a runtime that is taken from them means nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterator, Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.log.files import LOG
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.tables import write_tables
+from ctgraph_rl.metrics import Regime
+
+COLUMNS = (
+    "block_num",
+    "exp_num",
+    "worker_id",
+    "block_type",
+    "block_subtype",
+    "task_name",
+    "task_params",
+    "exp_status",
+    "timestamp",
+    "reward",
+)
+WORKER = "worker0"
+START = datetime(2000, 1, 1)
+FORMATS = ("l2logger", "parquet")
+
+
+def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
+    """Write regimes as a log of l2logger 1.1.
+
+    Args:
+        regimes: a run, such as of `RunLog.regimes`, or an expert's, which trains one task.
+        folder: is made; l2metrics calls the run by its name.
+
+    Raises:
+        ValueError: if the folder holds something.
+    """
+    folder = Path(folder)
+    require((not folder.exists() or not any(folder.iterdir()), f"{folder} must be empty or new; choose another folder"))
+    names = task_names(regimes)
+    tables: dict[tuple[int, str], list[str]] = {}
+    experience = 0
+    for block, regime in numbered(regimes):
+        kind = "train" if regime.training else "test"
+        rows = tables.setdefault((block, kind), ["\t".join(COLUMNS)])
+        for value in regime.values.tolist():
+            stamp = (START + timedelta(seconds=experience)).strftime("%Y%m%dT%H%M%S.%f")
+            what = (block, experience, WORKER, kind, "wake", names[regime.task], "{}", "complete", stamp, repr(value))
+            rows.append("\t".join(map(str, what)))
+            experience += 1
+    for (block, kind), rows in tables.items():
+        where = folder / WORKER / f"{block}-{kind}"
+        where.mkdir(parents=True)
+        (where / "data-log.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    about = {"metrics_columns": ["reward"], "log_format_version": "1.1"}
+    scenario = {"complexity": "1-low", "difficulty": "1-easy", "scenario_type": "custom"}
+    (folder / "logger_info.json").write_text(json.dumps(about) + "\n", encoding="utf-8")
+    (folder / "scenario_info.json").write_text(json.dumps(scenario) + "\n", encoding="utf-8")
+
+
+def numbered(regimes: Sequence[Regime]) -> Iterator[tuple[int, Regime]]:
+    """Regimes with block numbers from 0: a block per training, and one for the evaluations of different tasks after it.
+
+    l2metrics would take two evaluations of a task in one block for one.
+    """
+    block = -1
+    evaluated: set[str] | None = None
+    for regime in regimes:
+        if regime.training or evaluated is None or regime.task in evaluated:
+            block, evaluated = block + 1, None if regime.training else set()
+        if evaluated is not None:
+            evaluated.add(regime.task)
+        yield block, regime
+
+
+def task_names(regimes: Sequence[Regime]) -> dict[str, str]:
+    """Names of the form that l2logger asks for, in lower case: ``ctgraph_1goal11`` for the first task, ``goal1.1``."""
+    tasks = dict.fromkeys(regime.task for regime in regimes)
+    return {task: f"ctgraph_{i}{re.sub('[^0-9a-z]', '', task.lower())}" for i, task in enumerate(tasks, 1)}
+
+
+def main() -> None:
+    """Export a run directory."""
+    parser = argparse.ArgumentParser(prog="ctgraph-rl export", description=__doc__)
+    parser.add_argument("run", type=Path, help="a run directory")
+    parser.add_argument("--format", choices=FORMATS, default=FORMATS[0], help="the format to write")
+    parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
+    arguments = parser.parse_args()
+    try:
+        log = RunLog.read(arguments.run / LOG)
+        if arguments.format == "parquet":
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            write_tables(log, arguments.out, parquet=True)
+        else:
+            write_l2logger(log.regimes(), arguments.out)
+    except (OSError, ValueError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+    print(f"{arguments.format}: {arguments.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""What a run's numbers depend on, for the first line of its log."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of what computes its numbers."""
+    import tensordict
+    import torch
+    import torchrl
+
+    from ctgraph_rl import __version__
+
+    return {
+        "ctgraph_rl": __version__,
+        "torch": torch.__version__,
+        "torchrl": torchrl.__version__,
+        "tensordict": tensordict.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def named(curriculum: Curriculum) -> Curriculum:
+    """The curriculum, with ``(modified)`` behind its name if it is not what is published under that name."""
+    published = import_module("curricula")
+    known = curriculum.name in published.names()
+    if not known or published.load(curriculum.name).fingerprint == curriculum.fingerprint:
+        return curriculum
+    return replace(curriculum, name=f"{curriculum.name} (modified)")
+
+
+def provenance(curriculum: Curriculum) -> dict[str, Any]:
+    """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
+    from ctgraph_rl.log.run_log import SCHEMA
+
+    return {
+        "schema": SCHEMA,
+        "curriculum": named(curriculum).name,
+        "version": curriculum.version,
+        "fingerprint": curriculum.fingerprint,
+        "source": curriculum.source,
+        "tasks": list(curriculum.labels),
+        "trained": [[number + 1 for number in block] for block in curriculum.trained],
+        "versions": versions(),
+        **machine(),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
+    import torch
+
+    kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    return {"machine": kind, "num_threads": torch.get_num_threads()}

@@ -1,0 +1,293 @@
+"""RunLog: append measurements to ``run.jsonl``, read them back as matrices, curves and regimes.
+
+Every line is one JSON object with a ``kind``. Schema 1:
+
+- ``run``: the first line: ``schema``, curriculum, configuration, seed, versions; ``trained``, the task numbers of each
+  block, such as ``[[1], [2]]``.
+- ``training``: one interval of a block: ``block`` from 1, ``frames`` of the run so far, finished ``episodes`` and their
+  ``return_mean``, ``success_rate``, ``end_rate`` (the share that reached an end state) and ``length_mean``; what the
+  agent reports of the batch. A batch that goes over a hidden boundary is a line for each block, and an episode counts
+  where it ends, though its task may be that of the block before.
+- ``evaluation``: means over the evaluation episodes of one task. ``moment`` says when: ``before`` any training (block
+  0), ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1; held-out tasks, marked
+  ``held_out``, count on from there.
+
+What is not finite, such as a mean over no episodes, is null. ``seconds`` is the time since the start of the run, and
+the only field that differs between two equal runs. A reader in three lines, for what `RunLog.read` does not give::
+
+    import json
+    with open("run.jsonl", encoding="utf-8") as file:
+        measurements = [json.loads(line) for line in file]
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.log.files import cannot_write, write_whole
+from ctgraph_rl.log.measurement import check, parsed
+from ctgraph_rl.metrics import Curves, Regime
+
+MOST_CELLS = 10**7
+"""Largest table that is made of a log."""
+
+SCHEMA = 1
+"""Raised when a line means something else than before; fields may be added without."""
+
+
+class RunLog:
+    """Measurements of one run, in memory and, with a path, in a file that is written line by line.
+
+    ``listeners`` are called with every measurement that is appended.
+
+    Args:
+        path: the file to append to; None keeps measurements in memory only.
+
+    Raises:
+        FileExistsError: if the file exists.
+    """
+
+    def __init__(self, path: Path | str | None = None) -> None:
+        self.measurements: list[dict[str, Any]] = []
+        self.torn_lines = 0
+        self.listeners: list[Callable[[dict[str, Any]], object]] = []
+        self._start = time.perf_counter()
+        self._path = None if path is None else Path(path)
+        self._file: BinaryIO | None = None
+        if self._path is not None:
+            self._file = self._path.open("xb", buffering=0)
+
+    @classmethod
+    def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
+        """Go on writing a log from a `position`; the lines after it are removed.
+
+        Raises:
+            ValueError: if the file ends before it, or a line is no measurement.
+        """
+        path, size = Path(path), int(position["bytes"])
+        there = path.stat().st_size
+        require((there >= size, f"{path} has {there} bytes and the checkpoint needs {size}: restore the file"))
+        os.truncate(path, size)
+        log = cls.read(path)
+        require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
+        log._path, log._file = path, path.open("ab", buffering=0)
+        log._start -= position["seconds"]
+        return log
+
+    def position(self) -> dict[str, float]:
+        """How far the file is, in bytes that have reached the disk, and the time of the run, in seconds."""
+        size = 0
+        if self._file is not None and self._path is not None:
+            size = self._file.tell()
+            try:
+                os.fsync(self._file.fileno())
+            except OSError as error:
+                raise cannot_write(self._path, size, error) from error
+        return {"bytes": size, "seconds": round(time.perf_counter() - self._start, 3)}
+
+    def append(self, kind: str, **values: Any) -> None:
+        """Add one measurement; NaN and infinity become null, as JSON has neither."""
+        finite = {name: _finite(value) for name, value in values.items()}
+        measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
+        self.measurements.append(measurement)
+        if self._file is not None and self._path is not None:
+            line = json.dumps(measurement).encode() + b"\n"
+            try:
+                written = self._file.write(line)
+                while written < len(line):  # a full disk takes a part, and says so at the next attempt
+                    written += self._file.write(line[written:])
+            except OSError as error:
+                raise cannot_write(self._path, len(line), error) from error
+        for listener in self.listeners:
+            listener(measurement)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+    @classmethod
+    def read(cls, path: Path | str) -> RunLog:
+        """The log of a run directory's ``run.jsonl``, in memory.
+
+        A last line that was torn when the run was killed is left out and counted in ``torn_lines``.
+
+        Raises:
+            ValueError: for any other line that is no measurement, and for a newer schema.
+        """
+        log = cls()
+        lines = Path(path).read_bytes().splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                log.measurements.append(parsed(line))
+            except ValueError:
+                require((number == len(lines), f"{path}: line {number} is no measurement; restore the file"))
+                log.torn_lines = 1
+        for number, measurement in enumerate(log.measurements, 1):
+            try:
+                check(measurement)
+            except ValueError as error:
+                raise ValueError(f"{path}: line {number}: {error}") from None
+        for run in log.of_kind("run"):
+            newer = run.get("schema", SCHEMA) > SCHEMA
+            require(
+                (not newer, f"{path} has schema {run.get('schema')}, this version reads {SCHEMA}: update ctgraph_rl")
+            )
+        return log
+
+    def of_kind(self, kind: str) -> list[dict[str, Any]]:
+        """Measurements of one kind, in order."""
+        return [measurement for measurement in self.measurements if measurement["kind"] == kind]
+
+    def performance(self, num_tasks: int = 0) -> Tensor:
+        """The performance matrix: mean return, float64 [blocks + 1, tasks]; NaN where not, or not yet, evaluated.
+
+        Blocks and tasks are those that the log says are trained; where it does not say, those so far.
+
+        Args:
+            num_tasks: columns that there are at least, for tasks that were never evaluated.
+        """
+        num_rows = max(len(self.ends()), 1 + len(self._said()))
+        rows: dict[int, dict[int, float]] = {block: {} for block in range(num_rows)}
+        for m in self._evaluations(during=False):
+            rows[m["block"]][m["task"]] = m["return_mean"]
+        return self._matrix(rows.values(), num_tasks)
+
+    def ends(self) -> list[int]:
+        """Frames of the run at the end of each block so far; 0 for block 0, before any training."""
+        ends = {0: 0}
+        for m in self.measurements:
+            if m["kind"] in ("training", "evaluation"):
+                ends[m["block"]] = m["frames"]
+        return [ends.get(block, 0) for block in range(max(ends) + 1)]
+
+    def training(self, name: str, block: int | None = None) -> Tensor:
+        """A field of the training intervals, of one block or of all, float64 [intervals]; NaN where it is null."""
+        intervals = [m for m in self.of_kind("training") if block in (None, m["block"])]
+        return _row([m.get(name) for m in intervals])
+
+    def last(self, name: str, num_tasks: int = 0) -> Tensor:
+        """A field of the last evaluation of each task at a boundary, float64 [tasks]; NaN where there is none.
+
+        Args:
+            name: the field.
+            num_tasks: see `performance`.
+        """
+        return self._matrix([{m["task"]: m.get(name) for m in self._evaluations(during=False)}], num_tasks)[0]
+
+    def curves(self, trained: Sequence[Sequence[int]] | None = None) -> Curves:
+        """All evaluations of the curriculum's tasks in time order, those during blocks included.
+
+        Args:
+            trained: for each block, its tasks counted from 0; default: as the log says.
+
+        Raises:
+            ValueError: if nothing was evaluated.
+        """
+        points: dict[tuple[int, int], dict[int, float]] = {}
+        for m in self._evaluations(during=True):
+            points.setdefault((m["block"], m["frames"]), {})[m["task"]] = m["return_mean"]
+        require((bool(points), "this log has no evaluation"))
+        blocks, frames = zip(*points, strict=True)
+        of_blocks = self._trained(trained)
+        num_tasks = 1 + max(task for block in of_blocks for task in block)
+        return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
+
+    def regimes(self, trained: Sequence[Sequence[int]] | None = None) -> list[Regime]:
+        """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
+
+        An experience is a training interval with finished episodes. Evaluations during blocks and of held-out tasks
+        are left out.
+
+        Args:
+            trained: for each block, its tasks counted from 0; default: as the log says.
+
+        Raises:
+            ValueError: for a block that trains several tasks, whose effects cannot be told apart, one without a
+                finished episode, and a task that was never evaluated.
+        """
+        tasks = [sorted(set(block)) for block in self._trained(trained)]
+        mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
+        require(
+            (not mixed, f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several")
+        )
+        labels = {m["task"] - 1: m["label"] for m in self._evaluations(during=True)}
+        require((all(block[0] in labels for block in tasks), "lifelong metrics need an evaluation of every task"))
+        regimes = []
+        for block in range(len(tasks) + 1):
+            if block:
+                returns = self.training("return_mean", block)
+                regimes.append(Regime(labels[tasks[block - 1][0]], True, returns[~returns.isnan()]))
+            at_end = [m for m in self._evaluations(during=False) if m["block"] == block]
+            regimes += [Regime(m["label"], False, _row([m["return_mean"]])) for m in at_end]
+        return regimes
+
+    def _trained(self, trained: Sequence[Sequence[int]] | None) -> tuple[tuple[int, ...], ...]:
+        if trained is None:
+            trained = self._said()
+            require((bool(trained), "this log does not say what each block trained: give trained, Curriculum.trained"))
+        return tuple(tuple(block) for block in trained)
+
+    def _said(self) -> list[list[int]]:
+        """The tasks of each block, counted from 0, if the first line says them."""
+        said = [run["trained"] for run in self.of_kind("run") if "trained" in run]
+        return [[number - 1 for number in block] for block in said[0]] if said else []
+
+    def _evaluations(self, during: bool) -> Iterator[dict[str, Any]]:
+        """Evaluations of the curriculum's own tasks."""
+        own = (m for m in self.of_kind("evaluation") if not m.get("held_out"))
+        return (m for m in own if during or m.get("moment") != "during")
+
+    def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
+        """Rows of values by task number, NaN where a row has none."""
+        trained = [number + 1 for block in self._said() for number in block]
+        evaluated = [m["task"] for m in self._evaluations(during=True)]
+        tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
+        rows = list(rows)
+        size = len(rows) * len(tasks)
+        require((size <= MOST_CELLS, f"a table of {len(rows):,} x {len(tasks):,} is no run's: restore the log"))
+        return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
+
+
+def _row(values: Sequence[float | None]) -> Tensor:
+    return torch.tensor([math.nan if value is None else value for value in values], dtype=torch.float64)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> None:
+    """Write the performance matrix as CSV: one line per block so far, block 0 before any training.
+
+    Args:
+        path: file to write.
+        log: the run's log.
+        labels: a name per task, the last columns.
+    """
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["block", "frames", *labels])
+        so_far = zip(log.ends(), log.performance().tolist(), strict=False)
+        for block, (frames, row) in enumerate(so_far):
+            writer.writerow([block, frames, *row])
+
+
+def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
+    """Write metrics as JSON: for each name the value, its definition, formula and source, or why it is undefined.
+
+    One run is one seed, and has no interval; `ctgraph_rl.report.results` has those of several.
+    """
+    content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())

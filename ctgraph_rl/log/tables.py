@@ -1,0 +1,121 @@
+"""A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
+
+CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
+tables of many runs can be put below each other. What is undefined or was not measured is an empty cell, or null. A
+reader in three lines::
+
+    import csv
+    with open("evaluations.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+
+and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("evaluations.parquet")``.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.log.run_log import RunLog
+
+RUN = {
+    "curriculum": ("string", "name of the curriculum"),
+    "fingerprint": ("string", "what the curriculum is, in 16 digits"),
+    "seed": ("int64", "seed of the run"),
+}
+EPISODES = {
+    "episodes": ("int64", "finished episodes"),
+    "return_mean": ("double", "their mean return"),
+    "success_rate": ("double", "share that reached the goal"),
+    "end_rate": ("double", "share that reached an end state"),
+    "length_mean": ("double", "their mean steps"),
+}
+SECONDS = {"seconds": ("double", "since the start of the run; the only column that differs between equal runs")}
+
+EVALUATIONS = {
+    **RUN,
+    "block": ("int64", "block in or after which it was made; 0 before any training"),
+    "moment": ("string", "`before` any training, `during` a block, or `after` it"),
+    "frames": ("int64", "frames learned so far"),
+    "task": ("int64", "number of the task from 1; held-out tasks count on"),
+    "label": ("string", "short name of the task"),
+    "held_out": ("bool", "whether no block trains the task"),
+    **EPISODES,
+    **SECONDS,
+}
+"""Columns of ``evaluations``: type and meaning."""
+
+TRAINING = {
+    **RUN,
+    "block": ("int64", "block from 1"),
+    "frames": ("int64", "frames learned so far, this interval included"),
+    **EPISODES,
+    **SECONDS,
+}
+"""Columns of ``training``: type and meaning; what the agent reports follows, each a double."""
+
+TABLES = {"evaluation": ("evaluations", EVALUATIONS), "training": ("training", TRAINING)}
+
+
+def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -> list[Path]:
+    """Write ``evaluations`` and ``training`` into a folder.
+
+    Args:
+        log: the run's log.
+        folder: where they go.
+        parquet: write Parquet, too; None writes it where pyarrow is installed.
+
+    Returns:
+        The files.
+
+    Raises:
+        ModuleNotFoundError: with ``parquet=True`` and without pyarrow; names the extra to install.
+    """
+    written = []
+    for kind, (name, columns) in TABLES.items():
+        types = _types(log, kind, columns)
+        rows = list(_rows(log, kind, list(types)))
+        written.append(Path(folder) / f"{name}.csv")
+        with written[-1].open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([list(types), *rows])
+        arrow = None if parquet is False else _pyarrow(needed=parquet is True)
+        if arrow is not None:
+            written.append(Path(folder) / f"{name}.parquet")
+            _write_parquet(arrow, written[-1], types, rows)
+    return written
+
+
+def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[str, str]:
+    """Type of each column; what else the log has follows as numbers, in the order of first appearance."""
+    names = dict.fromkeys(name for measurement in log.of_kind(kind) for name in measurement)
+    extra = {name: "double" for name in names if name != "kind" and name not in columns}
+    return {name: type_ for name, (type_, _) in columns.items()} | extra
+
+
+def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
+    about = (log.of_kind("run") or [{}])[0]
+    run = {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint")}
+    run["seed"] = about.get("config", {}).get("seed")
+    for measurement in log.of_kind(kind):
+        row = {**run, **measurement}
+        yield [row.get(name) for name in names]
+
+
+def _write_parquet(arrow: Any, path: Path, types: dict[str, str], rows: Sequence[Sequence[Any]]) -> None:
+    from pyarrow import parquet
+
+    schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])
+    values = [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in types]
+    parquet.write_table(arrow.table(values, schema=schema), path)
+
+
+def _pyarrow(needed: bool) -> Any:
+    try:
+        import pyarrow
+    except ModuleNotFoundError as error:
+        if not needed:
+            return None
+        raise ModuleNotFoundError("Parquet tables need pyarrow: pip install 'ctgraph_rl[tables]'") from error
+    return pyarrow

@@ -1,0 +1,397 @@
+"""Many runs as one table: each agent on each curriculum, with intervals over seeds.
+
+``ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--format latex] [--csv FILE]``
+
+Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
+undefined metric is counted, as in n = 9/10. What cannot be read is named and left out, and the exit code is then 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import html
+import math
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+from ctgraph_rl import metrics
+from ctgraph_rl.checks import positive, require
+from ctgraph_rl.report.statistics import (
+    Comparison,
+    Estimate,
+    compare,
+    interquartile_mean,
+    mean,
+    seeds_needed,
+    solved_rate,
+)
+from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
+
+SOLVED = 0.9
+"""Success rate from which on a task counts as solved."""
+
+AGAINST_EXPERTS = (
+    *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
+    *("continual_world_forward_transfer", "forward_transfer_from_experts"),
+)
+"""Metrics that are shown where some run of a curriculum has a value."""
+
+SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "mean_final_return", "solved_rate")
+"""Measures that are always shown."""
+
+_HERE = metrics.record.HERE
+AT_END = {
+    "mean_final_return": metrics.Definition(
+        f"{_HERE}/mean-return-at-end", "mean over tasks of the mean return at their last evaluation", _HERE
+    ),
+    "solved_rate": metrics.Definition(
+        f"{_HERE}/share-solved-at-end>={SOLVED}", f"share of tasks with a last success rate >= {SOLVED}", _HERE
+    ),
+    "interquartile_return": metrics.Definition(
+        "agarwal2021/iqm",
+        "mean of the middle half of the mean returns at the last evaluations of all tasks and seeds",
+        "Agarwal et al. 2021, Deep RL at the edge of the statistical precipice (arXiv 2108.13264)",
+    ),
+    "solved": metrics.Definition(
+        f"{_HERE}/solved-at-end>={SOLVED}", f"share of seeds whose last success rate on the task is >= {SOLVED}", _HERE
+    ),
+}
+"""Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
+
+NO_RUN_FINISHED = "every_metric"
+"""The measure of the only row of an agent none of whose runs finished."""
+
+MEANS = "mean [Student's 95 % interval]"
+LEGEND = f"{MEANS}, share of solved seeds [exact one]"
+
+HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Args:
+        curriculum: its name.
+        agent: the agent's class or name, and the settings in which it differs from others of that; or a directory.
+        measure: a metric, a measure of how tasks ended, or ``solved`` and a task.
+        estimate: over seeds.
+        definition: id of the metric's definition.
+        note: why seeds have no value.
+    """
+
+    curriculum: str
+    agent: str
+    measure: str
+    estimate: Estimate
+    definition: str
+    note: str
+
+
+def table(runs: Sequence[Run]) -> list[Row]:
+    """Every metric, and how tasks ended, for each agent on each curriculum."""
+    groups = grouped(runs).items()
+    return [
+        Row(name, agent, *line)
+        for (name, agent), by_seed in groups
+        for line in (*_metrics(by_seed), *_at_the_end(by_seed))
+    ]
+
+
+def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
+    """Every pair of agents on the same curriculum and seeds, by (curriculum, first, second).
+
+    Raises:
+        ValueError: if no run has the metric; lists those that there are.
+    """
+    choices = dict.fromkeys(name for run in runs for name in run.metrics)
+    require((metric in choices, f"no run has a metric {metric!r}; there are: {', '.join(choices) or 'none'}"))
+    found = {}
+    for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
+        if first[0] == second[0] and list(one) == list(other):
+            values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
+            found[first[0], first[1], second[1]] = compare(values, others)
+    return found
+
+
+def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Row]:
+    """The rows of some measures; agents none of whose runs finished stay.
+
+    Args:
+        rows: the whole table.
+        names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `AGAINST_EXPERTS` where a run
+            of the curriculum has a value.
+
+    Raises:
+        ValueError: for a name that no row has; lists those that there are.
+    """
+    choices = list(dict.fromkeys(row.measure.split(" ")[0] for row in rows if row.measure != NO_RUN_FINISHED))
+    unknown = [name for name in names or () if name not in choices]
+    message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
+    require((not choices or not unknown, message))
+    with_value = {(row.curriculum, row.measure) for row in rows if row.measure in AGAINST_EXPERTS and row.estimate.n}
+    always = (*(SHOWN if names is None else names), NO_RUN_FINISHED)
+    return [
+        row
+        for row in rows
+        if row.measure.split(" ")[0] in always or (names is None and (row.curriculum, row.measure) in with_value)
+    ]
+
+
+def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
+    """Write the table, empty cells for what is undefined."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(HEADER)
+        for row in rows:
+            e = row.estimate
+            numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
+            writer.writerow([row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note])
+
+
+def text(rows: Sequence[Row]) -> str:
+    """The table for a terminal: under each curriculum and agent a line for each measure."""
+    return "\n\n".join([LEGEND, *map(_text, pages(rows))])
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A table in Markdown for each curriculum."""
+    return "\n\n".join(map(_markdown, pages(rows)))
+
+
+def latex(rows: Sequence[Row]) -> str:
+    """A table in LaTeX for each curriculum, for the package ``booktabs``."""
+    return "\n\n".join(map(_latex, pages(rows)))
+
+
+FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
+
+
+class Line(NamedTuple):
+    """A row as it is shown."""
+
+    agent: str
+    measure: str
+    value: str
+    n: str
+    mark: str  # number of its note, or nothing
+
+
+class Page(NamedTuple):
+    """The lines of a curriculum, and their notes in the order of their numbers."""
+
+    curriculum: str
+    lines: list[Line]
+    notes: list[str]
+
+
+def pages(rows: Sequence[Row]) -> Iterator[Page]:
+    """The rows as they are shown, for each curriculum."""
+    for curriculum in dict.fromkeys(row.curriculum for row in rows):
+        its = [row for row in rows if row.curriculum == curriculum]
+        notes = list(dict.fromkeys(row.note for row in its if row.note))
+        yield Page(curriculum, [_line(row, notes) for row in its], notes)
+
+
+def _line(row: Row, notes: list[str]) -> Line:
+    value, _, n = str(row.estimate).partition(" n = ")
+    mark = str(notes.index(row.note) + 1) if row.note else ""
+    return Line(row.agent, row.measure.replace("_", " "), value, n, mark)
+
+
+def _text(page: Page) -> str:
+    measures, values, counts = (max(len(line[i]) for line in page.lines) for i in (1, 2, 3))
+    shown, agent = [page.curriculum], None
+    for line in page.lines:
+        if line.agent != agent:
+            agent = line.agent
+            shown.append(f"  {agent}")
+        note = f"({line.mark})" if line.mark else ""
+        shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
+    notes = (f"({number}) {note}" for number, note in enumerate(page.notes, 1))
+    shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
+    return "\n".join(shown)
+
+
+def _markdown(page: Page) -> str:
+    head = [
+        f"### {markdown_text(page.curriculum)}",
+        "",
+        LEGEND,
+        "",
+        "| agent | measure | over seeds | n | note |",
+        "|---|---|---|---|---|",
+    ]
+    lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
+    notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
+    return "\n".join([*head, *lines, *([""] if notes else []), *notes])
+
+
+def markdown_text(plain: str) -> str:
+    """Text of one line without meaning to HTML or to a table in Markdown."""
+    return html.escape(" ".join(plain.split()), quote=False).replace("|", "\\|")
+
+
+def _latex(page: Page) -> str:
+    caption = rf"\caption{{{latex_text(page.curriculum)}: {latex_text(LEGEND)}}}"
+    columns = r"agent & measure & over seeds & $n$ \\"
+    head = [r"\begin{table}", caption, r"\begin{tabular}{llll}", r"\toprule", columns, r"\midrule"]
+    notes = [rf"\par\footnotesize $^{{{number}}}$ {latex_text(note)}" for number, note in enumerate(page.notes, 1)]
+    lines = map(_latex_line, page.lines)
+    return "\n".join([*head, *lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])
+
+
+def _latex_line(line: Line) -> str:
+    mark = rf"$^{{{line.mark}}}$" if line.mark else ""
+    return rf"{latex_text(line.agent)} & {latex_text(line.measure)} & {latex_value(line.value)}{mark} & {line.n} \\"
+
+
+def latex_value(value: str) -> str:
+    """A number and its interval with signs, or a dash for none."""
+    return "--" if value == "-" else value.replace("-", "$-$")
+
+
+def latex_text(plain: str) -> str:
+    """Text without meaning to LaTeX; a bracket after a line's end would be an argument."""
+    commands = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "[": "{[}"}
+    return "".join(rf"\{each}" if each in "&%$#_{}" else commands.get(each, each) for each in plain)
+
+
+def _metrics(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+    """A line for each metric; one for all if no run finished."""
+    present = [run for run in by_seed.values() if run is not None]
+    if not any(run.metrics for run in present):
+        estimate = mean([None] * len(by_seed))
+        yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
+    for metric in dict.fromkeys(metric for run in present for metric in run.metrics):
+        definition = next(run.metrics[metric]["definition"] for run in present if metric in run.metrics)
+        estimate = mean([_value(run, metric) for run in by_seed.values()])
+        yield metric, estimate, definition, _note(by_seed, metric, estimate)
+
+
+def _at_the_end(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+    """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
+    if any(run is not None and run.tasks for run in by_seed.values()):
+        yield from _over_tasks(by_seed)
+    tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
+    if tasks:
+        returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
+        estimate = interquartile_mean(returns)
+        yield _ended("interquartile_return", estimate, by_seed)
+    for task in tasks:
+        estimate = solved_rate([_solved(run, task) for run in by_seed.values()])
+        yield _ended(f"solved {task}", estimate, by_seed)
+
+
+def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+    """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
+    returns = mean(
+        [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in by_seed.values()]
+    )
+    yield _ended("mean_final_return", returns, by_seed)
+    solved = mean(
+        [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in by_seed.values()]
+    )
+    yield _ended("solved_rate", solved, by_seed)
+
+
+def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
+    return measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = list(values)
+    numbers = [value for value in known if value is not None]
+    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(known) else None
+
+
+def _solved(run: Run | None, task: str) -> bool | None:
+    rate = None if run is None else run.success.get(task)
+    return None if rate is None else rate >= SOLVED
+
+
+def _value(run: Run | None, metric: str) -> float | None:
+    return None if run is None or metric not in run.metrics else run.metrics[metric]["value"]
+
+
+def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
+    """Why seeds have no value, each reason once with its seeds."""
+    reasons: dict[str, list[str]] = {}
+    for seed, run in by_seed.items():
+        reason = _missing(run, metric)
+        if reason is not None:
+            reasons.setdefault(reason, []).append(str(seed))
+    notes = [f"seed {', '.join(seeds)}: {reason}" for reason, seeds in reasons.items()]
+    return "; ".join(notes + ([estimate.reason] if estimate.reason else []))
+
+
+def _missing(run: Run | None, metric: str | None) -> str | None:
+    if run is None:
+        return "no run"
+    if run.reason is not None:
+        return run.reason
+    if metric is None or _value(run, metric) is not None:
+        return None
+    return run.metrics[metric]["undefined"] if metric in run.metrics else "another version, without this metric"
+
+
+def main() -> None:
+    """Print the table of many runs, and write it where asked."""
+    parser = _parser()
+    arguments = parser.parse_args()
+    if arguments.difference is not None and arguments.compare is None:
+        parser.error("--difference is of the metric that --compare names; give both")
+    try:
+        require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
+        runs, problems = find_runs(arguments.runs)
+        require((bool(runs), "; ".join(problem.reason for problem in problems)))
+        rows = table(runs)
+        names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
+        print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names)))
+        if arguments.csv is not None:
+            write_csv(arguments.csv, rows)
+        if arguments.compare is not None:
+            for pair, found in comparisons(runs, arguments.compare).items():
+                comment = "% " if arguments.format == "latex" else ""
+                print(f"\n{comment}{_sentence(*pair, found, arguments.difference)}")
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+    for problem in problems:
+        print(f"left out: {problem.reason}", file=sys.stderr)
+    if problems:
+        sys.exit(1)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="ctgraph-rl results", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
+    which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
+    parser.add_argument("--format", choices=FORMATS, default="text", help="of what is printed (default: text)")
+    parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
+    parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
+    parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
+    return parser
+
+
+def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:
+    record = f"better in {found.wins}, equal in {found.ties}, worse in {found.losses}"
+    p_value = "" if found.p_value is None else f"; sign-flip p = {found.p_value:.3g}"
+    sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}{p_value}"
+    if difference is None or not found.std:
+        return sentence
+    seeds = seeds_needed(difference, found.std, paired=True)
+    return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
+
+
+if __name__ == "__main__":
+    main()

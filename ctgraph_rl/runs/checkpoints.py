@@ -1,0 +1,196 @@
+"""Checkpoints that can be trusted: whole files with a checksum, the last two kept, read without running any code.
+
+A file is one line of JSON, ``{"format": 1, "frames": ..., "bytes": ..., "sha256": ...}``, and what `torch.save` makes
+of plain tensors and Python values. It is read only if length and checksum agree, and by ``weights_only=True``, which
+refuses anything else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import pickle
+import shutil
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ctgraph_rl.checks import is_int
+from ctgraph_rl.log.files import PART, write_whole
+from ctgraph_rl.runs.interrupt import Interrupt
+
+FORMAT = 1
+"""Raised when a checkpoint means something else than before."""
+
+KEPT = 2
+"""Checkpoints that are kept, the newest."""
+
+State = Mapping[str, Any]
+"""What is saved: tensors and plain Python values, nested; ``frames`` is the number of frames of the run so far."""
+
+
+NOT_PLAIN = "a run can only be saved where the agent's state_dict() holds tensors and plain Python values"
+
+
+class BrokenCheckpoint(ValueError):
+    """A checkpoint that is not what was written."""
+
+
+class Checkpoints:
+    """The checkpoints of one run in a folder, which is made with the first one.
+
+    Args:
+        folder: where they are.
+        seconds: time between two checkpoints within a block.
+        strict: refuse to go on from an older checkpoint where the newest is broken, instead of warning.
+        interrupt: tells that the process was asked to stop: a checkpoint is then saved, and the process exits.
+    """
+
+    def __init__(
+        self, folder: Path | str, seconds: float = 300.0, strict: bool = False, interrupt: Interrupt | None = None
+    ) -> None:
+        self.folder, self.seconds, self.strict = Path(folder), seconds, strict
+        self.interrupt = Interrupt() if interrupt is None else interrupt
+        self._last: float | None = None
+
+    def offer(self, state: Callable[[], State], at_block_end: bool) -> None:
+        """Save if it is time, called after every update.
+
+        The first one is saved at once, so that a full disk, or a state that cannot be read back, stops a run early.
+
+        Args:
+            state: makes what is saved.
+            at_block_end: always save.
+        """
+        stop = self.interrupt.is_asked
+        if stop or at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds:
+            self.save(state())
+        if stop:
+            self.interrupt.exit()
+
+    def save(self, state: State) -> None:
+        """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.
+
+        Raises:
+            OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
+            ValueError: if the first one cannot be read back, for it holds more than tensors and plain values.
+        """
+        path, content = self.folder / f"{state['frames']:012d}.pt", encoded(state)
+        if self._last is None:
+            _require_plain(content)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            write_whole(path, content)
+        except OSError as error:
+            kept = self.files()
+            last = f"the checkpoint after {_frames(kept[0]):,} frames is kept" if kept else "there is none before"
+            raise OSError(error.errno, f"{error.strerror}; {last}. Make room, then run the same command") from error
+        self._last = time.monotonic()
+        files = self.files()
+        here = files.index(path)
+        for other in (*files[:here], *files[here + KEPT :]):
+            other.unlink(missing_ok=True)
+
+    def files(self) -> list[Path]:
+        """The checkpoints, newest first."""
+        return sorted((file for file in self.folder.glob("*.pt") if file.stem.isdecimal()), key=_frames, reverse=True)
+
+    def newest(self) -> State | None:
+        """The newest sound checkpoint, None without one; a broken one is warned of and left out.
+
+        Raises:
+            BrokenCheckpoint: for a broken one, if ``strict``; and if there are some, but all are broken.
+        """
+        files = self.files()
+        for file in files:
+            try:
+                return decoded(file)
+            except BrokenCheckpoint as error:
+                if self.strict or file == files[-1]:
+                    raise
+                warnings.warn(f"{error}; the one before it is used", stacklevel=2)
+        return None
+
+    def clear(self) -> None:
+        """Remove all."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def tidy(self) -> None:
+        """Remove what was being written when a process was killed."""
+        for part in self.folder.glob("*" + PART):
+            part.unlink(missing_ok=True)
+
+
+def encoded(state: State) -> bytes:
+    """The bytes of a checkpoint.
+
+    Raises:
+        ValueError: for what cannot be saved at all.
+    """
+    buffer = io.BytesIO()
+    try:
+        torch.save(dict(state), buffer)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(f"{NOT_PLAIN}: {error}") from error
+    content = buffer.getvalue()
+    header = {"format": FORMAT, "frames": state["frames"], "bytes": len(content), "sha256": _digest(content)}
+    return json.dumps(header).encode() + b"\n" + content
+
+
+def decoded(path: Path) -> State:
+    """Read a checkpoint, its tensors on the CPU.
+
+    Raises:
+        BrokenCheckpoint: if it is torn, changed, of another format, or holds more than tensors and plain values.
+    """
+    head, _, content = path.read_bytes().partition(b"\n")
+    advice = "delete it to go on from the one before"
+    try:
+        header = json.loads(head)
+        version, expected = header["format"], (header["bytes"], header["sha256"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise BrokenCheckpoint(f"{path} is no checkpoint, or torn; {advice}") from None
+    if version != FORMAT:
+        raise BrokenCheckpoint(f"{path} has format {version}, this version reads {FORMAT}; overwrite=true starts anew")
+    if (len(content), _digest(content)) != expected:
+        raise BrokenCheckpoint(f"{path} is not what was written: {len(content)} of {expected[0]} bytes; {advice}")
+    try:
+        state = read_plain(content)
+    except ValueError as error:
+        raise BrokenCheckpoint(f"{path} {error}, and is not read; {advice}") from error
+    if not (isinstance(state, dict) and is_int(state.get("frames"), 0)):
+        raise BrokenCheckpoint(f"{path} does not say after how many frames it was made; {advice}")
+    return state
+
+
+def read_plain(content: bytes) -> Any:
+    """What `torch.save` made of tensors and plain values, on the CPU; nothing else is made of it, and no code runs.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    try:
+        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # what a pickle that others made may raise is without end
+        raise ValueError("holds more than tensors and plain values, or is torn") from error
+
+
+def _require_plain(checkpoint: bytes) -> None:
+    """Refuse a state that could be written and never read."""
+    try:
+        read_plain(checkpoint.partition(b"\n")[2])
+    except ValueError as error:
+        raise ValueError(f"{NOT_PLAIN}: {error.__cause__}") from error
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _frames(file: Path) -> int:
+    return int(file.stem)

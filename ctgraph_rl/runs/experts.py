@@ -1,0 +1,113 @@
+"""Single-task experts: each task of a curriculum learned alone, by the same agent with the same budget and protocol.
+
+Forward transfer and relative performance compare with them. An expert is a run like any other; it is kept in a folder
+under the hash of all that its numbers depend on, so that no run trains it twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.log.files import LOG, METRICS, locked
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
+from ctgraph_rl.tasks.task import Task
+
+Learn = Callable[[Curriculum, Path], None]
+"""Runs the learning of a curriculum into a directory, or goes on with what was begun there."""
+
+
+EXPERT = "single-task expert"
+"""What their curricula are called."""
+
+
+class Expert(NamedTuple):
+    """Who learned a task alone."""
+
+    task: int  # position in the curriculum's tasks, from 1
+    fingerprint: str  # of the single-task curriculum
+    run_dir: Path
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Plain values for the log."""
+        return {"task": self.task, "fingerprint": self.fingerprint, "run": str(self.run_dir)}
+
+    @property
+    def log(self) -> RunLog:
+        """Its measurements."""
+        return RunLog.read(self.run_dir / LOG)
+
+
+def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
+    """A task of a curriculum alone: the frames of the block that trains it first, the same evaluation and task id.
+
+    Raises:
+        ValueError: if that block trains other tasks, too.
+    """
+    block = next(block for block in curriculum.blocks if task in block.tasks)
+    alone = set(block.tasks) == {task}
+    require((alone, "experts need blocks of one task each: the frames of one task cannot be told from the others'"))
+    told = curriculum.protocol
+    if told.task_id != "hidden":
+        length = told.length(len(curriculum.tasks)) if told.task_id == "one_hot" else None
+        told = Protocol(told.task_id, num_task_ids=length, task_ids=(curriculum.task_ids[task],))
+    else:
+        told = Protocol()
+    evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
+    return Curriculum(EXPERT, 1, "-", (Block((task,), block.num_frames),), evaluation, told)
+
+
+def find_or_train(
+    curriculum: Curriculum,
+    learn: Learn,
+    folder: Path,
+    settings: Mapping[str, Any],
+    tell: Callable[[str], object],
+    waiting: Callable[[], object] = lambda: None,
+) -> list[Expert]:
+    """The experts of all tasks of a curriculum; those that the folder lacks are trained first.
+
+    Args:
+        curriculum: whose tasks.
+        learn: trains one, or goes on training it.
+        folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
+        settings: all else that an expert's numbers depend on: agent, seed, versions.
+        tell: is given a line about each expert.
+        waiting: called every half second while another process trains one that is needed here.
+
+    Raises:
+        ValueError: before any training, for a block with several tasks.
+    """
+    alone = [expert_curriculum(curriculum, task) for task in curriculum.tasks]
+    experts = [Expert(number, each.fingerprint, folder / _key(each, settings)) for number, each in enumerate(alone, 1)]
+    for expert, each, label in zip(experts, alone, curriculum.labels, strict=True):
+        found = _is_trained(expert.run_dir)
+        state = "found in" if found else "learns into"
+        tell(f"expert {expert.task} of {len(experts)}, {label}: {state} {expert.run_dir}")
+        if not found:
+            _train(each, learn, expert.run_dir, waiting)
+    return experts
+
+
+def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callable[[], object]) -> None:
+    """Train into the directory, alone; go on with what was begun there, wait for a process that is at it."""
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with locked(run_dir, waiting):
+        if not _is_trained(run_dir):
+            learn(curriculum, run_dir)
+
+
+def _is_trained(run_dir: Path) -> bool:
+    return (run_dir / METRICS).exists()
+
+
+def _key(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:
+    text = json.dumps([curriculum.fingerprint, settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

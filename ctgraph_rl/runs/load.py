@@ -1,0 +1,155 @@
+"""A run's trained agent, given back from its directory; no code of the directory is ever run."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.checkpoints import Checkpoints, read_plain
+from ctgraph_rl.runs.train import MakeAgent, new_agent, wearing
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+OURS = {"agent": re.compile(r"(baselines\.\w+)\.(\w+)"), "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)")}
+"""Names of agents and methods that a directory may name; others are named by who loads it."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a run left.
+
+    ``evaluate(trained.policy_for(task), [task], initial_state=trained.agent.initial_state,
+    curriculum=trained.curriculum)`` of this package plays a task, ``learn_curriculum(another, trained.agent)`` lets the
+    agent learn on.
+    """
+
+    agent: Agent
+    curriculum: Curriculum
+    seed: int
+    frames: int  # that it has learned from
+    log: RunLog
+
+    def policy_for(self, task: Task) -> TensorDictModuleBase:
+        """What acts in a task: by its id, where the curriculum has one and tells it."""
+        number = None if self.curriculum.protocol.task_id == "hidden" else self.curriculum.task_ids.get(task)
+        return self.agent.policy if number is None else self.agent.policy_for(number)
+
+
+def load(
+    run_dir: Path | str,
+    make_agent: MakeAgent | None = None,
+    curriculum: Curriculum | None = None,
+    device: torch.device | str = "cpu",
+    make_method: Callable[[], Method] | None = None,
+) -> Trained:
+    """The trained agent of a run, finished or not, with its method and all that it needs to play on or learn on.
+
+    Args:
+        run_dir: the directory.
+        make_agent: builds the agent from the environment's unbatched observation and action specs; needed where its
+            class is not one of the baselines, such as ``partial(MyAgent, **settings)``.
+        curriculum: what was learned; needed where it has parts of classes that are not this package's.
+        device: where the agent shall live.
+        make_method: builds the method that the agent wears; needed where its class is not one of the baselines'.
+
+    Raises:
+        FileNotFoundError: if there is no run, or none that has been saved.
+        ValueError: for an agent, a method or a curriculum that must be given, and files that do not belong together.
+    """
+    run_dir = Path(run_dir)
+    if not (run_dir / LOG).exists():
+        raise FileNotFoundError(f"{run_dir} holds no run: there is no {LOG}")
+    log = RunLog.read(run_dir / LOG)
+    runs = log.of_kind("run")
+    require((bool(runs), f"{run_dir / LOG} has no first line of a run; it was stopped before it began"))
+    learned = _curriculum(run_dir, curriculum, runs[0].get("fingerprint"))
+    config = runs[0].get("config") or {}
+    seed = config.get("seed", 0)
+    require((is_int(seed, 0, 2**63 - 1), f"{run_dir / LOG} has no seed: seed must be in [0, 2**63), got {seed!r:.80}"))
+    build = _builder(run_dir, config, make_agent, make_method, learned)
+    weights, frames = _weights(run_dir, log)
+    try:
+        with torch.random.fork_rng():
+            agent = new_agent(learned, build, seed, device)
+        agent.load_state_dict(weights)
+    except (RuntimeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{run_dir} holds weights that are not of the agent that was built: {error}") from error
+    return Trained(agent, learned, seed, frames, log)
+
+
+def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Curriculum:
+    """The run's curriculum, from its directory if it is not given."""
+    path = run_dir / CURRICULUM
+    there = given is not None or path.exists()
+    require((there, f"{run_dir} has no {CURRICULUM}, as of classes that are not ours: give load(..., curriculum=)"))
+    found = Curriculum.from_json(path) if given is None else given
+    same = found.fingerprint == fingerprint
+    require((same, f"{run_dir} learned a curriculum with fingerprint {fingerprint}, this one has {found.fingerprint}"))
+    return found
+
+
+def _builder(
+    run_dir: Path,
+    config: Mapping[str, Any],
+    make_agent: MakeAgent | None,
+    make_method: Callable[[], Method] | None,
+    curriculum: Curriculum,
+) -> MakeAgent:
+    """Builds the agent with its method, if it has one; the curriculum is already prepared for that."""
+    alone = _ours(run_dir, "agent", config.get("agent")) if make_agent is None else make_agent
+    if make_method is None and config.get("method") is not None:
+        make_method = _ours(run_dir, "method", config["method"])
+    if make_method is None:
+        return alone
+    return wearing(alone, make_method, curriculum)
+
+
+def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
+    """Builds the agent or method that a configuration names; only classes that are defined in ``baselines`` are."""
+    settings = settings if isinstance(settings, Mapping) else {}
+    name = str(settings.get("_target_"))
+    ours = OURS[part].fullmatch(name)
+    if ours is None:
+        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=), in Python")
+    kind: Any = getattr(import_module(ours[1]), ours[2], None) if find_spec(ours[1]) is not None else None
+    defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == ours[1]
+    require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
+    return partial(kind, **{key: value for key, value in settings.items() if key != "_target_"})
+
+
+def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
+    """The agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
+    if (run_dir / AGENT).exists():
+        return _checked(run_dir / AGENT), log.ends()[-1]
+    saved = Checkpoints(run_dir / CHECKPOINTS).newest()
+    if saved is None:
+        raise FileNotFoundError(f"{run_dir} has neither {AGENT} nor a checkpoint: the run was stopped before its first")
+    require(("agent" in saved, f"{run_dir / CHECKPOINTS} holds a checkpoint without an agent"))
+    return saved["agent"], saved["frames"]
+
+
+def _checked(path: Path) -> Any:
+    """What a file of `torch.save` holds, if its own sums agree and it is plain."""
+    content = path.read_bytes()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as records:
+            changed = records.testzip()
+        require((changed is None, f"{changed} in it is not what was written"))
+        return read_plain(content)
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read: {error}; restore it, or run again with overwrite=true") from error

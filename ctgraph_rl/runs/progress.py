@@ -1,0 +1,78 @@
+"""A progress bar on a terminal, a line every ten seconds elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from datetime import timedelta
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+SECONDS_BETWEEN_LINES = 10.0
+
+
+class ProgressBar:
+    """Shows block, frames, rate, return and time left on standard error; use it as a context manager.
+
+    Args:
+        num_blocks: blocks of the run.
+        num_frames: frames of the run.
+        console: where it shows; default: standard error.
+        done: frames that were learned before, by a run that goes on.
+    """
+
+    def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
+        self.num_blocks, self.num_frames, self.done = num_blocks, num_frames, done
+        self.console = Console(stderr=True) if console is None else console
+        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
+        self._live = self.console.is_terminal
+        self._task = self._bar.add_task(self.beginning, completed=done, total=num_frames)
+        self._start = self._last_line = time.perf_counter()
+
+    def __enter__(self) -> ProgressBar:
+        if self._live:
+            self._bar.start()
+        elif self.done:
+            self.console.print(self.beginning, highlight=False, soft_wrap=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live:
+            self._bar.stop()
+
+    @property
+    def beginning(self) -> str:
+        """What is said before the first batch."""
+        return f"goes on after {_short(self.done)} frames" if self.done else "evaluating before training"
+
+    def update(self, block: int, frames: int, episode_return: float) -> None:
+        """See `ctgraph_rl.learn.lifelong.Progress`."""
+        now = time.perf_counter()
+        text = self.describe(block, frames, episode_return, now - self._start)
+        if self._live:
+            self._bar.update(self._task, completed=frames, description=text)
+        elif now - self._last_line >= SECONDS_BETWEEN_LINES or frames == self.num_frames:
+            self._last_line = now
+            self.console.print(text, highlight=False, soft_wrap=True)
+
+    def describe(self, block: int, frames: int, episode_return: float, seconds: float) -> str:
+        """One line: block, frames, rate, return and time left."""
+        rate = (frames - self.done) / seconds
+        left = timedelta(seconds=round((self.num_frames - frames) / rate))
+        shown = "-" if math.isnan(episode_return) else f"{episode_return:.2f}"
+        return (
+            f"block {block}/{self.num_blocks}  {_short(frames)}/{_short(self.num_frames)} frames  {_short(rate)}/s  "
+            f"return {shown}  {left} left"
+        )
+
+
+def _short(number: float) -> str:
+    """A count with at most four digits: 960, 20.48k, 819.2k, 1.638M."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.4g}{unit}"
+    return f"{number:.0f}"

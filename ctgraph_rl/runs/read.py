@@ -1,0 +1,340 @@
+"""Run directories as data: each log is read once, and only what tables and figures need is kept of it.
+
+Runs of one configuration but for the seed belong together; one that names no agent stands alone, under its directory.
+A directory that cannot be read is a `Problem` with its reason, and never a number.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.log.files import FAILURE, LOG, METRICS
+from ctgraph_rl.log.measurement import check, parsed
+from ctgraph_rl.log.run_log import SCHEMA, RunLog
+from ctgraph_rl.runs.experts import EXPERT
+
+MODIFIED = " (modified)"
+"""What the name of a curriculum ends with that is not what is published under the name."""
+
+OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
+"""Settings that a curriculum's fingerprint covers."""
+
+ABOUT = ("curriculum", "fingerprint", "config")
+"""What the first line of a log must have."""
+
+NO_METHOD = "Finetune"
+"""The method of a run whose agent is as it is; such a run is one of a configuration without a method."""
+
+Curve = list[tuple[int, float]]
+"""Mean returns after numbers of frames; NaN for one without a value."""
+
+
+class History(NamedTuple):
+    """What happened in a run, of the curriculum's own tasks."""
+
+    labels: tuple[str, ...]  # name of each task
+    trained: tuple[tuple[int, ...], ...]  # for each block the positions of its tasks; empty if the log does not say
+    ends: tuple[int, ...]  # frames at the end of each block so far; 0 for block 0, before any training
+    performance: list[list[float]]  # mean return [blocks + 1][tasks]; NaN where not evaluated
+    evaluations: Mapping[str, Curve]  # by label
+    training: Mapping[int, Curve]  # by block, of finished episodes
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run directory says.
+
+    Args:
+        path: the directory.
+        about: the first line of its log.
+        agent: class or name of who learned, ``PPO + EWC`` with a method; None if the configuration does not say.
+        settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
+            with them if there is no agent.
+        seed: the seed.
+        reason: why it has no results; None for a finished run.
+        metrics: `Metric` fields by name; empty without results, as are the next three.
+        success: success rate on each task by its label, at the end.
+        returns: mean return on each task in the same way.
+        tasks: labels of the tasks that are not held out.
+        history: curves and performance; None if the log cannot be read.
+    """
+
+    path: Path
+    about: Mapping[str, Any]
+    agent: str | None
+    settings: Mapping[str, Any]
+    seed: int
+    reason: str | None
+    metrics: Mapping[str, Mapping[str, Any]]
+    success: Mapping[str, float | None]
+    returns: Mapping[str, float | None]
+    tasks: Sequence[str]
+    history: History | None
+
+    @property
+    def curriculum(self) -> tuple[str, str]:
+        """The curriculum by its name and its fingerprint."""
+        return self.about["curriculum"], self.about["fingerprint"]
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """The curriculum by its published name and its fingerprint."""
+        name, fingerprint = self.curriculum
+        return name.removesuffix(MODIFIED), fingerprint
+
+    @property
+    def configuration(self) -> tuple[tuple[str, str], str]:
+        """What runs have in common that differ in their seed alone."""
+        return self.group, json.dumps(self.settings, sort_keys=True)
+
+
+class Problem(NamedTuple):
+    """A directory that is left out."""
+
+    path: Path
+    reason: str
+
+
+BySeed = Mapping[int, Run | None]
+"""Runs that differ in their seed alone; None for a seed that only other agents have."""
+
+
+def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
+    """Every run in or below the directories, and what is left out: unreadable logs, and one run that is there twice.
+
+    Single-task experts are left out without a word where there are other runs.
+    """
+    found, problems = [], []
+    refused: dict[Path, Path] = {}
+    for path in paths:
+        logs = sorted(Path(path).rglob(LOG))
+        marks = [mark.parent for mark in sorted(Path(path).rglob(FAILURE)) if not (mark.parent / LOG).exists()]
+        for folder in marks:
+            refused.setdefault(folder.resolve(), folder)
+        if not logs and not marks:
+            problems.append(Problem(Path(path), f"{path} holds no run: no run.jsonl in or below it"))
+        for log in logs:
+            try:
+                found.append(read_run(log.parent))
+            except (OSError, ValueError) as error:
+                problems.append(Problem(log.parent, str(error)))
+    problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused.values()]
+    runs: dict[tuple[Any, ...], Run] = {}
+    for run in [run for run in found if run.group[0] != EXPERT] or found:
+        twin = runs.setdefault((*run.configuration, run.seed), run)
+        if twin.path.resolve() != run.path.resolve():
+            problems.append(Problem(run.path, f"{twin.path} and {run.path} are one run twice; the second is left out"))
+    return list(runs.values()), problems
+
+
+def read_run(path: Path) -> Run:
+    """A run directory, finished or not. Of one with a broken file only what was run is known, and the reason.
+
+    Raises:
+        ValueError: if its log does not start with what was run, or is of a newer version.
+        OSError: if its log cannot be opened.
+    """
+    file = path / LOG
+    about = _about(file)
+    config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
+    if _called(config.get("method")) == NO_METHOD:
+        del config["method"]
+    seed, agent = config.pop("seed"), _agent(config)
+    settings = {**dict(flat(config)), **({"directory": str(path.resolve())} if agent is None else {})}
+    try:
+        log = RunLog.read(file)
+        history = _history(log)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
+        return Run(path, about, agent, settings, seed, reason, {}, {}, {}, (), None)
+    metrics, why = _metrics(path, log)
+    ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if metrics else []
+    success, returns = ({m["label"]: m.get(name) for m in ends} for name in ("success_rate", "return_mean"))  # the last
+    tasks = list(dict.fromkeys(m["label"] for m in ends if not m.get("held_out")))
+    return Run(path, about, agent, settings, seed, why, metrics, success, returns, tasks, history)
+
+
+def _about(file: Path) -> dict[str, Any]:
+    """The first line of a log: what was run."""
+    with file.open("rb") as lines:
+        first = lines.readline()
+    try:
+        about = parsed(first)
+        check(about)
+    except ValueError:
+        about = {}
+    is_run = about.get("kind") == "run"
+    require((is_run, f"{file} does not say what was run: its first line is missing, or it is no log of ours"))
+    missing = [name for name in ABOUT if not about.get(name)]
+    require((not missing, f"{file} does not say its {', '.join(missing)}; add it to the first line"))
+    config, schema = about["config"], about.get("schema", SCHEMA)
+    has_seed = isinstance(config, dict) and is_int(config.get("seed"))
+    require(
+        (has_seed, f"{file} has no seed in its config; add it to the first line"),
+        (is_int(schema, 1, SCHEMA), f"{file} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"),
+    )
+    return {**about, "curriculum": str(about["curriculum"]), "fingerprint": str(about["fingerprint"])}
+
+
+def _agent(config: Mapping[str, Any]) -> str | None:
+    """The agent and its method, each by its class or by the name that whoever recorded the run gave."""
+    agent = _called(config.get("agent")) or _called(config.get("learner"))
+    method = _called(config.get("method"))
+    return f"{agent} + {method}" if agent and method else agent
+
+
+def _called(part: Any) -> str | None:
+    """The class that a part of a configuration builds, or the part itself if it is a name."""
+    if isinstance(part, Mapping) and "_target_" in part:
+        return str(part["_target_"]).rpartition(".")[2]
+    return part if isinstance(part, str) and part else None
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a nested configuration by dotted names."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
+    """The metrics of a finished run, or why there are none."""
+    file = path / METRICS
+    if not file.exists():
+        torn = ", with a torn last line" if log.torn_lines else ""
+        return {}, f"{_failure(path) or 'unfinished'}{torn}"
+    try:
+        metrics = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        return {}, f"{file} cannot be read: {error}"
+    ours = isinstance(metrics, dict) and metrics and all(_is_metric(metric) for metric in metrics.values())
+    return (metrics, None) if ours else ({}, f"{file} does not hold metrics of ours")
+
+
+def _failure(path: Path) -> str | None:
+    """Why a run failed, as it says itself."""
+    try:
+        return "failed: " + " ".join((path / FAILURE).read_text(encoding="utf-8", errors="replace").split())
+    except OSError:
+        return None
+
+
+def _is_metric(metric: Any) -> bool:
+    """Whether it has what tables show of a metric."""
+    value = metric.get("value") if isinstance(metric, dict) else ""
+    return (value is None or is_real(value)) and {"value", "definition", "undefined"} <= metric.keys()
+
+
+def _history(log: RunLog) -> History:
+    own = [m for m in log.of_kind("evaluation") if not m.get("held_out")]
+    performance = log.performance().tolist()
+    evaluations: dict[str, Curve] = {}
+    for m in own:
+        evaluations.setdefault(m["label"], []).append((m["frames"], _number(m["return_mean"])))
+    training: dict[int, Curve] = {}
+    for m in log.of_kind("training"):
+        if m["return_mean"] is not None:
+            training.setdefault(m["block"], []).append((m["frames"], m["return_mean"]))
+    seconds = log.measurements[-1].get("seconds", 0.0)
+    labels, trained = _labels(log, own, len(performance[0])), _trained(log)
+    return History(labels, trained, tuple(log.ends()), performance, evaluations, training, seconds)
+
+
+def _labels(log: RunLog, own: Iterable[Mapping[str, Any]], count: int) -> tuple[str, ...]:
+    """Name of each task, as the first line says or else its evaluations."""
+    said = log.of_kind("run")[0].get("tasks") or ()
+    known = {**dict(enumerate(said, 1)), **{m["task"]: m["label"] for m in own}}
+    return tuple(str(known.get(task, f"task {task}")) for task in range(1, count + 1))
+
+
+def _trained(log: RunLog) -> tuple[tuple[int, ...], ...]:
+    said = log.of_kind("run")[0].get("trained") or ()
+    return tuple(tuple(number - 1 for number in block) for block in said)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]:
+    """Runs by seed, for each (curriculum, agent), as `_in_order`; None for a seed that only other agents have."""
+    groups: dict[tuple[Any, ...], dict[int, Run]] = {}
+    expected: dict[tuple[str, str], set[int]] = {}
+    for run in _in_order(runs):
+        groups.setdefault(run.configuration, {})[run.seed] = run
+        if run.agent is not None:
+            expected.setdefault(run.group, set()).add(run.seed)
+    one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
+    curricula, agents = _curriculum_names(runs), _agent_names(one_each)
+    found: dict[tuple[str, str], dict[int, Run | None]] = {}
+    for one, agent, by_seed in zip(one_each, agents, groups.values(), strict=True):
+        seeds = sorted(by_seed if one.agent is None else expected[one.group])
+        found[curricula[one.group], agent] = {seed: by_seed.get(seed) for seed in seeds}
+    return found
+
+
+def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:
+    """Each curriculum's shortest name, with its fingerprint where another one has the same name."""
+    named: dict[tuple[str, str], str] = {}
+    for run in runs:
+        named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
+    names = list(named.values())
+    return {group: name if names.count(name) == 1 else f"{name} {group[1]}" for group, name in named.items()}
+
+
+def _in_order(runs: Sequence[Run]) -> list[Run]:
+    """Runs of one curriculum and agent where the first of them is, by the settings in which they differ."""
+    alike = _alike(runs)
+    return [
+        run
+        for some in alike.values()
+        for keys in [_differing(some)]
+        for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
+    ]
+
+
+def _rank(value: Any) -> tuple[int, float, str]:
+    """Orders values of a setting: first none, then numbers by size, then others by their text."""
+    return (1, value, "") if is_real(value) else (0 if value is None else 2, 0.0, str(value))
+
+
+def _agent_names(runs: Sequence[Run]) -> list[str]:
+    """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
+    differing = {key: _differing(some) for key, some in _alike(runs).items()}
+    return [_named(run, differing[run.group, _name(run)]) for run in runs]
+
+
+def _alike(runs: Iterable[Run]) -> dict[tuple[Any, ...], list[Run]]:
+    """Runs by curriculum and name of the agent."""
+    found: dict[tuple[Any, ...], list[Run]] = {}
+    for run in runs:
+        found.setdefault((run.group, _name(run)), []).append(run)
+    return found
+
+
+def _differing(runs: Sequence[Run]) -> list[str]:
+    values: dict[str, set[str]] = {}
+    for run in runs:
+        for key in run.settings:
+            values.setdefault(key, set())
+    for key, seen in values.items():
+        seen |= {json.dumps(run.settings.get(key)) for run in runs}
+    return sorted(key for key, seen in values.items() if len(seen) > 1)
+
+
+def _named(run: Run, keys: Iterable[str]) -> str:
+    short = {key: key.removeprefix("agent.").removeprefix("method.") for key in keys}
+    return " ".join([_name(run), *(f"{name}={run.settings.get(key)}" for key, name in short.items())])
+
+
+def _name(run: Run) -> str:
+    return run.path.resolve().name if run.agent is None else run.agent

@@ -1,0 +1,248 @@
+"""Recorder: anyone's learner, measured by a curriculum's protocol, with the files of a run of our own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from inspect import Parameter, signature
+from itertools import takewhile
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.learn.lifelong import Examiner, Policy, by_slices
+from ctgraph_rl.log.files import CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.provenance import provenance
+from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.tables import write_tables
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+class Recorder:
+    """Evaluates policies by the protocol of a curriculum, when its user's own loop says so, and keeps a run log.
+
+    A policy is one of
+
+    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions;
+    - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
+      is None, and ``episode_start``, bool [n], says which rows start an episode;
+    - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol says so;
+    - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
+
+    Observations are NumPy arrays. Where the protocol shows task ids with observations, they are a dict of
+    ``observation`` and ``task_id``, uint8 [n, num_task_ids]. A function draws its own random numbers: where the
+    protocol is greedy it should take its best action.
+
+    Use it as a context manager, or call `close`::
+
+        with Recorder(curriculum, "runs/mine") as recorder:
+            recorder.evaluate(policy, 0)
+            for block, frames in zip(curriculum.blocks, curriculum.ends):
+                ...  # learn block.tasks for block.num_frames
+                recorder.evaluate(policy, frames)
+
+    Args:
+        curriculum: what is learned.
+        run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
+        seed: of the run; evaluations derive theirs from it, in [0, 2**63).
+        about: what else the first line of the log should tell, such as the learner's name and settings, as JSON.
+
+    Raises:
+        ValueError: for values out of range, before anything is written.
+        FileExistsError: if the directory holds a log.
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        run_dir: Path | str | None = None,
+        seed: int = 0,
+        about: Mapping[str, Any] | None = None,
+    ) -> None:
+        require(
+            (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
+            (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
+            ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
+            (_is_json(about), f"about must be plain JSON values by name, got {about!r}"),
+        )
+        curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
+        self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
+        path = None if self.run_dir is None else self.run_dir / LOG
+        if path is not None:
+            if path.exists():
+                raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self.log = RunLog(path)
+        self.log.append("run", **provenance(curriculum), config={"seed": seed, **(about or {})})
+        self._examiner = Examiner(curriculum, seed, self.log)
+        self._frames, self._trained = -1, 0
+
+    @property
+    def moments(self) -> tuple[int, ...]:
+        """All numbers of frames after which the protocol wants an evaluation."""
+        how = self.curriculum.evaluation
+        within = range(how.every, self.curriculum.num_frames + 1, how.every) if how.every else ()
+        candidates = sorted({0, *self.curriculum.ends, *within})
+        return tuple(frames for frames in candidates if self.curriculum.moment(frames) is not None)
+
+    def evaluate(
+        self, policy: Any = None, frames: int = 0, policy_for: Callable[[int], Any] | None = None
+    ) -> dict[str, float]:
+        """Evaluate after ``frames`` frames of the run, on the tasks and in the way that the protocol says.
+
+        The ends of blocks must be told exactly, and are rows of the performance matrix; any other number of frames in
+        between is logged as an evaluation during a block.
+
+        Args:
+            policy: who plays; see the class.
+            frames: frames learned from so far, more than at the last evaluation.
+            policy_for: instead of ``policy``, where the protocol tells task ids: the policy for an id.
+
+        Returns:
+            The mean return on each task, by label.
+
+        Raises:
+            ValueError: for frames out of order or beyond the curriculum, and a policy that is none.
+        """
+        last = self.curriculum.num_frames
+        require(
+            (is_int(frames, 0, last), f"frames must be an integer in 0..{last}, the curriculum's, got {frames!r}"),
+            ((policy is None) != (policy_for is None), "give either policy or policy_for"),
+        )
+        require((frames > self._frames, f"frames must grow: {frames} comes after {self._frames}"))
+        acts = self._adapted(policy, policy_for, frames)
+        where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
+        self._examiner.evaluate(acts, frames, where)
+        self._frames = frames
+        return {m["label"]: m["return_mean"] for m in _last(self.log.of_kind("evaluation"), frames)}
+
+    def training(self, frames: int, **values: Any) -> None:
+        """Log what was measured while training since the last time, or the start of the block.
+
+        Args:
+            frames: frames learned from so far, more than the last time.
+            values: numbers by name: ``return_mean``, ``success_rate`` and ``length_mean`` of the finished ``episodes``,
+                which metrics use, and any others.
+
+        Raises:
+            ValueError: for frames out of order or beyond the curriculum, and values that are no numbers.
+        """
+        last = self.curriculum.num_frames
+        numbers = {name: _number(value) for name, value in values.items()}
+        no_numbers = [name for name, value in numbers.items() if not isinstance(value, (int, float, type(None)))]
+        taken = sorted({"kind", "block", "seconds"} & set(values))
+        require(
+            (is_int(frames, 1, last), f"frames must be an integer in 1..{last}, the curriculum's, got {frames!r}"),
+            (not no_numbers, f"{', '.join(no_numbers)} must be numbers or None; leave out what is none"),
+            (not taken, f"{', '.join(taken)} are fields of every line of the log: choose other names"),
+        )
+        require((frames > self._trained, f"frames must grow: {frames} comes after {self._trained}"))
+        self._trained = frames
+        common = {"episodes": 0, "return_mean": None, "success_rate": None, "length_mean": None}
+        self.log.append("training", block=self.curriculum.block_at(frames), frames=frames, **{**common, **numbers})
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The metrics of the evaluations so far; what is missing makes them undefined, with the reason."""
+        return dict(scores(self.log, self.curriculum))
+
+    def close(self) -> None:
+        """Write tables and metrics, and close the log."""
+        self.log.close()
+        if self.run_dir is not None:
+            with suppress(ValueError):  # parts of a user's own classes have no JSON
+                self.curriculum.to_json(self.run_dir / CURRICULUM)
+            write_tables(self.log, self.run_dir, parquet=False)
+            write_performance(self.run_dir / "performance.csv", self.log, self.curriculum.labels)
+            write_metrics(self.run_dir / METRICS, self.metrics)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        else:
+            self.log.close()
+
+    def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
+        greedy = self.curriculum.evaluation.greedy
+        ids, told = self.curriculum.task_ids, self.curriculum.protocol.task_id
+        if policy_for is None:
+            return adapt(policy, greedy, told == "one_hot")
+        require((told != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
+        unknown = [task for task in self._examiner.examined(frames) if task not in ids]
+        require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
+        return by_slices(
+            [adapt(policy_for(ids[task]), greedy, told == "one_hot") for task in self._examiner.examined(frames)]
+        )
+
+
+def _is_json(about: object) -> bool:
+    try:
+        json.dumps(about)
+    except (TypeError, ValueError):
+        return False
+    return about is None or isinstance(about, Mapping)
+
+
+def _number(value: Any) -> Any:
+    """A scalar of NumPy, torch or JAX as a number of Python; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
+
+
+def _last(measurements: list[dict[str, Any]], frames: int) -> Iterable[dict[str, Any]]:
+    """The measurements after ``frames`` frames, which are the last ones, in order."""
+    return reversed(list(takewhile(lambda m: m["frames"] == frames, reversed(measurements))))
+
+
+def adapt(policy: Any, greedy: bool, shows_ids: bool = False) -> Policy:
+    """Any policy as a function of TensorDicts; see `Recorder`.
+
+    Raises:
+        ValueError: for what is no policy.
+    """
+    if isinstance(policy, TensorDictModuleBase | type):
+        return policy
+    if hasattr(policy, "predict"):
+        predict, space = policy.predict, getattr(policy, "observation_space", None)
+        blind = shows_ids and space is not None and "task_id" not in getattr(space, "spaces", {})
+        fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
+        require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))
+        return _NumpyPolicy(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))
+    require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    taken = [p for p in signature(policy).parameters.values() if p.kind in positional and p.default is p.empty]
+    fits = len(taken) in (1, 3)
+    require(
+        (fits, f"policy must take (observation) or (observation, state, episode_start), not {len(taken)} arguments")
+    )
+    return _NumpyPolicy(policy if len(taken) == 3 else lambda observation, state, start: (policy(observation), None))
+
+
+class _NumpyPolicy:
+    """A function of NumPy arrays that acts on TensorDicts; it remembers from one step to the next."""
+
+    def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]]) -> None:
+        self.act, self.state = act, None
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        observation: Any = data["observation"].numpy()
+        if "task_id" in data.keys():  # noqa: SIM118, a TensorDict iterates over rows
+            observation = {"observation": observation, "task_id": data["task_id"].numpy()}
+        actions, self.state = self.act(observation, self.state, data["is_init"].squeeze(-1).numpy())
+        actions = np.asarray(actions)
+        whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == data.batch_size
+        got = f"{actions.dtype} {list(actions.shape)}"
+        require((whole, f"a policy must return {data.batch_size[0]} integer actions, one for each row, got {got}"))
+        return data.set("action", torch.from_numpy(actions.astype(np.int64)))

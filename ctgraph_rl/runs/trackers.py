@@ -1,0 +1,210 @@
+"""Trackers: a run's measurements in CSV files, TensorBoard, W&B, MLflow or Trackio, as they are made.
+
+``logger=NAME`` on the command line chooses one of TorchRL's loggers. The run's own files do not depend on it, and what
+goes wrong with it cannot stop a run that has begun.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from torchrl.record.loggers import CSVLogger, MLFlowLogger, TensorboardLogger, WandbLogger
+from torchrl.record.loggers.common import Logger
+from torchrl.record.loggers.trackio import TrackioLogger
+
+from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.log.files import LOG
+from ctgraph_rl.log.run_log import RunLog
+
+FOLDER = "tracker"
+"""Where trackers write, in the run's directory."""
+
+MODES = ("offline", "online")
+"""Of W&B."""
+
+ENVIRONMENT = {
+    "WANDB_ERROR_REPORTING": "false",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "3",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+}
+"""Where the user sets nothing else: no package reports home, and a server that is down costs seconds, not minutes."""
+
+NOT_SENT = ("frames", "task")
+"""Numbers of a measurement that are its step and its name."""
+
+
+class Tracker:
+    """Sends measurements to a logger: a listener of a run's log, and a context manager that closes the logger.
+
+    The logger's first error is a warning, and then nothing more is sent.
+
+    Args:
+        make_logger: builds the logger, of a folder that is there and empty.
+        run_dir: the run's directory, in which the folder is made anew, as a resumed run sends all it measured again.
+        hyperparameters: what the logger is told of the configuration.
+
+    Raises:
+        ModuleNotFoundError: if the logger's package is missing; names the extra to install.
+        ValueError: for a value that the logger does not take.
+    """
+
+    def __init__(
+        self, make_logger: Callable[[Path], Logger], run_dir: Path, hyperparameters: Mapping[str, Any]
+    ) -> None:
+        folder = run_dir.resolve() / FOLDER
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        self.name = getattr(make_logger, "func", make_logger).__name__
+        self._log: Path | None = run_dir / LOG
+        self._logger: Logger | None = None
+        try:
+            self._logger = make_logger(folder)
+        except (ModuleNotFoundError, ValueError):
+            shutil.rmtree(folder)
+            raise
+        except Exception as error:
+            self._give_up(error)
+        self._send("log_hparams", {name: _plain(value) for name, value in hyperparameters.items()})
+
+    def __call__(self, measurement: Mapping[str, Any]) -> None:
+        """Send one measurement, with the run's frames as the step; before the first, those of a resumed run's log."""
+        log, self._log = self._log, None
+        if log is not None and log.exists():
+            for earlier in RunLog.read(log).measurements[:-1]:  # the last one is this
+                self(earlier)
+        values = scalars(measurement)
+        if values:
+            self._send("log_metrics", values, step=measurement["frames"])
+
+    def __enter__(self) -> Tracker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._send("close")
+
+    def _send(self, method: str, *args: Any, **kwargs: Any) -> None:
+        try:
+            if self._logger is not None:
+                getattr(self._logger, method)(*args, **kwargs)
+        except Exception as error:
+            self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        self._logger = None
+        warnings.warn(f"{self.name} failed, the run goes on without it: {error}", stacklevel=3)
+
+
+def scalars(measurement: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers of a measurement of training or evaluation, named as ``train/return_mean``; none of another.
+
+    Those of a task have its label in the name, with ``_`` for what is no letter, digit or hyphen: W&B takes what is
+    before a dot for another group, and MLflow and TensorBoard take no ``#``.
+    """
+    if measurement["kind"] == "training":
+        group = "train"
+    elif measurement["kind"] == "evaluation":
+        group = "eval/" + re.sub(r"[^\w-]", "_", measurement["label"])
+    else:
+        return {}
+    return {f"{group}/{name}": value for name, value in measurement.items() if is_real(value) and name not in NOT_SENT}
+
+
+def csv_logger(folder: Path) -> Logger:
+    """One CSV file for each number, of steps and values."""
+    return CSVLogger(exp_name="", log_dir=str(folder))
+
+
+def tensorboard_logger(folder: Path) -> Logger:
+    """Event files of TensorBoard."""
+    _need("tensorboard")
+    return TensorboardLogger(exp_name="", log_dir=str(folder))
+
+
+def wandb_logger(folder: Path, mode: str, project: str) -> Logger:
+    """A run of Weights & Biases.
+
+    Args:
+        folder: where its files are.
+        mode: ``offline`` or ``online``.
+        project: what runs are grouped under.
+    """
+    require((mode in MODES, f"logger.mode must be one of {', '.join(MODES)}, got {mode!r}"))
+    _need("wandb")
+    return WandbLogger(
+        exp_name=_name(folder),
+        log_dir=str(folder),
+        project=project,
+        mode=mode,
+        log_env_packages=False,
+        settings={"silent": mode == "offline", "console": "off"},
+    )
+
+
+def mlflow_logger(folder: Path, uri: str | None, experiment: str) -> Logger:
+    """A run of MLflow.
+
+    Args:
+        folder: where its files are.
+        uri: address of a store; None makes one in the folder.
+        experiment: what runs are grouped under.
+    """
+    _need("mlflow")
+    return _MLFlow(folder, uri, experiment)
+
+
+class _MLFlow(MLFlowLogger):
+    """TorchRL's logger with a name for the run, which ends with it."""
+
+    def __init__(self, folder: Path, uri: str | None, experiment: str) -> None:
+        import mlflow
+
+        artifacts = None if uri else (folder / "artifacts").as_uri()
+        super().__init__(experiment, uri or f"sqlite:///{folder / 'mlflow.db'}", artifact_location=artifacts)
+        mlflow.set_tag("mlflow.runName", _name(folder))
+
+    def shutdown(self, timeout: float | None = None) -> None:
+        import mlflow
+
+        mlflow.end_run()
+        super().shutdown(timeout)
+
+
+def trackio_logger(folder: Path, project: str) -> Logger:
+    """A run of Trackio.
+
+    Args:
+        folder: where its files are.
+        project: what runs are grouped under.
+    """
+    _need("trackio")
+    os.environ["TRACKIO_DIR"] = str(folder)
+    for name in [name for name in sys.modules if name.split(".")[0] == "trackio"]:
+        del sys.modules[name]  # it reads its folder when it is imported, and a sweep has many
+    return TrackioLogger(exp_name=_name(folder), project=project, embed=False)
+
+
+def _need(package: str) -> None:
+    """Check that a package is there, and set its environment before it is imported."""
+    if find_spec(package) is None:
+        raise ModuleNotFoundError(f"logger={package} needs {package}: pip install 'ctgraph_rl[{package}]'")
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+
+
+def _name(folder: Path) -> str:
+    """A run's name from its directory, such as ``su_b1_4tasks/dqn-seed0-1a2b3c4d``."""
+    return "/".join(folder.parent.parts[-2:])
+
+
+def _plain(value: Any) -> Any:
+    """A hyperparameter as every logger takes it."""
+    return value if isinstance(value, (bool, int, float, str)) else str(value)

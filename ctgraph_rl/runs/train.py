@@ -1,0 +1,172 @@
+"""A run in a directory: an agent learns a curriculum, and its measurements, metrics and weights are files."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torchrl.data import Composite, TensorSpec
+
+from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.batch.params import require_memory
+from ctgraph_rl.checks import require
+from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum, make_env
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS, append_line, write_whole
+from ctgraph_rl.log.provenance import machine, provenance
+from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.tables import write_tables
+from ctgraph_rl.runs.checkpoints import Checkpoints, State
+from ctgraph_rl.runs.experts import Expert
+from ctgraph_rl.runs.progress import ProgressBar
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+MakeAgent = Callable[[Composite, TensorSpec], Agent]
+"""Builds an agent for an environment's unbatched observation and action specs."""
+
+MEMBERS = (
+    "num_envs",
+    "num_steps",
+    "policy",
+    "policy_for",
+    "initial_state",
+    "start_task",
+    "end_task",
+    "learn",
+    "to",
+    "state_dict",
+)
+"""What a run needs of an agent."""
+
+RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
+"""What a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
+``curriculum.json`` where the curriculum has only parts of this package's classes."""
+
+RESTARTS = "restarts.jsonl"
+"""Says, for a run that was stopped, where it went on and on which machine."""
+
+
+def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: torch.device | str = "cpu") -> Agent:
+    """An agent whose weights come from the seed, which sets torch's global generator.
+
+    Raises:
+        ValueError: if it cannot learn the curriculum.
+    """
+    torch.manual_seed(seed)
+    env = make_env(curriculum, curriculum.tasks, seed)
+    agent: Agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
+    missing = [name for name in MEMBERS if not hasattr(agent, name)]
+    require(
+        (not missing, f"{type(agent).__name__} is no agent, it lacks {', '.join(missing)}: see ctgraph_rl.agent.Agent")
+    )
+    frames = agent.num_envs * agent.num_steps
+    batch = f"batches of num_envs={agent.num_envs} x num_steps={agent.num_steps} frames"
+    require_memory(batch, 2 * frames * env.observation_spec_unbatched["observation"].shape.numel(), "of either")
+    agent = agent.to(device)
+    check_rows(curriculum, agent.num_envs)
+    return agent
+
+
+def wearing(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
+    """Builds agents, each with a new method for a curriculum."""
+    return lambda observation_spec, action_spec: make_method().worn_by(
+        make_agent(observation_spec, action_spec), curriculum
+    )
+
+
+def train(
+    curriculum: Curriculum,
+    make_agent: MakeAgent,
+    run_dir: Path,
+    seed: int,
+    device: torch.device | str = "cpu",
+    config: Mapping[str, Any] | None = None,
+    experts: Sequence[Expert] | None = None,
+    checkpoints: Checkpoints | None = None,
+    listeners: Sequence[Callable[[dict[str, Any]], object]] = (),
+    console: Console | None = None,
+) -> None:
+    """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
+
+    A run that was stopped there goes on from its last checkpoint, and ends as if it had never been stopped.
+
+    Args:
+        curriculum: what is learned.
+        make_agent: builds the agent.
+        run_dir: an existing directory.
+        seed: decides the run, in [0, 2**63).
+        device: where environment and agent live.
+        config: what else the first line of the log should hold.
+        experts: for each task, who learned it alone; they are named in the log.
+        checkpoints: default: those in the directory, every five minutes.
+        listeners: are called with every measurement.
+        console: where progress shows; default: standard error.
+
+    Raises:
+        ValueError: if the directory holds a run that cannot be gone on with.
+    """
+    agent = new_agent(curriculum, make_agent, seed, device)
+    checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
+    checkpoints.tidy()
+    saved = checkpoints.newest()
+    about = provenance(curriculum)
+    log = _new_log(run_dir) if saved is None else _resumed_log(run_dir, saved, about, checkpoints.strict)
+    log.listeners.extend(listeners)
+    if saved is None:
+        log.append("run", **about, config=config)
+        with suppress(ValueError):  # parts of a user's own classes have no JSON
+            curriculum.to_json(run_dir / CURRICULUM)
+        if experts is not None:
+            log.append("experts", experts=[expert.about for expert in experts])
+    done = 0 if saved is None else saved["frames"]
+    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
+        learn_curriculum(curriculum, agent, seed, log, progress, device, saved, checkpoints.offer)
+    log.close()
+    weights = io.BytesIO()
+    torch.save(agent.state_dict(), weights)
+    write_whole(run_dir / AGENT, weights.getvalue())
+    write_tables(log, run_dir, parquet=False)
+    write_performance(run_dir / "performance.csv", log, curriculum.labels)
+    logs = None if experts is None else [expert.log for expert in experts]
+    write_metrics(run_dir / METRICS, scores(log, curriculum, logs))
+    checkpoints.clear()
+
+
+def _new_log(run_dir: Path) -> RunLog:
+    """A log in place of what a run left that was stopped before its first checkpoint."""
+    remove_results(run_dir)
+    return RunLog(run_dir / LOG)
+
+
+def remove_results(run_dir: Path) -> None:
+    """Remove what a run left: first what says that it is complete, last what says that there was one."""
+    for name in (*reversed(RESULTS[1:]), RESTARTS, LOG):
+        (run_dir / name).unlink(missing_ok=True)
+
+
+def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
+    """The log as it was at a checkpoint; another machine or other versions are told, or refused if ``strict``.
+
+    Raises:
+        ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.
+    """
+    path = run_dir / LOG
+    runs = RunLog.read(path).of_kind("run") if path.exists() else []
+    require((bool(runs), f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"))
+    before, same = runs[0], ("versions", "machine", "num_threads")
+    changed = f"{run_dir} was begun with another curriculum of this name, whose code has changed: overwrite=true"
+    require((before.get("fingerprint") == about["fingerprint"], changed))
+    other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
+    message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
+    require((not (strict and other), f"{message}; resume=warn goes on"))
+    if other:
+        warnings.warn(message, stacklevel=2)
+    log = RunLog.resume(path, saved["log"])
+    append_line(run_dir / RESTARTS, {"frames": saved["frames"], "versions": about["versions"], **machine()})
+    return log

@@ -1,0 +1,174 @@
+"""The baseline configurations of the CT-graph paper, tasks of any size in their manner, and tasks by keywords.
+
+Soltoggio et al. 2023 (arXiv 2302.10887).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from difflib import get_close_matches
+from inspect import signature
+from os import PathLike
+from typing import Any
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
+
+
+def ct_graph(
+    branching_factor: int = 2,
+    depth: int = 2,
+    wait_prob: float = 0.0,
+    goal: tuple[int, ...] | None = None,
+    fully_observable: bool = True,
+    one_hot: bool = False,
+    image_seed: int = 1,
+) -> Task:
+    """A task of any size, observed fully or through one image for each kind of state.
+
+    Args:
+        branching_factor: b >= 2.
+        depth: d >= 1.
+        wait_prob: p in [0, 1).
+        goal: d decisions in 1..b; None: always the first branch.
+        fully_observable: an image for each state, in the order home, fail, waits, decisions, ends; False: surjective,
+            the images 0 to 4 for home, fail, decision, wait and end states.
+        one_hot: vectors instead of images.
+        image_seed: seed of the image set.
+    """
+    graph = CTGraph(branching_factor, depth, wait_prob)
+    observations = _one_id_per_state(graph) if fully_observable else _ONE_ID_PER_KIND
+    num_images = observations.last_id + 1
+    images = OneHot(num_images) if one_hot else PaperImages(num_images, image_seed)
+    return Task(graph, (1,) * depth if goal is None else goal, observations, images)
+
+
+_ONE_ID_PER_KIND = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
+
+
+def _one_id_per_state(graph: CTGraph) -> Observations:
+    decisions, ends = 2 + graph.num_wait_states, 2 + graph.num_wait_states + graph.num_decision_states
+    return Observations(
+        wait_ids=(2, decisions - 1),
+        decision_ids=(decisions, ends - 1),
+        end_ids=(ends, ends + graph.num_end_states - 1),
+        unique_waits=True,
+        unique_decisions=True,
+    )
+
+
+def ct_fo_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-FO-B1: fully observable, b=2, d=2, p=0; one of 16 images for each state.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 2, 0.0, goal, image_seed=image_seed)
+
+
+def ct_fo_b2(goal: tuple[int, ...] = (1, 1, 1), image_seed: int = 1) -> Task:
+    """CT-FO-B2: fully observable, b=2, d=3, p=0.5; one of 32 images for each state.
+
+    Args:
+        goal: three decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 3, 0.5, goal, image_seed=image_seed)
+
+
+def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-SU-B1: surjective, b=2, d=2, p=0; one image for all decision states, one for all wait states.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return ct_graph(2, 2, 0.0, goal, fully_observable=False, image_seed=image_seed)
+
+
+def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-CO-B1: confounding, b=2, d=2, p=0; wait states draw one of a hundred images at every observation.
+
+    The paper leaves ids and numbers of images open. This package chose: a hundred images for wait states, one for
+    decision states and one for end states.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    observations = Observations(decision_ids=(2, 2), wait_ids=(3, 102), end_ids=(103, 103))
+    return Task(CTGraph(2, 2, 0.0), goal, observations, PaperImages(104, image_seed))
+
+
+def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
+    """CT-POSR-B1: partially observable with stochastic rewards, b=2, d=2, p=0.5; the images of CT-SU-B1.
+
+    End states pay a draw from N(c, 0.1), with c = 1 at the goal and 0 at the others. The paper leaves ids and the
+    standard deviation open: they are choices of this package.
+
+    Args:
+        goal: two decisions in 1..2.
+        image_seed: seed of the image set.
+    """
+    return replace(ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed), reward_std=0.1)
+
+
+CONFIGURATIONS: dict[str, Callable[..., Task]] = {
+    "CT-FO-B1": ct_fo_b1,
+    "CT-FO-B2": ct_fo_b2,
+    "CT-SU-B1": ct_su_b1,
+    "CT-CO-B1": ct_co_b1,
+    "CT-POSR-B1": ct_posr_b1,
+}
+"""The configurations of the paper by name."""
+
+Json = str | PathLike[str] | Mapping[str, Any]
+
+
+def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
+    """A task from what ``gymnasium.make`` is given.
+
+    Args:
+        task: a task, or the name of one of the paper's configurations.
+        config: a configuration file of the authors' implementation or its content, for `Task.from_json` with ``goal``.
+        changes: ``image_seed``, and fields of `Task`, `CTGraph` and `Observations` that shall be different. Without
+            task and config also the arguments of `ct_graph`.
+
+    Raises:
+        ValueError: for unknown names, and values out of range.
+    """
+    require((task is None or config is None, "give a task or a config, not both"))
+    if config is not None:
+        return _changed(Task.from_json(config, changes.pop("goal", None)), changes)
+    if task is None:
+        shape = {name: changes.pop(name) for name in signature(ct_graph).parameters if name in changes}
+        return _changed(ct_graph(**shape), changes)
+    if isinstance(task, str):
+        require((task in CONFIGURATIONS, f"task must be one of {', '.join(CONFIGURATIONS)}, got {task!r}"))
+        task = CONFIGURATIONS[task]()
+    require((isinstance(task, Task), f"task must be a Task or the name of a configuration, got {task!r}"))
+    return _changed(task, changes)
+
+
+def _changed(task: Task, changes: dict[str, Any]) -> Task:
+    """A task with other values of its fields, those of its graph and its observations among them."""
+    if "image_seed" in changes:
+        require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))
+        changes["images"] = replace(task.images, seed=changes.pop("image_seed"))  # type: ignore[type-var]
+    for name in ("graph", "observations"):
+        part = getattr(task, name)
+        own = {field.name: changes.pop(field.name) for field in fields(part) if field.name in changes}
+        if own:
+            changes[name] = replace(part, **own)
+    unknown = sorted(changes.keys() - {field.name for field in fields(Task)})
+    parts = (Task, type(task.graph), type(task.observations))
+    known = ["config", "task", "task_pool", "image_seed", *(field.name for part in parts for field in fields(part))]
+    close = [f"; did you mean {match!r}?" for name in unknown for match in get_close_matches(name, known, 1)]
+    message = f"no field of a task, its graph or its observations: {', '.join(unknown)}{''.join(close)}"
+    require((not unknown, message))
+    return replace(task, **changes)

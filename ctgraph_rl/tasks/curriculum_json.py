@@ -1,0 +1,271 @@
+"""Curricula as JSON, so that others can use one without this package.
+
+Every field is written out, defaults too, under the names that the classes have. The different tasks are listed once,
+first those that blocks train, then those held out; blocks and ``held_out`` name them by position, from 0. ``type`` says
+which of several classes a part is. ``fingerprint`` is that of `Curriculum`; ``about`` holds numbers that follow from
+the rest and is not read.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from difflib import get_close_matches
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.batch.params import bank_bytes
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.reference import ReferenceImages, ReferenceOneHot
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.tasks.task import Task
+
+SCHEMA = 1
+"""Raised when the form of the JSON changes."""
+
+MAX_BYTES = 2**26
+"""Largest file that is read: 64 MiB."""
+
+MAX_NESTING = 16
+"""Most objects and lists within each other; a curriculum has 5."""
+
+MAX_BANK_BYTES = 2**36
+"""Most that the images of one task may need: 64 GiB."""
+
+IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
+REWARD_FNS = (Needle, Gradient, ReferenceLinear)
+SWITCHES = (ByEpisode, AtRandom, Drift)
+
+_KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
+_DERIVED = "about"
+
+
+def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:
+    """A curriculum as JSON; see `Curriculum.to_json`."""
+    require((path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"))
+    places = {task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))}
+    content = {
+        "schema": SCHEMA,
+        "fingerprint": curriculum.fingerprint,
+        "name": curriculum.name,
+        "version": curriculum.version,
+        "source": curriculum.source,
+        "tasks": [_plain(task, {}) for task in places],
+        "blocks": [_plain(block, places) for block in curriculum.blocks],
+        "evaluation": _plain(curriculum.evaluation, places),
+        "protocol": _plain(curriculum.protocol, places),
+    }
+    with _within(curriculum.name):
+        _check_form(content)
+    content[_DERIVED] = _about(curriculum)
+    if path is not None:
+        Path(path).write_text(_text(content) + "\n", encoding="utf-8")
+    return content
+
+
+def read_curriculum(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Curriculum:
+    """The curriculum of a JSON file or of its content; see `Curriculum.from_json`."""
+    source, content = _load(path_or_dict)
+    with _within(source):
+        _check_form({key: value for key, value in content.items() if key != _DERIVED})
+        schema = content.get("schema")
+        newer = f"schema {schema} is newer than {SCHEMA}, the newest that is known here; update ctgraph_rl"
+        require((not is_int(schema, SCHEMA + 1), newer))
+        _check_keys(content, _KEYS, optional=(_DERIVED,))
+        require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
+        curriculum = _curriculum(content)
+        stated, found = content["fingerprint"], curriculum.fingerprint
+        fix = f"if it was changed on purpose, write {found!r} there, and a new version and name"
+        require((stated == found, f"fingerprint is {stated!r}, but the content has {found!r}; {fix}"))
+    return curriculum
+
+
+def _plain(value: Any, places: Mapping[Task, int]) -> Any:
+    """A value of ours as JSON, tasks by their places where these are given."""
+    if isinstance(value, Task) and places:
+        return places[value]
+    if isinstance(value, tuple):
+        return [_plain(item, places) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    chosen = (*IMAGE_SETS, *REWARD_FNS, *SWITCHES)
+    known = (*chosen, Task, CTGraph, Observations, Block, Evaluation, Protocol)
+    require((type(value) in known, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
+    kind = {"type": type(value).__name__} if type(value) in chosen else {}
+    return {**kind, **{name: _plain(getattr(value, name), places) for name in _names(type(value))}}
+
+
+def _names(kind: type) -> list[str]:
+    """The fields that a class of ours is made of."""
+    return [field.name for field in fields(kind) if field.init]
+
+
+def _about(curriculum: Curriculum) -> dict[str, Any]:
+    from ctgraph_rl import __version__
+
+    numbers = ("num_states", "num_end_states", "reward_prob_random", "expected_episode_length")
+    return {
+        "written_by": f"ctgraph_rl {__version__}",
+        "num_frames": curriculum.num_frames,
+        "tasks": [
+            {"label": label, "goal_leaf": task.goal_leaf, **{name: getattr(task.graph, name) for name in numbers}}
+            for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
+        ],
+    }
+
+
+def _text(value: Any, margin: str = "\n") -> str:
+    """JSON with indented objects, and lists of plain values on one line."""
+    inner = margin + "  "
+    if isinstance(value, dict):
+        parts = [f"{json.dumps(key)}: {_text(item, inner)}" for key, item in value.items()]
+        return "{" + inner + f",{inner}".join(parts) + margin + "}"
+    if isinstance(value, list) and any(isinstance(item, (dict, list)) for item in value):
+        return "[" + inner + f",{inner}".join(_text(item, inner) for item in value) + margin + "]"
+    return json.dumps(value, allow_nan=False)
+
+
+@contextmanager
+def _within(place: str) -> Iterator[None]:
+    """Say in errors where they are."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+
+
+def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
+    """What to call the source in an error, and its content."""
+    if isinstance(path_or_dict, Mapping):
+        return "curriculum", path_or_dict
+    is_path = isinstance(path_or_dict, (str, PathLike))
+    require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
+    try:
+        with open(path_or_dict, "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
+    require((len(data) <= MAX_BYTES, f"{path_or_dict} has more than {MAX_BYTES:,} bytes, the limit for a curriculum"))
+    with _within(str(path_or_dict)):
+        return str(path_or_dict), _parse(data)
+
+
+def _parse(data: bytes) -> Mapping[str, Any]:
+    """The object that a file holds."""
+    try:
+        content = json.loads(data, object_pairs_hook=_without_repeats)
+    except RecursionError:
+        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
+    except ValueError as error:
+        raise ValueError(f"must be JSON: {error}") from error
+    require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
+    return content
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    repeated = sorted({key for key in keys if keys.count(key) > 1}) if len(set(keys)) < len(keys) else []
+    require((not repeated, f"key {repeated[:1]} occurs twice in one object"))
+    return dict(pairs)
+
+
+def _check_form(value: Any, nesting: int = 1) -> None:
+    """Refuse what is no JSON, nested too deeply, or no number of 64 bits."""
+    if isinstance(value, (Mapping, list)):
+        require((nesting <= MAX_NESTING, f"nested more than {MAX_NESTING} deep"))
+        for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+            with _within(str(key)):
+                _check_form(item, nesting + 1)
+        return
+    require(
+        (value is None or isinstance(value, (bool, int, float, str)), f"must be a JSON value, got {value!r}"),
+        (not isinstance(value, int) or -(2**63) <= value < 2**63, "must fit 64 bits, got a larger integer"),
+        (not isinstance(value, float) or math.isfinite(value), f"must be a finite number, got {value!r}"),
+    )
+
+
+def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()) -> None:
+    """Refuse anything but an object with exactly these keys."""
+    require((isinstance(content, Mapping), f"must be an object with {', '.join(names)}, got {content!r:.80}"))
+    missing = [name for name in names if name not in content]
+    unknown = [str(name) for name in content if name not in (*names, *optional)]
+    close = [f" (did you mean {near!r}?)" for name in unknown[:1] for near in get_close_matches(name, names, 1)]
+    require(
+        (not missing, f"missing keys: {', '.join(missing)}"),
+        (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{''.join(close)}"),
+    )
+
+
+def _curriculum(content: Mapping[str, Any]) -> Curriculum:
+    require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
+    tasks = _each("tasks", content["tasks"], _task)
+    positions = partial(_tasks_at, tasks)
+    block = partial(_built, Block, readers={"tasks": positions, "switch": partial(_chosen, SWITCHES, or_none=True)})
+    blocks = _each("blocks", content["blocks"], block)
+    with _within("evaluation"):
+        evaluation = _built(Evaluation, content["evaluation"], {"held_out": positions})
+    with _within("protocol"):
+        protocol = _built(Protocol, content["protocol"], {})
+    return Curriculum(content["name"], content["version"], content["source"], tuple(blocks), evaluation, protocol)
+
+
+def _task(content: Any) -> Task:
+    parts = {
+        "graph": partial(_built, CTGraph, readers={}),
+        "observations": partial(_built, Observations, readers={}),
+        "images": partial(_chosen, IMAGE_SETS),
+        "reward_fn": partial(_chosen, REWARD_FNS),
+    }
+    task = _built(Task, content, parts)
+    needed = bank_bytes([task])
+    require((needed <= MAX_BANK_BYTES, f"images need {needed:,} bytes, the limit is {MAX_BANK_BYTES:,}; use fewer"))
+    return task
+
+
+def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
+    """Every item of a list, read."""
+    require((isinstance(content, list), f"{name} must be a list, got {content!r:.80}"))
+    items = []
+    for i, item in enumerate(content):
+        with _within(f"{name}[{i}]"):
+            items.append(read(item))
+    return items
+
+
+def _built(kind: type, content: Any, readers: Mapping[str, Callable[[Any], Any]]) -> Any:
+    """An object of a class of ours from its fields; ``readers`` turn some of them into parts first."""
+    _check_keys(content, _names(kind))
+    arguments = dict(content)
+    for name, read in readers.items():
+        with _within(name):
+            arguments[name] = read(content[name])
+    return kind(**arguments)
+
+
+def _chosen(kinds: Sequence[type], content: Any, or_none: bool = False) -> Any:
+    """An object of the class that its ``type`` names."""
+    if content is None and or_none:
+        return None
+    require((isinstance(content, Mapping), f"must be an object with a type, got {content!r:.80}"))
+    names = {kind.__name__: kind for kind in kinds}
+    given = content.get("type")
+    known = isinstance(given, str) and given in names
+    require((known, f"type must be one of {', '.join(names)}, got {given!r:.80}"))
+    return _built(names[given], {key: item for key, item in content.items() if key != "type"}, {})
+
+
+def _tasks_at(tasks: Sequence[Task], positions: Any) -> tuple[Task, ...]:
+    """The tasks at positions in the list of tasks."""
+    holds = isinstance(positions, list) and all(is_int(i, 0, len(tasks) - 1) for i in positions)
+    require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {positions!r:.80}"))
+    return tuple(tasks[i] for i in positions)

@@ -1,0 +1,141 @@
+"""X: which observation id a state shows. The images behind the ids are in `ctgraph_rl.tasks.images`.
+
+Section 2.3 of the paper. The id ranges are inclusive, as in the paper's JSON (W_IDs, D_IDs, graph_ends).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import combinations
+
+from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.core.graph import CTGraph, StateType
+
+Ids = tuple[int, int]
+"""First and last id of a subset, both included."""
+
+MAX_READ_ROTATION = 359
+
+
+@dataclass(frozen=True)
+class Observations:
+    """The observation process X of a task: the ids of each kind of state, and the variation on read.
+
+    Fully observable: ``unique_decisions`` and ``unique_waits`` (MDP_D, MDP_W of the paper). Surjective: ranges of
+    one id. Confounding: longer ranges without uniqueness; an id is then drawn for every observation.
+
+    Args:
+        wait_ids: ids of wait states, O^W.
+        decision_ids: ids of decision states, O^D.
+        end_ids: ids of end states, O^E.
+        home_ids: ids of the home state, O^H.
+        fail_ids: ids of the fail state, O^F.
+        unique_waits: each wait state has an id of its own.
+        unique_decisions: each decision state has an id of its own.
+        unique_ends: each end state has an id of its own; None means: when waits or decisions have.
+        read_noise: each pixel gets an integer drawn from 0..read_noise added, saturating at 255.
+        read_rotation: images are rotated by a whole number of degrees drawn from 0..read_rotation.
+        reward_cue: the images of end states show what was paid, as the brightness of a square in their middle.
+        legacy_index: number unique ids as the authors' implementation does: a state after k decisions, number j of the
+            b^k of its level, gets id (b^k - 1 + j) modulo the size of its range. For b >= 3 states share ids in ranges
+            of exactly their number, and end states begin with another id than the first.
+        noise_before_rotation: read as the authors' implementation does: first noise, then rotation.
+        cue_wraps: the brightness of the cue is taken modulo 256, as there, instead of saturating.
+
+    Raises:
+        ValueError: for ranges that are reversed or overlap, and values out of range.
+    """
+
+    wait_ids: Ids
+    decision_ids: Ids
+    end_ids: Ids
+    home_ids: Ids = (0, 0)
+    fail_ids: Ids = (1, 1)
+    unique_waits: bool = False
+    unique_decisions: bool = False
+    unique_ends: bool | None = None
+    read_noise: int = 0
+    read_rotation: int = 0
+    reward_cue: bool = False
+    legacy_index: bool = False
+    noise_before_rotation: bool = False
+    cue_wraps: bool = False
+
+    def __post_init__(self) -> None:
+        ranges = [field.name for field in fields(self) if field.name.endswith("_ids")]
+        for name in ranges:
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        if self.unique_ends is None:
+            object.__setattr__(self, "unique_ends", bool(self.unique_decisions or self.unique_waits))
+        require(
+            *((_is_range(getattr(self, name)), _range_rule(name, getattr(self, name))) for name in ranges),
+            *_overlap_rules({name: getattr(self, name) for name in ranges if _is_range(getattr(self, name))}),
+            *_flag_rules(self),
+            (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
+            (
+                is_int(self.read_rotation, 0, MAX_READ_ROTATION),
+                f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {self.read_rotation!r}",
+            ),
+        )
+
+    def ids(self, kind: StateType) -> Ids:
+        """First and last id of a kind of state."""
+        return getattr(self, f"{kind.name.lower()}_ids")
+
+    def is_unique(self, kind: StateType) -> bool:
+        """Whether each state of this kind has an id of its own."""
+        return bool(getattr(self, f"unique_{kind.name.lower()}s", False))
+
+    @property
+    def last_id(self) -> int:
+        """The highest id in use."""
+        return max(self.ids(kind)[1] for kind in StateType)
+
+    @property
+    def draws_ids(self) -> bool:
+        """Whether any kind of state shows an id drawn from several."""
+        return any(not self.is_unique(kind) and self.ids(kind)[0] < self.ids(kind)[1] for kind in StateType)
+
+    def first_of_level(self, level: int, branching_factor: int) -> int:
+        """What a level of the tree adds to the unique ids of its states: the ids before it, or the legacy number."""
+        before = branching_factor**level - 1
+        return before if self.legacy_index else before // (branching_factor - 1)
+
+    def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
+        """What must hold on a graph: unique ids need as many ids as there are states."""
+        return [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
+
+    def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:
+        name, (first, last) = f"{kind.name.lower()}_ids", self.ids(kind)
+        need = f"unique_{kind.name.lower()}s needs {count} {name}, got {last - first + 1} in ({first}, {last})"
+        return last - first + 1 >= count, f"{need}; use ({first}, {first + count - 1})"
+
+
+def _states_with_ids(graph: CTGraph) -> list[tuple[StateType, int]]:
+    return [
+        (StateType.WAIT, graph.num_wait_states),
+        (StateType.DECISION, graph.num_decision_states),
+        (StateType.END, graph.num_end_states),
+    ]
+
+
+def _is_range(value: object) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and is_int(value[0], 0) and is_int(value[1], value[0])
+
+
+def _range_rule(name: str, value: object) -> str:
+    return f"{name} must be (first, last) with 0 <= first <= last, got {value!r}"
+
+
+def _flag_rules(observations: Observations) -> list[tuple[bool, str]]:
+    names = [field.name for field in fields(observations) if field.type in ("bool", "bool | None")]
+    flags = [(name, getattr(observations, name)) for name in names]
+    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in flags]
+
+
+def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:
+    ordered = sorted(ranges.items(), key=lambda item: item[1])
+    return [
+        (high[0] > low[1], f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later")
+        for (low_name, low), (high_name, high) in combinations(ordered, 2)
+    ]

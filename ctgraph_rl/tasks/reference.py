@@ -1,0 +1,449 @@
+"""What the authors' implementation has: its image sets and its configuration files, in all three dialects.
+
+`Task.from_json` and `Task.to_json` read and write the files.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fractions import Fraction
+from functools import lru_cache
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
+from ctgraph_rl.tasks.images import BLUEPRINT_SIZE, WHITE, _Generated
+from ctgraph_rl.tasks.observations import MAX_READ_ROTATION, Observations
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.task import Task
+
+MAX_SEED = 2**32 - 1
+"""Seeds of the authors' implementation are those of ``numpy.random.RandomState``."""
+
+_ANGLES = 359
+"""Image sets are rotated by 0..358 degrees."""
+
+_PIXELS_PER_CELL = 3
+
+_DIALECTS = ("2019", "2021", "2023")
+_GOAL_NEVER_CHANGES = ("2019",)  # the versions that read these files have no use for the numbers of episodes
+
+
+def _everywhere(section: str, key: str) -> tuple[str, str, str, str]:
+    return section, key, key, key
+
+
+_KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section, and the key in each dialect
+    "depth": ("graph_shape", "depth", "depth", "d"),
+    "branching_factor": ("graph_shape", "branching_factor", "branching_factor", "b"),
+    "wait_prob": ("graph_shape", "delay_prob", "wait_prob", "p"),
+    "goal_reward": ("reward", "high_reward_value", "high_reward_value", "high_r"),
+    "fail_reward": ("reward", "crash_reward_value", "crash_reward_value", "fail_r"),
+    "is_stochastic": ("reward", "stochastic_sampling", "stochastic_sampling", None),
+    "reward_std": ("reward", "reward_std", "reward_std", "std_r"),
+    "min_episodes": _everywhere("reward", "min_static_reward_episodes"),
+    "max_episodes": _everywhere("reward", "max_static_reward_episodes"),
+    "distribution": _everywhere("reward", "reward_distribution"),
+    "unique_decisions": ("observations", "MDP_decisions", "MDP_decision_s", "MDP_D"),
+    "unique_waits": ("observations", "MDP_delays", "MDP_wait_s", "MDP_W"),
+    "wait_ids": ("observations", "delay_states", "wait_states", "W_IDs"),
+    "decision_ids": ("observations", "decision_points", "decision_states", "D_IDs"),
+    "end_ids": _everywhere("observations", "graph_ends"),
+    "image_seed": _everywhere("image_dataset", "seed"),
+    "one_hot": _everywhere("image_dataset", "1D"),
+    "num_images": _everywhere("image_dataset", "nr_of_images"),
+    "noise": ("image_dataset", "noise_on_images_on_read", "noise_on_images_on_read", "noise_on_read"),
+    "rotation": ("image_dataset", "small_rotation_on_read", "small_rotation_on_read", "rotation_on_read"),
+}
+"""The dialects: what a key means here, and how each dialect calls it; None where it has no such key."""
+
+_SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
+
+_DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
+
+_LEGACY: dict[str, Any] = {
+    "reward_cue": True,
+    "cue_wraps": True,
+    "legacy_index": True,
+    "noise_before_rotation": True,
+}
+"""How the authors' implementation shows states, whatever a file says."""
+
+
+@dataclass(frozen=True)
+class ReferenceImages(_Generated):
+    """The image sets of the authors' implementation: 12 x 12 random blueprints at any angle, repeats kept.
+
+    An image is 4 x 4 cells of {0, 1, 2}, each 3 x 3 pixels of that many halves of the brightest level, 254 - noise. It
+    is rotated by 0..358 degrees (bilinear, black outside) and truncated to whole levels. The sets equal recorded ones
+    pixel by pixel. Longer sets begin with the shorter ones; `count_repeats` tells how many images equal an earlier one.
+
+    Args:
+        num_images: number of images.
+        seed: the image seed, in [0, 2**32).
+        noise: ``noise_on_read`` of the configuration file, in [0, 254]. Here it lowers the brightest level; the noise
+            on read itself is ``read_noise`` of `Observations`, without the digits after the point.
+    """
+
+    num_images: int
+    seed: int = 1
+    noise: float = 0.0
+
+    size = BLUEPRINT_SIZE * _PIXELS_PER_CELL
+
+    def __post_init__(self) -> None:
+        require(
+            _num_images_rule(self.num_images),
+            (is_int(self.seed, 0, MAX_SEED), f"image seed must be in [0, 2**32), got {self.seed!r}"),
+            (is_real(self.noise, 0, WHITE), f"noise must be a number in [0, {WHITE}], got {self.noise!r}"),
+        )
+        object.__setattr__(self, "noise", float(self.noise))
+
+    @property
+    def white(self) -> float:
+        """The brightness of the goal's reward cue; the brightest level is this without the digits after the point."""
+        return WHITE - self.noise
+
+    @property
+    def images(self) -> Tensor:
+        """uint8 [num_images, 12, 12], before noise and rotation on read."""
+        return _reference_images(self)
+
+    def bank(self, read_rotation: int) -> Tensor:
+        """See `ImageSet`; rotated on read as the authors' implementation does it, pixel by pixel."""
+        upright = self.images.numpy().astype(np.float64)
+        views = [_rotate(upright, angle).astype(np.uint8) for angle in range(read_rotation + 1)]
+        return torch.from_numpy(np.stack(views, axis=1)).flatten(0, 1).unsqueeze(1)
+
+
+@dataclass(frozen=True)
+class ReferenceOneHot:
+    """The 1D observations of the authors' implementation: 254 at the id's place, and a last element for the reward cue.
+
+    The vector has K + 1 elements here, where the authors' implementation has an array of shape (K + 1, 1).
+
+    Args:
+        num_images: K, the number of ids.
+    """
+
+    num_images: int
+
+    num_variants = 1
+    white = WHITE
+    cue_element = True
+
+    def __post_init__(self) -> None:
+        require(_num_images_rule(self.num_images))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(K + 1,)."""
+        return (self.num_images + 1,)
+
+    def bank(self, read_rotation: int) -> Tensor:
+        """uint8 [K, K + 1]: 254 times the identity, and a column of zeros; a vector has no rotation."""
+        return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8)
+
+
+def _num_images_rule(value: object) -> tuple[bool, str]:
+    return is_int(value, 1), f"num_images must be an integer >= 1, got {value!r}"
+
+
+@lru_cache(maxsize=16)
+def _reference_images(image_set: ReferenceImages) -> Tensor:
+    """The images of a set, uint8 [num_images, r, r]."""
+    blueprints, angles = _blueprints(image_set.seed, image_set.num_images)
+    cells = blueprints * ((WHITE - image_set.noise) / 2)
+    upright = cells.repeat(_PIXELS_PER_CELL, axis=1).repeat(_PIXELS_PER_CELL, axis=2)
+    images = np.empty(upright.shape, dtype=np.uint8)
+    for angle in np.unique(angles):
+        chosen = angles == angle
+        images[chosen] = _rotate(upright[chosen], int(angle)).astype(np.uint8)
+    return torch.from_numpy(images)
+
+
+def _blueprints(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cells in {0, 1, 2}, int64 [count, 4, 4], and whole degrees, int64 [count], from NumPy's frozen generator."""
+    generator = np.random.RandomState(seed)
+    cells = np.empty((count, BLUEPRINT_SIZE, BLUEPRINT_SIZE), dtype=np.int64)
+    angles = np.empty(count, dtype=np.int64)
+    for i in range(count):
+        cells[i] = generator.randint(0, 3, BLUEPRINT_SIZE**2, dtype=np.int64).reshape(cells[i].shape)
+        angles[i] = generator.randint(0, _ANGLES, dtype=np.int64)
+    return cells, angles
+
+
+def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
+    """Rotate as scikit-image does, counter-clockwise about the centre, bilinear, black outside; float64 [n, r, r].
+
+    Truncation to whole levels shows the last bit of a sum, so this has the order of operations that recorded sets have,
+    where `images.rotate` has rounded weights.
+    """
+    y, x = _sources(images.shape[-1], degrees)
+    border = images.shape[-1] // 2  # no pixel comes from farther outside
+    padded = np.pad(images, ((0, 0), (border, border), (border, border)))
+    above, left = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
+    down, right = y - above, x - left
+    rows, columns = above + border, left + border
+    upper, lower = (
+        (1 - right) * padded[:, row, columns] + right * padded[:, row, columns + 1] for row in (rows, rows + 1)
+    )
+    rotated = (1 - down) * upper + down * lower
+    # scikit-image stays within an image's levels, and black only counts as one where a pixel is fully outside
+    lowest = np.where(rotated.min((1, 2)) > 0, images.min((1, 2)), 0)
+    return np.clip(rotated, lowest[:, None, None], images.max((1, 2))[:, None, None])
+
+
+@lru_cache(maxsize=_ANGLES)
+def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns in the image that the pixels of the rotated one come from, float64 [r, r] each."""
+    angle, centre = math.radians(degrees), (size - 1) / 2
+    cos, sin = math.cos(angle), math.sin(angle)
+    y, x = np.mgrid[:size, :size].astype(np.float64)
+    first_x = _fused(sin, centre, -cos * centre) + centre
+    first_y = _fused(-cos, centre, -sin * centre) + centre
+    return sin * x + cos * y + first_y, cos * x - sin * y + first_x
+
+
+def _fused(a: float, b: float, c: float) -> float:
+    """a b + c, rounded once, as the matrix products that recorded sets come from."""
+    return float(Fraction(a) * Fraction(b) + Fraction(c))
+
+
+def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
+    """The arguments of `Task` for a configuration file; see `Task.from_json`."""
+    source, content = _load(path_or_dict)
+    draws = "the authors' implementation draws one at random or sets it with set_high_reward_path, counting from 0"
+    fix = "add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]"
+    require((goal is not None, f"goal is not in the file and must be given: {draws}; {fix}"))
+    dialect = _dialect(content)
+    require(*((False, f"{source}: {fault}") for fault in _faults(content, dialect)))
+    found = {name: content[section][key] for name, (section, key) in _places(dialect).items()}
+    if dialect in _GOAL_NEVER_CHANGES:
+        found.update(min_episodes=-1, max_episodes=-1)
+    require(*_value_rules(found, _places(dialect)))
+    return {"goal": goal, **_arguments(found)}
+
+
+def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
+    """What to call the source in an error, and its content."""
+    if isinstance(path_or_dict, Mapping):
+        return "configuration", path_or_dict
+    is_path = isinstance(path_or_dict, (str, PathLike))
+    require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
+    try:
+        content = json.loads(Path(path_or_dict).read_bytes())
+    except OSError as error:
+        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
+    require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))
+    return str(path_or_dict), content
+
+
+def _places(dialect: str) -> dict[str, tuple[str, str]]:
+    """Section and key of everything that a dialect knows."""
+    column = 1 + _DIALECTS.index(dialect)
+    return {name: (row[0], key) for name, row in _KEYS.items() if (key := row[column]) is not None}
+
+
+def _dialect(content: Mapping[str, Any]) -> str:
+    """The dialect that has most of the keys, the newest of several."""
+    sections = {name: section for name, section in content.items() if isinstance(section, Mapping)}
+    keys = {(name, key) for name, section in sections.items() for key in section}
+    return max(reversed(_DIALECTS), key=lambda dialect: len(keys & set(_places(dialect).values())))
+
+
+def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
+    """What keeps a file from being one of a dialect: sections and keys that are missing, unknown, or another's."""
+    wanted, names = _places(dialect).values(), (*_SECTIONS, "general_seed")
+    unknown = [f"unknown section {name!r}{_suggest(name, names)}" for name in content if name not in names]
+    whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
+    no_section = [
+        f"section {name!r} {'must be an object' if name in content else 'is missing'}"
+        for name in _SECTIONS
+        if name not in whole
+    ]
+    surplus = [
+        _surplus(section, key, dialect)
+        for section in whole
+        for key in content[section]
+        if (section, key) not in wanted and not _says_nothing(section, key, content)
+    ]
+    missing = [
+        f"{section}.{key} is missing" for section, key in wanted if section in whole and key not in content[section]
+    ]
+    return [*unknown, *no_section, *surplus, *missing]
+
+
+def _says_nothing(section: str, key: str, content: Mapping[str, Any]) -> bool:
+    """Files of 2023 may keep the older switch of reward noise; without noise it has no meaning."""
+    return (section, key) == ("reward", "stochastic_sampling") and content["reward"].get("std_r") == 0
+
+
+def _surplus(section: str, key: str, dialect: str) -> str:
+    """What is wrong with a key that a dialect does not have."""
+    here = _places(dialect)
+    for other in _DIALECTS:
+        for name, place in _places(other).items():
+            if place == (section, key):
+                fix = f"use {here[name][1]!r}" if name in here else "leave it out"
+                return f"{section}.{key} is of the {other} dialect, the other keys of the {dialect} one: {fix}"
+    keys = [known for home, known in here.values() if home == section]
+    return f"unknown key {section}.{key}{_suggest(key, keys)}"
+
+
+def _suggest(name: object, choices: Sequence[str]) -> str:
+    close = get_close_matches(str(name), choices, n=1)
+    return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(choices)}"
+
+
+def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[tuple[bool, str]]:
+    """What must hold for values before they become ours; all else is checked by what they become."""
+
+    def said(name: str) -> str:
+        return f"{'.'.join(places[name])} must be"
+
+    noise, rotation, first, end = (found[name] for name in ("noise", "rotation", "min_episodes", "max_episodes"))
+    whole = is_int(first) and is_int(end)
+    distribution, choices = found["distribution"], " or ".join(map(repr, _DISTRIBUTIONS))
+    flags = [name for name in ("is_stochastic", "unique_decisions", "unique_waits", "one_hot") if name in found]
+    still = is_real(noise) and noise < 1 and rotation == 1
+    return [
+        *((isinstance(found[name], bool), f"{said(name)} true or false, got {found[name]!r}") for name in flags),
+        (
+            isinstance(distribution, str) and distribution in _DISTRIBUTIONS,
+            f"{said('distribution')} {choices}, got {distribution!r}",
+        ),
+        (
+            whole and (max(first, end) <= 0 or 1 <= first < end),
+            f"{said('min_episodes')} below max_static_reward_episodes, which is exclusive, and both >= 1, or both <= 0 "
+            f"for a goal that stays; got {first!r} and {end!r}",
+        ),
+        (is_real(noise, 0, WHITE), f"{said('noise')} a number in [0, {WHITE}], got {noise!r}"),
+        (
+            is_int(rotation, 1, MAX_READ_ROTATION + 1),
+            f"{said('rotation')} an integer in 1..{MAX_READ_ROTATION + 1}, got {rotation!r}; it is exclusive: 1 is "
+            "none, and 0 makes the authors' implementation crash",
+        ),
+        (
+            found["one_hot"] is not True or still,
+            f"image_dataset.1D needs {places['noise'][1]} below 1 and {places['rotation'][1]} 1, got {noise!r} and "
+            f"{rotation!r}: what the authors' implementation does with others is not recorded",
+        ),
+    ]
+
+
+def _arguments(found: dict[str, Any]) -> dict[str, Any]:
+    """Values in our words as arguments of `Task`, all but the goal."""
+    changes = found["min_episodes"] > 0
+    noise = 0 if found["one_hot"] else found["noise"]
+    images = (
+        ReferenceOneHot(found["num_images"])
+        if found["one_hot"]
+        else ReferenceImages(found["num_images"], found["image_seed"], noise)
+    )
+    shown = {name: found[name] for name in ("wait_ids", "decision_ids", "end_ids", "unique_waits", "unique_decisions")}
+    return {
+        "graph": CTGraph(found["branching_factor"], found["depth"], found["wait_prob"]),
+        "observations": Observations(
+            **shown, **_LEGACY, read_noise=math.floor(noise), read_rotation=found["rotation"] - 1
+        ),
+        "images": images,
+        "reward_fn": _DISTRIBUTIONS[found["distribution"]],
+        "goal_reward": found["goal_reward"],
+        "fail_reward": found["fail_reward"],
+        "reward_std": found["reward_std"] if found.get("is_stochastic", True) else 0.0,
+        "reward_noise": "multiplicative",
+        "goal_change": (found["min_episodes"], found["max_episodes"] - 1) if changes else None,
+        "extra_end_step": True,
+        "legacy_goal_change": changes,
+    }
+
+
+def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> dict[str, Any]:
+    """A task as a configuration file of the 2023 dialect; see `Task.to_json`."""
+    require(
+        (path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"),
+        (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),
+        *((holds, f"the file cannot express {what}") for holds, what in _expressible(task)),
+    )
+    values = _values(task)
+    content: dict[str, Any] = {"general_seed": general_seed, **{section: {} for section in _SECTIONS}}
+    for name, (section, key) in _places("2023").items():
+        content[section][key] = values[name]
+    if path is not None:
+        Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return content
+
+
+def _expressible(task: Task) -> list[tuple[bool, str]]:
+    """What a task must have for a file of the 2023 dialect to say it, and what it has instead."""
+    x, images = task.observations, task.images
+    unique = x.unique_waits or x.unique_decisions or x.unique_ends
+    kinds = (ReferenceImages, ReferenceOneHot)
+    one_noise = not isinstance(images, ReferenceImages) or x.read_noise == math.floor(images.noise)
+    return [
+        (isinstance(images, kinds), f"images={images!r}: use ReferenceImages or ReferenceOneHot"),
+        (one_noise, f"read_noise={x.read_noise} with {images!r}: use one noise, noise={x.read_noise} of the images"),
+        (task.reward_fn in _DISTRIBUTIONS.values(), f"reward_fn={task.reward_fn!r}: use Needle or ReferenceLinear"),
+        (task.step_reward == 0, f"step_reward={task.step_reward}: use 0"),
+        (
+            task.reward_std == 0 or task.reward_noise == "multiplicative",
+            f"reward_noise={task.reward_noise!r}: use 'multiplicative'",
+        ),
+        (task.extra_end_step, "extra_end_step=False: use True"),
+        (task.goal_change is None or task.legacy_goal_change, "legacy_goal_change=False with a goal_change: use True"),
+        (x.home_ids == (0, 0), f"home_ids={x.home_ids}: use (0, 0)"),
+        (x.fail_ids == (1, 1), f"fail_ids={x.fail_ids}: use (1, 1)"),
+        (
+            x.unique_ends == (x.unique_waits or x.unique_decisions),
+            f"unique_ends={x.unique_ends}: end states are unique when waits or decisions are; use None",
+        ),
+        (x.reward_cue, "reward_cue=False: use True"),
+        (x.cue_wraps, "cue_wraps=False: use True"),
+        (x.legacy_index or not unique, "legacy_index=False with unique ids: use True"),
+        (
+            x.noise_before_rotation or not (x.read_noise and x.read_rotation),
+            "noise_before_rotation=False with noise and rotation: use True",
+        ),
+    ]
+
+
+def _values(task: Task) -> dict[str, Any]:
+    """A task in the words of `_KEYS`."""
+    graph, x, images = task.graph, task.observations, task.images
+    first, last = task.goal_change or (-1, -2)
+    return {
+        "depth": graph.depth,
+        "branching_factor": graph.branching_factor,
+        "wait_prob": graph.wait_prob,
+        "goal_reward": task.goal_reward,
+        "fail_reward": task.fail_reward,
+        "reward_std": task.reward_std,
+        "min_episodes": first,
+        "max_episodes": last + 1,
+        "distribution": next(name for name, reward_fn in _DISTRIBUTIONS.items() if reward_fn == task.reward_fn),
+        "unique_decisions": x.unique_decisions,
+        "unique_waits": x.unique_waits,
+        "wait_ids": list(x.wait_ids),
+        "decision_ids": list(x.decision_ids),
+        "end_ids": list(x.end_ids),
+        "image_seed": getattr(images, "seed", 1),
+        "one_hot": isinstance(images, ReferenceOneHot),
+        "num_images": images.num_images,
+        "noise": getattr(images, "noise", 0.0),
+        "rotation": x.read_rotation + 1,
+    }

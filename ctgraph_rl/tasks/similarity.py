@@ -1,0 +1,379 @@
+"""How alike tasks are: exact measures of goals, optimal actions, images and graphs, as matrices and as heat maps.
+
+All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the decisions that lead to them, in
+the *common tree*: decisions and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
+return; actions are as those of an environment with all tasks, where one above a task's branching factor fails. Where
+nothing is at stake, such as off the way to a needle that costs nothing to miss, all actions are optimal.
+
+Goals that change, and noise and rotation on read, are left aside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctgraph_rl.batch.params import bank_bytes
+from ctgraph_rl.checks import fraction, require, require_all
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import ImageSet
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import MAX_ENUMERATED_STATES, _is_needle, _Optimal, _tree
+from ctgraph_rl.visualize.curriculum_figure import new_figure
+
+ROUNDING = 1e-9
+"""Actions whose values differ by no more than this, relative to the largest value of the task, are equally good."""
+
+MAX_COMPARED_BYTES = 2**31
+"""Largest image set whose images are compared."""
+
+MOST_NUMBERS, MOST_LABELS = 8, 40
+"""Tasks up to which a heat map shows numbers and labels."""
+
+CHOOSING = (StateType.WAIT, StateType.DECISION)
+"""The states whose actions matter: home leads on whatever the action."""
+
+ON_THE_WAY, ELSEWHERE = 0, 1
+"""The two kinds of nodes of a tree that collapses."""
+
+
+def shared_decisions(tasks: Sequence[Task]) -> Tensor:
+    """Decisions that two goals share from the first on, as a share of the shorter goal's; float64 [T, T].
+
+    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3. 1 means that the goal of the smaller graph is on
+    the way to that of the larger one.
+    """
+
+    def share(one: Task, other: Task) -> float:
+        pairs = list(zip(one.goal, other.goal, strict=False))
+        return next((k for k, (a, b) in enumerate(pairs) if a != b), len(pairs)) / len(pairs)
+
+    return _matrix(_tasks(tasks), share)
+
+
+def state_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
+    """Share of the wait and decision states of the common tree with equal sets of optimal actions; float64 [T, T].
+
+    Two needles take O(depth); other rewards visit every state.
+
+    Args:
+        tasks: any tasks.
+        gamma: discount, in [0, 1].
+
+    Raises:
+        ValueError: for rewards other than `Needle` beyond `values.MAX_ENUMERATED_STATES` states.
+    """
+    return _matrix(_choices(_tasks(tasks), gamma), _equal_share)
+
+
+def observation_agreement(tasks: Sequence[Task], gamma: float = 1.0) -> Tensor:
+    """The same for what a policy without memory sees: a share of the observations shown in both tasks; float64 [T, T].
+
+    Counted are the different images that wait and decision states of both tasks can show. At each, a task leaves the
+    actions that are optimal in every one of its states that can show it; the tasks agree where they leave the same
+    actions, and any at all. So the diagonal is below 1 for tasks that need memory: with one image for all decision
+    states the goal (1, 2) leaves none there. nan where no image is shown in both.
+
+    Args:
+        tasks: any tasks.
+        gamma: discount, in [0, 1].
+
+    Raises:
+        ValueError: beyond `values.MAX_ENUMERATED_STATES` states where every state has to be visited, and for image sets
+            of more than `MAX_COMPARED_BYTES`.
+    """
+
+    def share(one: dict[bytes, int], other: dict[bytes, int]) -> float:
+        shown = one.keys() & other.keys()
+        return sum(one[i] == other[i] != 0 for i in shown) / len(shown) if shown else math.nan
+
+    return _matrix([_actions_left(choice) for choice in _choices(_tasks(tasks), gamma)], share)
+
+
+def shared_images(tasks: Sequence[Task]) -> Tensor:
+    """Images shown in both tasks as a share of those shown in either (Jaccard), by content; float64 [T, T].
+
+    Images are those that states of any kind can show; vectors of different lengths are padded with zeros.
+
+    Raises:
+        ValueError: for image sets of more than `MAX_COMPARED_BYTES`, and too many states with unique ids.
+    """
+    shown = [_images_shown(task) for task in _tasks(tasks)]
+    return _matrix(shown, lambda one, other: len(one & other) / len(one | other))
+
+
+def graph_containment(tasks: Sequence[Task]) -> Tensor:
+    """Share of the smaller graph's decision states that the larger graph has too; float64 [T, T].
+
+    1 where the larger has at least the depth and the branching factor of the smaller one, whatever their wait
+    probabilities.
+    """
+
+    def share(one: Task, other: Task) -> float:
+        smaller = min(task.graph.num_decision_states for task in (one, other))
+        b, d = _common(one, other)
+        return (b**d - 1) // (b - 1) / smaller
+
+    return _matrix(_tasks(tasks), share)
+
+
+MEASURES: dict[str, Callable[[Sequence[Task]], Tensor]] = {
+    "shared decisions on the way to the goals": shared_decisions,
+    "states with the same optimal actions": state_agreement,
+    "observations with the same optimal actions": observation_agreement,
+    "shared images": shared_images,
+    "containment of the smaller graph": graph_containment,
+}
+"""All measures by what they measure."""
+
+
+def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
+    """Draw a heat map of each measure over a curriculum's tasks.
+
+    Args:
+        curriculum: its tasks, in order of first appearance.
+        path: the picture to write; its ending decides the format.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib; names the extra to install.
+        ValueError: for tasks too large for a measure.
+    """
+    figure = new_figure(12, 7.6)
+    figure.suptitle(f"{curriculum.name}: similarity of {len(curriculum.tasks)} tasks")
+    *panels, last = figure.subplots(2, 3).flat
+    for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
+        image = _draw_matrix(axes, measure(curriculum.tasks), curriculum.labels, title)
+    last.axis("off")
+    figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
+    figure.savefig(path, dpi=160)
+
+
+def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -> Any:
+    axes.set_facecolor("white")
+    axes.patch.set(hatch="////", edgecolor="grey")
+    image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
+    axes.set_title(title, fontsize=9)
+    if len(labels) > MOST_LABELS:
+        axes.set(xlabel="task, from 0", ylabel="task, from 0")
+        return image
+    size = max(4, 8 - len(labels) // 8)
+    axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
+    axes.set_yticks(range(len(labels)), labels, fontsize=size)
+    if len(labels) <= MOST_NUMBERS:
+        for i, j in torch.cartesian_prod(*2 * [torch.arange(len(labels))]).tolist():
+            _write_number(axes, i, j, matrix[i, j].item())
+    return image
+
+
+def _write_number(axes: Any, i: int, j: int, value: float) -> None:
+    if not math.isnan(value):
+        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if value > 0.6 else "black")
+
+
+def _tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
+    return require_all(Task, "tasks", tasks)
+
+
+def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
+    """A symmetric measure of all pairs; float64 [n, n]."""
+    matrix = torch.zeros(len(items), len(items), dtype=torch.float64)
+    for i, one in enumerate(items):
+        for j, other in enumerate(items[: i + 1]):
+            matrix[i, j] = matrix[j, i] = share(one, other)
+    return matrix
+
+
+def _common(one: Task, other: Task) -> tuple[int, int]:
+    """Branching factor and depth of the common tree."""
+    graphs = (one.graph, other.graph)
+    return min(graph.branching_factor for graph in graphs), min(graph.depth for graph in graphs)
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """The optimal actions of a task: sets by kind and level, of every node or, collapsed, on the way and off.
+
+    A set of actions is an integer with a bit for each.
+    """
+
+    task: Task
+    sets: dict[tuple[StateType, int], list[int]]
+    collapsed: bool
+
+    @cached_property
+    def goal_nodes(self) -> list[int]:
+        """Number of the goal's node within each level."""
+        b, nodes = self.task.graph.branching_factor, [0]
+        for decision in self.task.goal:
+            nodes.append(nodes[-1] * b + decision - 1)
+        return nodes
+
+    def of_path(self, kind: StateType, path: tuple[int, ...]) -> int:
+        """The set at a node of a collapsed tree by the decisions that lead to it."""
+        return self.sets[kind, len(path)][ON_THE_WAY if path == self.task.goal[: len(path)] else ELSEWHERE]
+
+    def of_nodes(self, kind: StateType, level: int, nodes: Sequence[int]) -> list[int]:
+        """The sets at nodes by their numbers within a level."""
+        sets, goal = self.sets[kind, level], self.goal_nodes[level]
+        return [sets[ON_THE_WAY if node == goal else ELSEWHERE] if self.collapsed else sets[node] for node in nodes]
+
+    def in_use(self, kind: StateType) -> Iterator[int]:
+        """The sets that occur."""
+        for (of_kind, level), sets in self.sets.items():
+            if of_kind == kind:
+                yield from sets[:1] if level == 0 else sets
+
+
+def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
+    require(*fraction(gamma=gamma))
+    num_actions = 1 + max(task.graph.branching_factor for task in tasks)
+    return [_Choices(task, _optimal_sets(task, gamma, num_actions), _is_needle(task)) for task in tasks]
+
+
+def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[StateType, int], list[int]]:
+    """Backward induction from the end states, as `values` does it, that keeps what is optimal."""
+    tree, best = _tree(task, _is_needle(task)), _Optimal(task, gamma)
+    step, p = task.step_reward, task.graph.wait_prob
+    fails, margin = step + task.fail_reward, ROUNDING * _largest(task)
+    arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)
+    sets = {}
+    for level in reversed(range(task.graph.depth + 1)):
+        waiting = (step + (1 - p) * arrival) / (1 - gamma * p)
+        sets[StateType.WAIT, level] = _best(waiting.unsqueeze(-1), fails, num_actions, 0, margin)
+        if level > 0:
+            children = tree.children(best.at_wait(arrival, level), level - 1)
+            deciding = step + gamma * children
+            sets[StateType.DECISION, level - 1] = _best(deciding, fails, num_actions, 1, margin)
+            arrival = gamma * best.at_decision(children, level - 1)
+    return sets
+
+
+def _largest(task: Task) -> float:
+    steps = 2 * (task.graph.depth + 1) / (1 - task.graph.wait_prob)
+    return abs(task.goal_reward) + abs(task.fail_reward) + abs(task.step_reward) * steps
+
+
+def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: float) -> list[int]:
+    """The sets of best actions: ``values`` [n, m] are those of the actions from ``first`` on, any other one fails."""
+    best = values.amax(-1).clamp_min(fails) - margin
+    rows, which = torch.unique(values >= best.unsqueeze(-1), dim=0, return_inverse=True)
+    others = (1 << num_actions) - 1 - (((1 << values.shape[1]) - 1) << first)
+    packed = np.packbits(rows.numpy(), axis=1, bitorder="little")
+    chosen = [int.from_bytes(row.tobytes(), "little") << first for row in packed]
+    pairs = zip(which.tolist(), (fails >= best).tolist(), strict=True)
+    return [chosen[row] | (others if failing else 0) for row, failing in pairs]
+
+
+def _equal_share(one: _Choices, other: _Choices) -> float:
+    """Share of the states of the common tree with equal sets."""
+    b, d = _common(one.task, other.task)
+    count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
+    equal = sum(count(one, other, kind, level, b) for kind in CHOOSING for level in range(d + (kind == StateType.WAIT)))
+    decisions = (b**d - 1) // (b - 1)
+    return equal / (2 * decisions + b**d)
+
+
+def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
+    """Equal states of a level: those on the ways to two needles one by one, all others at once."""
+    ways = {choice.task.goal[:level] for choice in (one, other)}
+    inside = [path for path in ways if max(path, default=1) <= b]
+    equal = sum(one.of_path(kind, path) == other.of_path(kind, path) for path in inside)
+    others_equal = one.sets[kind, level][ELSEWHERE] == other.sets[kind, level][ELSEWHERE]
+    return equal + (b**level - len(inside)) * others_equal
+
+
+def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
+    """Equal states of a level, all visited."""
+
+    def sets(choice: _Choices) -> list[int]:
+        return choice.of_nodes(kind, level, _nodes(choice.task.graph.branching_factor, b, level))
+
+    return sum(a == z for a, z in zip(sets(one), sets(other), strict=True))
+
+
+@lru_cache(maxsize=64)
+def _nodes(own_b: int, b: int, level: int) -> list[int]:
+    """Numbers within a level of the nodes that b decisions reach, in their order."""
+    return [node * own_b + branch for node in _nodes(own_b, b, level - 1) for branch in range(b)] if level else [0]
+
+
+def _actions_left(choice: _Choices) -> dict[bytes, int]:
+    """For each image that wait and decision states show, the actions that are optimal in all states that show it."""
+    left: dict[bytes, int] = {}
+    for ids, actions in _shown_with_actions(choice):
+        for content in _contents(choice.task, ids):
+            left[content] = left.get(content, actions) & actions
+    return left
+
+
+def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]:
+    """Ids, and a set of actions that is optimal in every state that shows them."""
+    task = choice.task
+    for kind in CHOOSING:
+        if not task.observations.is_unique(kind):
+            actions = -1
+            for each in choice.in_use(kind):
+                actions &= each
+            yield _ids(task, kind), actions
+            continue
+        for level in _levels(task, kind):
+            ids = _unique_ids(task, kind, level)
+            sets = choice.of_nodes(kind, level, range(len(ids)))
+            yield from (([number], actions) for number, actions in zip(ids, sets, strict=True))
+
+
+def _images_shown(task: Task) -> set[bytes]:
+    return {content for kind in StateType for content in _contents(task, _ids(task, kind))}
+
+
+def _ids(task: Task, kind: StateType) -> Sequence[int]:
+    """The ids that states of a kind show."""
+    first, last = task.observations.ids(kind)
+    if not task.observations.is_unique(kind):
+        return range(first, last + 1)
+    return [number for level in _levels(task, kind) for number in _unique_ids(task, kind, level)]
+
+
+def _levels(task: Task, kind: StateType) -> range:
+    """Numbers of decisions taken that states of a kind can have."""
+    depth = task.graph.depth
+    return {StateType.WAIT: range(depth + 1), StateType.DECISION: range(depth)}.get(kind, range(depth, depth + 1))
+
+
+def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
+    """The ids of the states of a level, in their order."""
+    x, graph = task.observations, task.graph
+    states, limit = graph.num_states, MAX_ENUMERATED_STATES
+    require((states <= limit, f"unique ids on this graph need a visit to each of its {states} states, limit {limit}"))
+    first, last = x.ids(kind)
+    before = 0 if kind == StateType.END and not x.legacy_index else x.first_of_level(level, graph.branching_factor)
+    size = last - first + 1
+    return [first + (before + node) % size for node in range(graph.branching_factor**level)]
+
+
+def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
+    """What the images behind ids are known by: equal for equal images of any set."""
+    needed, variants = bank_bytes([task]), task.images.num_variants
+    rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"
+    require((needed <= MAX_COMPARED_BYTES, rule))
+    digests = _digests(task.images)  # type: ignore[arg-type]
+    return (digests[i * variants + variant] for i in ids for variant in range(variants))
+
+
+@lru_cache(maxsize=256)
+def _digests(images: ImageSet) -> list[bytes]:
+    """A hash of every image; of vectors without the zeros at their end."""
+    rows = images.bank(0).numpy()
+    vectors, shape = rows.ndim == 2, repr(rows.shape[2:]).encode()
+    contents = (row.tobytes().rstrip(b"\0") if vectors else shape + row.tobytes() for row in rows)
+    return [hashlib.blake2b(content, digest_size=16).digest() for content in contents]

@@ -1,0 +1,122 @@
+"""How the task changes within a block: by the episode, at random times, or by drift. No boundary tells of it.
+
+A switch decides which of a block's tasks an episode has. Its clock counts episodes: those that a row has completed in
+the block, or, for all rows ``together``, the mean over the rows, rounded down. A change takes effect where a row starts
+an episode, never within one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.core.philox import randint
+
+MOST_EPISODES = 2**31
+"""Drifts are drawn with 32-bit words."""
+
+
+class Switch(Protocol):
+    """Which task comes next. A user's own is a frozen dataclass with these members."""
+
+    @property
+    def together(self) -> bool:
+        """All rows change by one clock and one draw; False: each row by its own."""
+        ...
+
+    def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
+        """The positions in the block of the tasks of the episodes that start now; tensors of one shape.
+
+        Args:
+            task: int64, the position of the last episode's task.
+            clock: int64, episodes completed, at least 1.
+            num_tasks: tasks of the block.
+            words: at least two random words in [0, 2**32) each.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ByEpisode:
+    """The tasks take turns, each for a number of episodes.
+
+    Args:
+        episodes: episodes of a turn.
+        together: all rows change at once.
+    """
+
+    episodes: int = 1
+    together: bool = False
+
+    def __post_init__(self) -> None:
+        require(_episodes_rule(self.episodes), _together_rule(self.together))
+
+    def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
+        """See `Switch`."""
+        return clock // self.episodes % num_tasks
+
+
+@dataclass(frozen=True)
+class AtRandom:
+    """At each start of an episode the task changes with a probability, to any other one of the block.
+
+    A task lasts 1 / ``prob`` episodes in the mean.
+
+    Args:
+        prob: in (0, 1]; below 2**-32 it never changes.
+        together: all rows change at once.
+    """
+
+    prob: float
+    together: bool = False
+
+    def __post_init__(self) -> None:
+        holds = is_real(self.prob, 0, 1) and self.prob > 0
+        require((holds, f"prob must be in (0, 1], got {self.prob!r}"), _together_rule(self.together))
+        object.__setattr__(self, "prob", float(self.prob))
+
+    def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
+        """See `Switch`."""
+        other = (task + 1 + randint(words[1], num_tasks - 1)) % num_tasks
+        return torch.where(words[0] < int(self.prob * 2**32), other, task)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The probability of the next task rises linearly: from 0 at the start to 1 after ``episodes`` episodes.
+
+    With more than two tasks the drift goes from each to the next, and after the last it stays there.
+
+    Args:
+        episodes: episodes from one task to the next.
+        together: all rows draw at once.
+    """
+
+    episodes: int
+    together: bool = False
+
+    def __post_init__(self) -> None:
+        require(_episodes_rule(self.episodes), _together_rule(self.together))
+
+    def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
+        """See `Switch`."""
+        is_next = randint(words[0], self.episodes) < clock % self.episodes
+        return (clock // self.episodes + is_next).clamp_max(num_tasks - 1)
+
+
+def switch_rule(switch: object) -> tuple[bool, str]:
+    """The rule for switches, a user's own among them."""
+    holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)
+    return holds, f"switch must be one such as Drift(100), got {switch!r}"
+
+
+def _episodes_rule(episodes: object) -> tuple[bool, str]:
+    return is_int(episodes, 1, MOST_EPISODES), f"episodes must be an integer in 1..2**31, got {episodes!r}"
+
+
+def _together_rule(together: object) -> tuple[bool, str]:
+    return isinstance(together, bool), f"together must be true or false, got {together!r}"

@@ -1,0 +1,227 @@
+"""Task: the paper's <b, d, O, X, p, g> and the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any, Self
+
+from torch import Tensor
+
+from ctgraph_rl.checks import as_tuple, is_int, is_real, require
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.core.rewards import Needle, RewardFn
+from ctgraph_rl.tasks import reference, values
+from ctgraph_rl.tasks.images import ImageSet, has_cue_element
+from ctgraph_rl.tasks.observations import Observations
+
+REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
+NOISES = ("additive", "multiplicative")
+
+MAX_EPISODES = 2**31
+"""Episodes are drawn with 32-bit words."""
+
+SMALLEST_CUED_REWARD = 1e-30
+LARGEST_REWARD = 1e30
+"""Rewards are float32, and their sums and noise must stay finite."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One CT-graph problem. Frozen, validated, equal and hashable by value.
+
+    ``dataclasses.replace(task, goal=(2, 1))`` gives a variation.
+
+    Args:
+        graph: shape of the tree, <b, d, p>.
+        goal: the decisions that lead to the goal, d integers in 1..b.
+        observations: which id each state shows, X.
+        images: what is behind the ids, O.
+        reward_fn: the share of ``goal_reward`` that each end state pays, g.
+        goal_reward: reward at the goal, high_r of the paper.
+        fail_reward: reward on entering the fail state, fail_r.
+        step_reward: reward of every step, in addition.
+        reward_std: standard deviation of the noise on what end states pay, std_r.
+        reward_noise: ``additive``, N(c, reward_std) as in the paper, or ``multiplicative``, c (1 + N(0, reward_std)) as
+            in the authors' implementation.
+        goal_change: (first, last): a goal lasts for a number of episodes drawn from first..last, then another is drawn
+            from all end states, the same one among them; per row, from the environment's own randomness. None: never.
+        extra_end_step: end as the authors' implementation does: an end state takes one more action, any one, and the
+            last observation of the episode is one of the home state. The reward still comes on entering the end state.
+        legacy_goal_change: count as the authors' implementation does: the first goal lasts one episode less than drawn.
+
+    Raises:
+        ValueError: names every field that breaks a rule.
+    """
+
+    graph: CTGraph
+    goal: tuple[int, ...]
+    observations: Observations
+    images: ImageSet
+    reward_fn: RewardFn = field(default_factory=Needle)
+    goal_reward: float = 1.0
+    fail_reward: float = 0.0
+    step_reward: float = 0.0
+    reward_std: float = 0.0
+    reward_noise: str = "additive"
+    goal_change: tuple[int, int] | None = None
+    extra_end_step: bool = False
+    legacy_goal_change: bool = False
+
+    def __post_init__(self) -> None:
+        self._check_parts()
+        object.__setattr__(self, "goal", as_tuple(self.goal))
+        object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
+        one_hot = len(self.images.shape) == 1
+        x = self.observations
+        varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
+        room, last_id = self.images.num_images, self.observations.last_id
+        too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
+        require(
+            self._goal_rule(),
+            *self.observations.rules(self.graph),
+            (last_id < room, too_few),
+            (
+                not (one_hot and varies),
+                "read_noise, read_rotation and reward_cue need images, not one-hot observations",
+            ),
+            *self._reward_rules(),
+        )
+        for name in REWARDS:
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    @classmethod
+    def from_json(
+        cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None = None
+    ) -> Self:
+        """The task of a configuration file of the authors' implementation, to behave as it does there.
+
+        The keys may be those of 2019 (``delay_prob``), of 2021 (``wait_prob``) or of 2023 (``p``). Where a file has
+        ``stochastic_sampling``, the standard deviation of rewards counts only if that is true. The ``general_seed`` is
+        not of the task: give it to ``CTGraphEnv(seed=...)``, whose random numbers are other ones.
+
+        Args:
+            path_or_dict: the file, or its content.
+            goal: d decisions in 1..b; the file has none. A path for ``set_high_reward_path`` counts from 0: add 1.
+
+        Raises:
+            ValueError: for a missing goal, a file that cannot be read, keys that are missing, unknown or of several
+                dialects, and values out of range, those that the authors' implementation silently repairs among them.
+        """
+        return cls(**reference.read_task(path_or_dict, goal))
+
+    def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
+        """This task as a configuration file of the authors' implementation, with the keys of 2023.
+
+        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for the goal (2, 1).
+        ``Task.from_json(task.to_json(), goal=task.goal)`` equals every task that `from_json` made.
+
+        Args:
+            path: where to write the file; None: nowhere.
+            general_seed: seed of the authors' environment, in [0, 2**32).
+
+        Returns:
+            The content of the file.
+
+        Raises:
+            ValueError: lists everything of the task that the file cannot express.
+        """
+        return reference.write_task(self, path, general_seed)
+
+    def _check_parts(self) -> None:
+        images, reward_fn = self.images, self.reward_fn
+        has_images = hasattr(images, "bank") and not isinstance(images, type)
+        pays = callable(reward_fn) and not isinstance(reward_fn, type)
+        require(
+            (isinstance(self.graph, CTGraph), f"graph must be a CTGraph, got {self.graph!r}"),
+            (
+                isinstance(self.observations, Observations),
+                f"observations must be Observations, got {self.observations!r}",
+            ),
+            (has_images, f"images must be an image set such as PaperImages(5), got {images!r}"),
+            (pays, f"reward_fn must be a reward such as Needle(), got {reward_fn!r}"),
+        )
+
+    def _reward_rules(self) -> list[tuple[bool, str]]:
+        cue, change = self.observations.reward_cue, self.goal_change
+        pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
+        lasts = pair and is_int(change[1], change[0], MAX_EPISODES)  # type: ignore[index]
+        switches = [(name, getattr(self, name)) for name in ("extra_end_step", "legacy_goal_change")]
+        return [
+            *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
+            *((isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in switches),
+            (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
+            (self._noise_is_finite(), f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
+            (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
+            (
+                change is None or lasts,
+                f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}",
+            ),
+            (
+                not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD),
+                f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}",
+            ),
+        ]
+
+    def _noise_is_finite(self) -> bool:
+        if self.reward_noise != "multiplicative" or not (is_real(self.goal_reward) and is_real(self.reward_std)):
+            return True
+        return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
+
+    def _goal_rule(self) -> tuple[bool, str]:
+        b, d = self.graph.branching_factor, self.graph.depth
+        goal = self.goal
+        holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
+        message = f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
+        if not holds and isinstance(goal, tuple) and 0 in goal and all(is_int(branch, 0, b - 1) for branch in goal):
+            message += (
+                f"; a path of the authors' implementation counts from 0: use {tuple(branch + 1 for branch in goal)}"
+            )
+        return holds, message
+
+    @property
+    def goal_leaf(self) -> int:
+        """Number of the end state with the goal: its base-b digits are the decisions, the first one leading."""
+        leaf = 0
+        for decision in self.goal:
+            leaf = leaf * self.graph.branching_factor + decision - 1
+        return leaf
+
+    def optimal_value(self, gamma: float) -> float:
+        """The best expected discounted return from the home state; see `values.optimal_value`."""
+        return values.optimal_value(self, gamma)
+
+    def policy_value(self, policy: Tensor, gamma: float = 1.0) -> float:
+        """The expected discounted return of action probabilities per observation id; see `values.policy_value`."""
+        return values.policy_value(self, policy, gamma)
+
+    def success_prob(self, policy: Tensor) -> float:
+        """The probability that such a policy reaches the goal; see `values.success_prob`."""
+        return values.success_prob(self, policy)
+
+    def memoryless_ceiling(self, deterministic: bool = False) -> float:
+        """The best mean return of a policy that remembers nothing; see `values.memoryless_ceiling`."""
+        return values.memoryless_ceiling(self, deterministic)
+
+    @property
+    def image_seed(self) -> int | None:
+        """The seed of a generated image set, None for sets without."""
+        return getattr(self.images, "seed", None)
+
+    @property
+    def label_parts(self) -> dict[str, str]:
+        """What tells tasks apart in tables: goal, depth, branching factor, wait probability and images."""
+        images = type(self.images).__name__.lower() if self.image_seed is None else f"img{self.image_seed}"
+        return {
+            "goal": f"goal{'.'.join(map(str, self.goal))}",
+            "depth": f"d{self.graph.depth}",
+            "branching_factor": f"b{self.graph.branching_factor}",
+            "wait_prob": f"p{self.graph.wait_prob:g}",
+            "images": images,
+        }
+
+
+def _reward_rule(name: str, value: object) -> tuple[bool, str]:
+    holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
+    return holds, f"{name} must be a finite number, got {value!r}; at most 1e30 in size"

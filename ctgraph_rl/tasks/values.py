@@ -1,0 +1,265 @@
+"""What policies are worth: exact values by backward induction, and the ceiling of policies without memory.
+
+The tree has no cycles but the waiting in place, so values follow from the end states back to home in one pass. With
+reward r_(t+1) for step t (the first step has t = 0) a return is sum_t gamma^t r_(t+1); every episode ends, so gamma
+may be 1. A wait state is left with probability 1 - p per wait; with V' the value of where it leads,
+
+    V(wait) = s + a (1 - p) V' + a p gamma V(wait) + (1 - a) fail_reward    if it waits with probability a,
+
+which is solved for V(wait). Rewards are those of `CTGraphEnv`: ``goal_reward`` times the share of ``reward_fn`` on
+entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step, one more of
+them after an end state where ``extra_end_step`` is set. The noise of rewards has mean 0 and changes nothing; a goal
+that changes stays as it is. The environment rounds rewards to float32; here they are float64. Policies see observation
+ids, which is what they see of images where no two are equal and nothing varies on read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import fraction, require
+from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.core.rewards import Arrival, Needle
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.task import Task
+
+MAX_ENUMERATED_STATES = 2**21
+"""Largest graph whose states are visited one by one; needles are computed without it where their docstrings say so."""
+
+SUM_TOLERANCE = 1e-6
+"""How far the probabilities of an observation may be from a sum of 1: float32 policies are welcome."""
+
+
+def optimal_value(task: Task, gamma: float) -> float:
+    """The best expected discounted return from the home state, of any policy; failing on purpose may be part of it.
+
+    For the plain needle (goal 1, fail 0) it is gamma^-1 (gamma^2 (1 - p) / (1 - gamma p))^(d + 1). Needles take O(d),
+    other rewards visit every state.
+
+    Args:
+        task: any task.
+        gamma: discount, in [0, 1].
+
+    Raises:
+        ValueError: for a gamma out of range, and rewards other than `Needle` beyond `MAX_ENUMERATED_STATES` states.
+    """
+    require(*fraction(gamma=gamma))
+    return _value_at_home(_tree(task, _is_needle(task)), _Optimal(task, gamma))
+
+
+def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
+    """The expected discounted return of a memoryless policy from the home state; with gamma = 1 the mean return.
+
+    Ids that a state draws are averaged, as a wait state draws anew at every step. Needles take O(d) when neither
+    waits nor decisions are unique, other tasks visit every state.
+
+    Args:
+        task: any task.
+        policy: action probabilities per observation id, float [num_images, A] with A >= b + 1 and rows that sum to 1;
+            actions above b fail, as in the environment. The rows of home, end and fail ids have no effect.
+        gamma: discount, in [0, 1].
+
+    Raises:
+        ValueError: for a policy of a wrong shape or dtype or without such rows, a gamma out of range, and more than
+            `MAX_ENUMERATED_STATES` states where every state has to be visited.
+    """
+    require(*fraction(gamma=gamma), *_policy_rules(task, policy))
+    shared = not (task.observations.unique_waits or task.observations.unique_decisions)
+    chooser = _Memoryless(task, gamma, policy.detach().to("cpu", torch.float64))
+    return _value_at_home(_tree(task, _is_needle(task) and shared), chooser)
+
+
+def success_prob(task: Task, policy: Tensor) -> float:
+    """The probability that a memoryless policy reaches the goal, whatever the rewards; arguments as `policy_value`."""
+    return policy_value(replace(task, reward_fn=Needle(), goal_reward=1.0, fail_reward=0.0, step_reward=0.0), policy)
+
+
+def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
+    """The best mean return of a policy that sees an observation id and remembers nothing.
+
+    Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. No way on is then worse than failing,
+    so waiting at wait states and deciding at decision states loses nothing, whether wait ids are unique or not. What is
+    left is the choice of decisions; with c_a the number of times that the goal takes decision a:
+
+    - unique decisions: every decision can be the right one; goal_reward.
+    - stochastic: decisions are drawn with the same probabilities q at every decision state, drawn ids or not, and
+      prod q_a^c_a is largest at q_a = c_a / d (Gibbs' inequality): goal_reward * prod (c_a / d)^c_a.
+    - deterministic: the K ids of decision states are divided among the decisions, n_a ids each, so q_a = n_a / K:
+      goal_reward * max prod (n_a / K)^c_a, which is 0 when the goal takes more than K different decisions.
+
+    A deterministic policy here is a function of the id: noise and rotation on read could serve it as dice.
+
+    Args:
+        task: a task as above.
+        deterministic: consider only policies that map an id to one action.
+
+    Raises:
+        ValueError: for other rewards, saying which; their best policies may fail on purpose or seek several end states.
+    """
+    require(*_ceiling_rules(task))
+    if task.observations.unique_decisions:
+        return task.goal_reward
+    counts = list(Counter(task.goal).values())
+    first, last = task.observations.decision_ids
+    shares = _divided(last - first + 1, counts) if deterministic else [count / task.graph.depth for count in counts]
+    return task.goal_reward * math.prod(share**count for share, count in zip(shares, counts, strict=True))
+
+
+def _divided(num_ids: int, counts: list[int]) -> list[float]:
+    """Shares n_a / K with sum n_a = K, integer n_a, that maximise prod (n_a / K)^c_a.
+
+    One id each and then, one by one, to the decision whose c_a ln n_a gains most: optimal since each of these terms is
+    concave in n_a, so gains only fall (Fox 1966, Operations Research 14). With fewer ids than decisions the product is
+    0 whatever they do.
+    """
+    if num_ids < len(counts):
+        return [0.0] * len(counts)
+    ids = [1] * len(counts)
+    for _ in range(num_ids - len(counts)):
+        gains = [count * math.log1p(1 / n) for n, count in zip(ids, counts, strict=True)]
+        ids[gains.index(max(gains))] += 1
+    return [n / num_ids for n in ids]
+
+
+def _value_at_home(tree: _EveryNode | _GoalPath, chooser: _Optimal | _Memoryless) -> float:
+    """Backward induction from the end states to home, whose step is not rewarded and leads to the root's wait state."""
+    after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
+    values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
+    for level in reversed(range(tree.task.graph.depth)):
+        decided = chooser.at_decision(tree.children(values, level), level)
+        values = chooser.at_wait(chooser.gamma * decided, level)
+    return tree.task.step_reward + chooser.gamma * values[0].item()
+
+
+def _tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
+    """The smallest tree that is exact."""
+    if collapses:
+        return _GoalPath(task)
+    states, limit = task.graph.num_states, MAX_ENUMERATED_STATES
+    too_many = f"{type(task.reward_fn).__name__} on this graph needs a visit to each of its {states} states"
+    require((states <= limit, f"{too_many}, more than the limit of {limit} (2**21); use a smaller depth"))
+    return _EveryNode(task)
+
+
+@dataclass(frozen=True)
+class _EveryNode:
+    """All b^k nodes of a level, in heap order."""
+
+    task: Task
+
+    def end_rewards(self) -> Tensor:
+        """float64 [b^d]."""
+        task = self.task
+        leaf = torch.arange(task.graph.num_end_states)
+        of_task = (task.goal_leaf, task.graph.branching_factor, task.graph.depth)
+        goal, b, depth = (torch.full_like(leaf, value) for value in of_task)
+        arrival = Arrival(leaf, goal, b, depth, task.graph.depth)
+        share = task.reward_fn(arrival)
+        return task.goal_reward * share.to(torch.float64)
+
+    def children(self, values: Tensor, level: int) -> Tensor:
+        """Values of level + 1 by parent and decision: float64 [b^level, b]."""
+        return values.view(-1, self.task.graph.branching_factor)
+
+
+@dataclass(frozen=True)
+class _GoalPath:
+    """Two nodes per level: the one on the way to a needle, and any one off it; all of those are worth the same."""
+
+    task: Task
+
+    def end_rewards(self) -> Tensor:
+        """float64 [2]."""
+        return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64)
+
+    def children(self, values: Tensor, level: int) -> Tensor:
+        """Values of level + 1 by parent and decision: float64 [2, b]."""
+        children = values[1].repeat(2, self.task.graph.branching_factor)
+        children[0, self.task.goal[level] - 1] = values[0]
+        return children
+
+
+@dataclass(frozen=True)
+class _Optimal:
+    """The best choice at every node."""
+
+    task: Task
+    gamma: float
+
+    def at_wait(self, arrival: Tensor, level: int) -> Tensor:
+        """Wait until it ends or fail; the choice that is best once stays best. float64, as ``arrival``."""
+        p, s = self.task.graph.wait_prob, self.task.step_reward
+        return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_min(s + self.task.fail_reward)
+
+    def at_decision(self, children: Tensor, level: int) -> Tensor:
+        """Decide for the best child or fail. float64 [n] of [n, b]."""
+        return self.task.step_reward + (self.gamma * children.amax(-1)).clamp_min(self.task.fail_reward)
+
+
+@dataclass(frozen=True)
+class _Memoryless:
+    """Choices by the observation id."""
+
+    task: Task
+    gamma: float
+    policy: Tensor
+
+    def at_wait(self, arrival: Tensor, level: int) -> Tensor:
+        """The module's V(wait), solved. float64, as ``arrival``."""
+        probs, p = self._action_probs(StateType.WAIT, level), self.task.graph.wait_prob
+        waits, fails = probs[:, WAIT_ACTION], probs[:, 1:].sum(-1)
+        leaves = self.task.step_reward + waits * (1 - p) * arrival + fails * self.task.fail_reward
+        return leaves / (1 - self.gamma * p * waits)
+
+    def at_decision(self, children: Tensor, level: int) -> Tensor:
+        """The mean over decisions and failing. float64 [n] of [n, b]."""
+        probs, b = self._action_probs(StateType.DECISION, level), self.task.graph.branching_factor
+        fails = probs[:, WAIT_ACTION] + probs[:, b + 1 :].sum(-1)
+        decided = self.gamma * (probs[:, 1 : b + 1] * children).sum(-1)
+        return self.task.step_reward + decided + fails * self.task.fail_reward
+
+    def _action_probs(self, kind: StateType, level: int) -> Tensor:
+        """float64 [b^level, A] by node where ids are unique, else [1, A]: the mean over the ids that are drawn."""
+        b, (first, last) = self.task.graph.branching_factor, self.task.observations.ids(kind)
+        if not self.task.observations.is_unique(kind):
+            return self.policy[first : last + 1].mean(0, keepdim=True)
+        number = self.task.observations.first_of_level(level, b) + torch.arange(b**level)
+        return self.policy[first + number % (last - first + 1)]
+
+
+def _is_needle(task: Task) -> bool:
+    return task.reward_fn == Needle()
+
+
+def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
+    b, images = task.graph.branching_factor, task.images.num_images
+    is_table = isinstance(policy, Tensor) and policy.dim() == 2 and policy.is_floating_point()
+    got = (policy.dtype, list(policy.shape)) if isinstance(policy, Tensor) else type(policy).__name__
+    shape_rule = f"policy must be a float tensor [{images}, A] with A >= {b + 1}, one row per image, got {got}"
+    if not is_table or policy.shape[0] != images or policy.shape[1] < b + 1:
+        return [(False, shape_rule)]
+    sums = policy.detach().to(torch.float64).sum(-1)
+    wrong = ~((policy >= 0).all(-1) & ((sums - 1).abs() <= SUM_TOLERANCE))
+    rows = wrong.nonzero().flatten()[:5].tolist()
+    return [(not rows, f"rows of policy must be >= 0 and sum to 1, not so rows {rows}")]
+
+
+def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
+    name, goal, fail = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward
+    step, b = task.step_reward, task.graph.branching_factor
+    shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
+    only = "the memoryless ceiling is exact only for"
+    return [
+        (_is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
+        (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
+        (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
+        (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),
+        (not shares, f"{only} ids of their own, not a legacy_index with branching_factor={b}, where states share ids"),
+    ]

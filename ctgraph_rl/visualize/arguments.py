@@ -1,0 +1,133 @@
+"""The task and the policy that a command line names, for ``ctgraph-rl draw`` and ``ctgraph-rl play``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.cli import curriculum_named
+from ctgraph_rl.learn.lifelong import InitialState, Policy
+from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
+from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.layout import in_digits
+from ctgraph_rl.visualize.player import Player
+from ctgraph_rl.visualize.visits import Visits, visits
+
+POLICIES: dict[str, Policy] = {"random": RandomPolicy, "navigation": NavigationPolicy, "optimal": OptimalPolicy}
+
+CHANGES: dict[str, type] = {
+    "branching_factor": int,
+    "depth": int,
+    "wait_prob": float,
+    "image_seed": int,
+    "read_noise": int,
+    "read_rotation": int,
+}
+"""Arguments of `make_task` that are plain numbers."""
+
+
+class Choice(NamedTuple):
+    """What was chosen.
+
+    Args:
+        task: the task.
+        name: what to call it.
+        policy: who acts, as for `evaluate`; None: nobody was named.
+        initial_state: of a recurrent policy.
+        curriculum: that a trained policy learned.
+    """
+
+    task: Task
+    name: str
+    policy: Policy | None = None
+    initial_state: InitialState | None = None
+    curriculum: Curriculum | None = None
+
+    def player(self, seed: int, greedy: bool = True) -> Player:
+        """The policy in an environment of its own."""
+        return Player(self.task, self.policy, self.initial_state, seed, greedy, self.curriculum)
+
+    def visits(self, num_episodes: int, seed: int, greedy: bool = True) -> Visits:
+        """Where the policy goes; as many episodes follow each other in a row as the curriculum says."""
+        assert self.policy is not None
+        in_row = 1 if self.curriculum is None else self.curriculum.evaluation.episodes_per_row
+        whole = max(1, num_episodes // in_row) * in_row
+        how = (whole, seed, greedy, in_row, self.curriculum)
+        return visits(self.task, self.policy, self.initial_state, *how)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What names a task and a policy."""
+    names = ", ".join(CONFIGURATIONS)
+    about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: numbers alone"
+    parser.add_argument("name", nargs="?", help=about)
+    parser.add_argument("--task", type=int, default=1, metavar="N", help="number of a curriculum's task, from 1")
+    for name, kind in CHANGES.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
+    parser.add_argument("--goal", type=decisions, metavar="1.2", help="the decisions to the goal")
+    parser.add_argument(
+        "--surjective", action="store_true", help="with numbers alone: one image for each kind of state"
+    )
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--policy", choices=POLICIES, help="who acts")
+    who.add_argument("--run", type=Path, help="the trained agent of a run acts, in a task of its curriculum")
+    parser.add_argument("--sampled", action="store_true", help="the trained agent samples and explores")
+    parser.add_argument("--seed", type=int, default=0, help="of the environment")
+
+
+def choose(arguments: argparse.Namespace) -> Choice:
+    """The task and the policy that are named.
+
+    Raises:
+        ValueError: for names that are unknown and what does not go together.
+        OSError: for files that cannot be read.
+    """
+    given = {name: getattr(arguments, name) for name in (*CHANGES, "goal")}
+    changes = {name: value for name, value in given.items() if value is not None}
+    changes |= {"fully_observable": False} if arguments.surjective else {}
+    if arguments.run is not None:
+        require((arguments.name is None and not changes, "--run has a curriculum of its own: choose one with --task"))
+        return _of_run(arguments.run, arguments.task)
+    policy = None if arguments.policy is None else POLICIES[arguments.policy]
+    return _named(arguments.name, arguments.task, changes)._replace(policy=policy)
+
+
+def decisions(text: str) -> tuple[int, ...]:
+    """``1.2`` as a goal."""
+    return tuple(map(int, text.split(".")))
+
+
+def _named(name: str | None, number: int, changes: dict[str, Any]) -> Choice:
+    """A task without a policy."""
+    if name is None:
+        return _called("CT-graph", make_task(**changes))
+    if name.endswith(".json"):
+        return _called(name, make_task(config=name, **changes))
+    if "-" in name:  # as in the paper's labels and in no curriculum's name
+        return _called(name.upper(), make_task(name.upper(), **changes))
+    require((not changes, f"the tasks of a curriculum are as they are: {name} takes no {', '.join(changes)}"))
+    return _of_curriculum(curriculum_named(name), number)
+
+
+def _called(name: str, task: Task) -> Choice:
+    return Choice(task, f"{name}, goal {in_digits(task.goal, '.')}")
+
+
+def _of_curriculum(curriculum: Curriculum, number: int) -> Choice:
+    tasks, labels = curriculum.tasks, curriculum.labels
+    rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
+    require((is_int(number, 1, len(tasks)), rule))
+    return Choice(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
+
+
+def _of_run(run: Path, number: int) -> Choice:
+    from ctgraph_rl.runs.load import load
+
+    trained = load(run)
+    chosen = _of_curriculum(trained.curriculum, number)
+    policy, initial_state = trained.policy_for(chosen.task), trained.agent.initial_state
+    return chosen._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

@@ -1,0 +1,190 @@
+"""The style of all pictures of trees, and the graphs and goals of a curriculum as a figure with a panel for each graph.
+
+Every kind of state has a colour and a shape of its own, so a grey print and any colour vision keep them apart. The
+panels leave wait states out: there is one before each decision and end state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.batch.render import GOAL, PALETTE
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.visualize.layout import MOST_WAYS, Layout, Way, end_of, in_digits, lay_out, parent, way_to
+
+MOST_PANELS = 12
+MOST_LEVEL = 4
+"""End states up to which labels stand level."""
+COLUMNS = 3
+DPI = 160
+
+MARKERS = {
+    StateType.HOME: "p",
+    StateType.WAIT: "o",
+    StateType.DECISION: "D",
+    StateType.END: "s",
+    StateType.FAIL: "8",
+}
+"""Pentagon, circle, diamond, square and octagon."""
+
+Point = tuple[float, float]
+
+
+def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
+    """Draw the graphs and goals of a curriculum.
+
+    Args:
+        curriculum: any curriculum.
+        path: the picture to write; its ending decides the format.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib; names the extra to install.
+    """
+    goals = goals_by_graph(curriculum)
+    panels = list(goals)[:MOST_PANELS]
+    columns = min(COLUMNS, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    figure = new_figure(max(4.4 * columns, 6), 3.4 * rows + 0.9)
+    left_out = f" ({len(goals) - len(panels)} more graphs not drawn)" if len(goals) > len(panels) else ""
+    figure.suptitle(f"{curriculum.name}, version {curriculum.version}, {curriculum.fingerprint}{left_out}", fontsize=11)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel, graph in zip(axes, panels, strict=False):
+        _draw_panel(panel, graph, goals[graph])
+    for panel in axes[len(panels) :]:
+        panel.axis("off")
+    figure.supxlabel("diamond: decision state    square: end state    star: goal, with its decisions", fontsize=9)
+    figure.savefig(path, dpi=DPI)
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure, sizes in inches.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib; names the extra to install.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def colour(number: int) -> str:
+    """The colour of a kind of state, or of another thing of `ctgraph_rl.batch.render`'s palette, as ``#rrggbb``."""
+    return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
+
+
+def mark(kind: StateType, size: float) -> dict[str, Any]:
+    """How a state is drawn, for matplotlib; sizes in points."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
+    size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
+    return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
+
+
+def goal_mark(size: float) -> dict[str, Any]:
+    """How a goal is drawn: the star of `ctgraph_rl.batch.render`."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
+    return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
+
+
+def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> None:
+    """Draw straight lines behind the states."""
+    from matplotlib.collections import LineCollection
+
+    look: dict[str, Any] = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
+    axes.add_collection(LineCollection(list(lines), **look))
+
+
+def stub_lines(layout: Layout, places: Mapping[int, Point], height: float) -> list[list[Point]]:
+    """Short lines from the states drawn towards branches that are not, left or right of those that are."""
+    reach = 1 / max(len(layout.leaves), 3) / 7
+    ends = [(places[node], side) for node, side in layout.stubs]
+    return [[(x, y), (x + side * reach, y - height)] for (x, y), side in ends]
+
+
+def shape_of(graph: CTGraph) -> str:
+    """A graph's three numbers in a title."""
+    return f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
+
+
+def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Way, str]]:
+    """For each graph its goals, each with a label of its decisions and the blocks that train it."""
+    blocks: dict[CTGraph, dict[Way, list[int]]] = {}
+    for number, block in enumerate(curriculum.blocks, 1):
+        for task in dict.fromkeys(block.tasks):
+            blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
+    return {graph: {goal: _label(goal, of) for goal, of in goals.items()} for graph, goals in blocks.items()}
+
+
+def _label(goal: Way, blocks: Sequence[int]) -> str:
+    numbers = sorted(set(blocks))
+    where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
+    where = f"block {numbers[0]}" if len(numbers) == 1 else where
+    return f"{in_digits(goal)}\n{where}"
+
+
+def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Way, str]) -> None:
+    labels = {end_of(graph, goal): label for goal, label in goals.items()}
+    layout = lay_out(graph, list(labels)[:MOST_WAYS])
+    shown = [end for end in layout.leaves if end in labels]
+    places = {node: (x, -float(layout.level[node])) for node, x in layout.x.items()}
+    level = len(layout.leaves) <= MOST_LEVEL
+    _draw_edges(axes, layout, places, shown)
+    _draw_states(axes, layout, places, shown)
+    for end in shown:
+        _write(axes, places[end], labels[end], level=level)
+    axes.set_title(_title(graph, len(goals), len(shown)), fontsize=9)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-graph.depth - _room(graph.depth, level), 0.3))
+    axes.axis("off")
+
+
+def _title(graph: CTGraph, goals: int, shown: int) -> str:
+    some = f", {shown} shown" if shown < goals else ""
+    return (
+        f"{shape_of(graph)}: {goals:,} {'goal' if goals == 1 else 'goals'}{some}, {graph.num_end_states:,} end states"
+    )
+
+
+def _room(depth: int, level: bool) -> float:
+    """Height below the end states for labels, in decisions."""
+    return (0.16 if level else 0.32) * depth + 0.2
+
+
+def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+    """The ways to goals are thick and black."""
+    graph, ways = layout.graph, {node for goal in goals for node in way_to(layout.graph, goal)}
+    lines = {node: [places[parent(graph, node)], places[node]] for node in places if node}
+    plain = [line for node, line in lines.items() if node not in ways]
+    draw_lines(axes, [*plain, *stub_lines(layout, places, 0.45)], colors="0.6", linewidths=0.8)
+    draw_lines(axes, [line for node, line in lines.items() if node in ways], linewidths=1.6)
+
+
+def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+    size = max(3.0, 9.0 - len(layout.leaves) / 6 - layout.graph.depth / 4)
+    ends, stars = set(layout.leaves), set(goals)
+    for points, style in (
+        ([place for node, place in places.items() if node not in ends], mark(StateType.DECISION, size)),
+        ([places[end] for end in ends - stars], mark(StateType.END, size)),
+        ([places[goal] for goal in stars], goal_mark(max(2 * size, 9))),
+    ):
+        if points:
+            axes.plot(*zip(*points, strict=True), zorder=3, clip_on=False, **style)
+
+
+def _write(axes: Any, place: Point, text: str, level: bool) -> None:
+    """A goal's label below it, upright where there is little room."""
+    words = text if level else text.replace("\n", "  ")
+    axes.annotate(
+        words,
+        place,
+        xytext=(0, -9),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize=7,
+        rotation=0 if level else 90,
+    )

@@ -1,0 +1,85 @@
+"""A task's graph in the DOT language of Graphviz, as plain text; Graphviz itself is not needed to write it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.curriculum_figure import colour
+from ctgraph_rl.visualize.layout import lay_out
+from ctgraph_rl.visualize.states import (
+    DECISION,
+    END,
+    FAIL,
+    FAIL_KEY,
+    HOME,
+    HOME_KEY,
+    WAIT,
+    Key,
+    edges,
+    ids_text,
+    states,
+)
+
+MOST_LEAVES = 1024
+"""End states up to which a file has the whole tree."""
+
+SHAPES: Mapping[StateType, str] = {
+    HOME: "house",
+    WAIT: "circle",
+    DECISION: "diamond",
+    END: "box",
+    FAIL: "octagon",
+}
+
+
+def to_dot(task: Task, name: str = "") -> str:
+    """All states with the ids they show, and all transitions with their actions; the goal has two lines around it.
+
+    Of a tree with more than 1,024 end states the way to the goal is written, with one node for the branches left out
+    of each decision state.
+
+    Args:
+        task: any task.
+        name: a title, any text.
+    """
+    return "\n".join(["digraph {", *(f"  {line};" for line in _statements(task, name)), "}", ""])
+
+
+def _statements(task: Task, name: str) -> Iterator[str]:
+    goal = task.graph.num_decision_states + task.goal_leaf
+    layout = lay_out(task.graph, [goal], MOST_LEAVES)
+    b, p = task.graph.branching_factor, task.graph.wait_prob
+    yield _attributes("graph", label=name, labelloc="t")
+    yield _attributes("node", style="filled", fontname="sans-serif")
+    for state in (*states(layout), FAIL_KEY):
+        kind, node = state
+        rings = {"peripheries": "2"} if state == (END, goal) else {}
+        text = ids_text(task, state, layout.level[node])
+        yield _attributes(_name(state), label=text, shape=SHAPES[kind], fillcolor=colour(kind), **rings)
+    for start, end, action in edges(layout):
+        yield _attributes(f"{_name(start)} -> {_name(end)}", label="any" if start == HOME_KEY else str(action))
+    for state in states(layout):
+        if state[0] == WAIT and p > 0:
+            yield _attributes(f"{_name(state)} -> {_name(state)}", label=f"{WAIT_ACTION} (p={p:g})")
+        if state[0] in (WAIT, DECISION):
+            wrong = f"1..{b}" if state[0] == WAIT else str(WAIT_ACTION)
+            yield _attributes(f"{_name(state)} -> {_name(FAIL_KEY)}", label=wrong, style="dashed")
+    for node, left_out in layout.left_out.items():
+        yield _attributes(f"more{node}", label=f"{left_out:,} more branches", shape="plaintext", style="")
+        yield f"{_name((DECISION, node))} -> more{node}"
+
+
+def _name(state: Key) -> str:
+    return f"{state[0].name.lower()}{state[1]}"
+
+
+def _attributes(what: str, **values: str) -> str:
+    return f"{what} [{', '.join(f'{key}={_quoted(value)}' for key, value in values.items())}]"
+
+
+def _quoted(text: str) -> str:
+    """Text that DOT shows as it is."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + escaped.replace("\r", "").replace("\n", "\\n") + '"'

@@ -1,0 +1,50 @@
+"""An episode as an animated GIF of what `CTGraphEnv.render` draws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.visualize.player import Player
+
+LAST = 3
+"""How many times as long as another the last picture stays."""
+
+
+def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int = 192, most_frames: int = 200) -> None:
+    """Let a policy play one episode and write its pictures.
+
+    Args:
+        player: a task and the policy that acts.
+        path: the file to write.
+        seconds: how long a picture stays.
+        size: height in pixels, at least 48.
+        most_frames: pictures after which the film ends, whether the episode is over or not.
+
+    Raises:
+        ModuleNotFoundError: without pillow; names the extra to install.
+        ValueError: for values out of range.
+    """
+    require(*positive(seconds=seconds), *at_least_one(most_frames=most_frames))
+    try:
+        from PIL import Image
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("GIFs need pillow: pip install 'ctgraph_rl[plot]'") from error
+    first, *others = [Image.fromarray(frame.numpy()) for frame in _frames(player, size, most_frames)]
+    stay = [round(1000 * seconds)] * len(others) + [round(1000 * seconds * LAST)]
+    first.save(path, "GIF", save_all=True, append_images=others, duration=stay, loop=0)
+
+
+def _frames(player: Player, size: int, most: int) -> list[Tensor]:
+    """The pictures of an episode, uint8 [size, 2 * size, 3]; torch's global generator is left as it was found."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(player.seed)
+        player.start()
+        frames, over = [player.env.render(size)[0]], False
+        while not over and len(frames) < most:
+            over = player.step()
+            frames.append(player.env.render(size)[0])
+    return frames

@@ -1,0 +1,120 @@
+"""A picture of what a task's states look like: images of each kind of state, and how they vary when they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.tasks.images import white_level
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.curriculum_figure import new_figure
+
+MOST_IDS = 3
+"""Ids of each kind of state that are shown with their variation."""
+COLUMNS = 8
+INCHES = 0.72
+"""Side of an image with the gap to the next."""
+ROW, GAP = 1.22, 0.06
+"""Height of a line and the gap between images, relative to that."""
+
+
+class Line(NamedTuple):
+    """Images side by side, uint8 [n, *shape], with a word above each."""
+
+    label: str
+    images: Tensor
+    words: list[str]
+
+
+def image_figure(task: Task, seed: int = 0) -> Any:
+    """A figure of the images of each kind of state, the first ones of each.
+
+    Where images vary on read, by noise, rotation or several instances, a line holds the image of one id and seven
+    observations of it; else eight ids of a kind.
+
+    Args:
+        task: any task.
+        seed: decides the observations.
+    """
+    x = task.observations
+    varies = x.read_noise or x.read_rotation or task.images.num_variants > 1
+    lines = _varied(task, seed) if varies else _plain(task)
+    figure = new_figure(INCHES * COLUMNS + 1.0, INCHES * ROW * len(lines) + 0.5)
+    axes = figure.subplots()
+    for row, line in enumerate(lines):
+        _draw_line(axes, row, line, white_level(task.images))
+    axes.set(xlim=(-1, COLUMNS), ylim=(-ROW * len(lines), 4 * GAP), aspect="equal")
+    axes.axis("off")
+    noise = f"noise 0..{x.read_noise}, rotation 0..{x.read_rotation} degrees on read"
+    figure.suptitle(f"{task.images.num_images:,} images, {noise if varies else 'nothing varies on read'}", fontsize=9)
+    return figure
+
+
+def _plain(task: Task) -> list[Line]:
+    """A line for each kind of state."""
+    lines = []
+    for kind in StateType:
+        ids = _first_ids(task, kind, COLUMNS)
+        lines.append(Line(kind.name.lower(), _stored(task, ids), [str(number) for number in ids]))
+    return lines
+
+
+def _varied(task: Task, seed: int) -> list[Line]:
+    """A line for each of the first ids of each kind of state."""
+    shown = [(kind, number) for kind in StateType for number in _first_ids(task, kind, MOST_IDS)]
+    reads = _reads(task, shown, COLUMNS - 1, seed)
+    lines = []
+    for (kind, number), images in zip(shown, reads, strict=True):
+        words = ["image", *["read"] * len(images)]
+        lines.append(Line(f"{kind.name.lower()} {number}", torch.cat([_stored(task, [number]), images]), words))
+    return lines
+
+
+def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:
+    first, last = task.observations.ids(kind)
+    return list(range(first, min(last, first + most - 1) + 1))
+
+
+def _stored(task: Task, ids: list[int]) -> Tensor:
+    """The first image of each id as it is stored."""
+    return task.images.bank(0)[torch.tensor(ids) * task.images.num_variants]
+
+
+def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
+    """Observations of ids by an environment whose states show no other, uint8 [ids, count, *shape]."""
+    pinned = [_pinned(task, kind, number) for kind, number in shown]
+    env = CTGraphEnv([one for one in pinned for _ in range(count)], seed)
+    env.reset()
+    state = env.get_state()
+    kinds = torch.tensor([kind for kind, _ in shown]).repeat_interleave(count)
+    state["state_type"] = kinds.to(state["state_type"].dtype)
+    state["node"] = torch.where(kinds == StateType.END, task.graph.num_decision_states, 0)
+    env.rows.state = type(env.rows.state)(**state)
+    return env.rows.show().observation.unflatten(0, (len(shown), count))
+
+
+def _pinned(task: Task, kind: StateType, number: int) -> Task:
+    """The task with one id for a kind of state."""
+    name = kind.name.lower()
+    changes: dict[str, Any] = {f"{name}_ids": (number, number)}
+    changes |= {f"unique_{name}s": False} if kind in (StateType.WAIT, StateType.DECISION, StateType.END) else {}
+    return replace(task, observations=replace(task.observations, **changes))
+
+
+def _draw_line(axes: Any, row: int, line: Line, white: float) -> None:
+    """Images in cells of size 1, a row lower by `ROW` than the one before."""
+    from matplotlib.patches import Rectangle
+
+    top = -ROW * row
+    axes.text(-GAP, top - 0.5, line.label, fontsize=7, ha="right", va="center")
+    for i, (image, word) in enumerate(zip(line.images.numpy(), line.words, strict=True)):
+        pixels = image[0] if image.ndim == 3 else image[None]
+        place = (i, i + 1 - GAP, top - 1 + GAP, top)
+        axes.imshow(pixels, cmap="gray", vmin=0, vmax=white, extent=place, aspect="auto", interpolation="nearest")
+        axes.add_patch(Rectangle((i, top - 1 + GAP), 1 - GAP, 1 - GAP, fill=False, linewidth=0.6))
+        axes.text(i + 0.5 - GAP / 2, top + GAP / 2, word, fontsize=6, ha="center", va="bottom")

@@ -1,0 +1,390 @@
+"""A picture of one task: its graph with what its states show, or with what a policy does there.
+
+``ctgraph-rl draw TASK --figure FILE`` draws it, and the task's images, a DOT file or a film of an episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize.curriculum_figure import (
+    DPI,
+    Point,
+    colour,
+    draw_lines,
+    goal_mark,
+    mark,
+    new_figure,
+    shape_of,
+    stub_lines,
+)
+from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_WAYS, decision_to, in_digits, lay_out, way_to
+from ctgraph_rl.visualize.states import (
+    DECISION,
+    END,
+    FAIL,
+    FAIL_KEY,
+    HOME,
+    HOME_KEY,
+    WAIT,
+    Edge,
+    Key,
+    edges,
+    ids_text,
+    states,
+)
+
+if TYPE_CHECKING:
+    from ctgraph_rl.visualize.arguments import Choice
+
+Counts = Mapping[Any, float]
+PerAction = Mapping[Any, Any]
+
+ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
+"""Points between end states from which on actions, loops and ways to fail are drawn, and numbers at them."""
+MOST_WAIT_LEVELS = 6
+"""Depth up to which wait states are drawn in a tree that is not drawn whole."""
+LARGEST_MARK = 24.0
+SMALLEST_TEXT = 4.0
+INITIALS = {kind: kind.name[0] for kind in StateType}
+GREY = "0.65"
+DASHES = (0, (2, 1))
+RING: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markeredgecolor": "0", "linestyle": "none"}
+
+
+def task_figure(task: Task, **overlays: Any) -> Any:
+    """A figure of its own, of a size that fits, for `draw_task` with the same arguments."""
+    graph = task.graph
+    side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_WAYS
+    beside = 0.9 if overlays.get("policy") or overlays.get("values") else 0.65
+    width = min(max(5.5, beside * side_by_side), 14.0)
+    figure = new_figure(width, 1.2 + 0.75 * min(2 * graph.depth + 2, 9))
+    draw_task(figure.subplots(), task, **overlays)
+    return figure
+
+
+def draw_task(
+    axes: Any,
+    task: Task,
+    visits: Counts | None = None,
+    policy: PerAction | None = None,
+    values: PerAction | None = None,
+    ids: bool = True,
+    legend: bool = True,
+) -> None:
+    """Draw a task's graph: every state in the colour and shape of its kind, and a star at the goal.
+
+    Wait states that may be stayed in have a loop, and dashed arrows are the actions that fail. In the nodes stand the
+    ids of their observations, the first and the last where one is drawn each time. Of a tree with more than 32 end
+    states the way to the goal is drawn, and those to the end states visited most.
+
+    States are keys (state type, node), as ``env.state_type`` and ``env.node`` give them; home and fail have node 0.
+    What is not in a mapping is not drawn.
+
+    Args:
+        axes: matplotlib axes, of their size when the picture is made.
+        task: any task.
+        visits: how often each state was visited: the numbers stand in the nodes instead of ids, and edges are as wide
+            as they were used. `ctgraph_rl.visualize.visits.visits` counts.
+        policy: b + 1 action probabilities for each state, or the number of its greedy action: edges have the numbers,
+            and the likeliest action is black.
+        values: b + 1 numbers for each state, such as Q-values, which stand at the edges.
+        ids: observation ids in the nodes; False: the initials of the kinds.
+        legend: name shapes and colours below the tree.
+    """
+    _TaskPicture(axes, task, visits or {}, policy or {}, values or {}, ids).draw(legend)
+
+
+class _TaskPicture:
+    """What `draw_task` is given, laid out on the axes."""
+
+    def __init__(self, axes: Any, task: Task, visits: Counts, policy: PerAction, values: PerAction, ids: bool) -> None:
+        self.axes, self.task, self.visits, self.ids = axes, task, visits, ids
+        self.graph, self.goal = task.graph, task.graph.num_decision_states + task.goal_leaf
+        self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
+        self.values = {key: [float(value) for value in of] for key, of in values.items()}
+        self.layout = lay_out(self.graph, [self.goal, *self._most_visited()])
+        self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
+        self.places = {state: self._place(state) for state in states(self.layout, self.waits)}
+        self.size, beside = self._sizes()
+        self.has_room, self.has_numbers = beside >= ROOM, beside >= ROOM_FOR_NUMBERS
+
+    def _most_visited(self) -> list[int]:
+        counts = {node: count for (kind, node), count in self.visits.items() if kind == END and node != self.goal}
+        return sorted(counts, key=lambda node: -counts[node])[: MOST_WAYS - 1]
+
+    def _place(self, state: Key) -> Point:
+        """x in (0, 1), y a row of states below 0."""
+        kind, node = state
+        x = self.layout.x[node]
+        if kind == HOME:
+            return x, 0.0
+        rows = self.layout.level[node] + 1
+        return x, -float(2 * rows - (kind == WAIT) if self.waits else rows)
+
+    @property
+    def height(self) -> float:
+        """Rows of states below home."""
+        return -min(y for _, y in self.places.values())
+
+    def _sizes(self) -> tuple[float, float]:
+        """How wide marks can be, and how far end states are from each other; in points."""
+        box, points = self.axes.get_window_extent(), 72 / self.axes.figure.dpi
+        beside, below = points * box.width / len(self.layout.leaves), points * box.height / (self.height + 2)
+        share = 0.52 if beside >= ROOM else 0.75
+        return max(2.0, min(LARGEST_MARK, share * beside, 0.55 * below)), beside
+
+    def draw(self, legend: bool) -> None:
+        """Draw everything."""
+        self._draw_edges()
+        self._draw_states()
+        self._draw_goal()
+        if self.has_room:
+            self._draw_loops()
+            self._draw_ways_to_fail()
+        title = f"{shape_of(self.graph)}, goal {in_digits(self.task.goal, '.')}"
+        self.axes.set_title(title + self._left_out(), fontsize=9)
+        self.axes.set(xlim=(-0.02, 1.02), ylim=(-self.height - 0.9, 0.6))
+        self.axes.axis("off")
+        if legend:
+            self._draw_legend()
+
+    def _left_out(self) -> str:
+        """What of the tree is not in the picture."""
+        if self.layout.is_whole:
+            return ""
+        waits = "" if self.waits else ", wait states left out"
+        return f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
+
+    def _draw_edges(self) -> None:
+        found = list(edges(self.layout, self.waits))
+        lines = [[self.places[edge.start], self.places[edge.end]] for edge in found]
+        strong = [self._is_strong(edge) for edge in found]
+        widths = [self._width(edge) for edge in found]
+        order = sorted(range(len(found)), key=strong.__getitem__)
+        draw_lines(
+            self.axes,
+            [lines[i] for i in order],
+            colors=["0" if strong[i] else GREY for i in order],
+            linewidths=[widths[i] for i in order],
+        )
+        row = 1.0 if self.waits else 0.5
+        nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
+        draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)
+        if self.has_room:
+            for edge, line in zip(found, lines, strict=True):
+                self._write_at_edge(edge, line)
+
+    def _is_strong(self, edge: Edge) -> bool:
+        """Black: the likeliest action, else what was visited, else the way to the goal."""
+        chances = self.policy.get(edge.start)
+        if chances is not None and edge.action is not None:
+            return chances[edge.action] == max(chances)
+        if self.visits or self.policy:
+            return bool(self.visits.get(edge.end, 0))
+        return edge.end[1] in way_to(self.graph, self.goal)
+
+    def _width(self, edge: Edge) -> float:
+        if self.visits:
+            return 0.8 + 3.2 * min(1.0, self.visits.get(edge.end, 0) / max(1, self.visits.get(HOME_KEY, 1)))
+        if edge.start in self.policy and edge.action is not None:
+            return 0.8 + 2 * self.policy[edge.start][edge.action]
+        return 1.6 if self._is_strong(edge) else 0.8
+
+    def _write_at_edge(self, edge: Edge, line: Sequence[Point]) -> None:
+        """The action, its probability and its value, on the edge; further down, where edges are apart."""
+        if edge.action is None:
+            return
+        numbers = self._numbers(edge.start, (edge.action,))
+        (x, y), (end_x, end_y) = line
+        words = f"{edge.action}" + (f": {numbers}" if numbers else "")
+        box = {"facecolor": "1", "edgecolor": "none", "pad": 0.6}
+        style = {"fontsize": 6.5, "ha": "center", "va": "center", "bbox": box, "zorder": 2}
+        self.axes.text(x + 0.55 * (end_x - x), y + 0.55 * (end_y - y), words, **style)
+
+    def _numbers(self, state: Key, actions: Sequence[int]) -> str:
+        """Probability and value of some actions of a state, the best of the values; empty without room."""
+        if not self.has_numbers:
+            return ""
+        parts = []
+        if state in self.policy:
+            parts.append(f"{sum(_of(self.policy[state], actions)):.2f}")
+        if state in self.values:
+            parts.append(f"Q {max(_of(self.values[state], actions)):.2f}")
+        return "\n".join(parts)
+
+    def _draw_states(self) -> None:
+        for state, place in (*self.places.items(), (FAIL_KEY, (0.97, 0.0))):
+            kind, _ = state
+            self.axes.plot(*place, zorder=3, clip_on=False, **mark(kind, self.size))
+            words = self._words(state)
+            fits = min(8.0, 1.25 * self.size / max(len(words), 2))
+            if fits >= SMALLEST_TEXT:
+                ink = "1" if kind == HOME else "0"
+                self.axes.text(*place, words, fontsize=fits, color=ink, ha="center", va="center", zorder=4)
+
+    def _words(self, state: Key) -> str:
+        """What stands in a node."""
+        if self.visits:
+            return _short(self.visits.get(state, 0))
+        return ids_text(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
+
+    def _draw_goal(self) -> None:
+        """A star below the goal, and the decisions below every end state of a tree that is not drawn whole."""
+        size = max(7.0, min(13.0, self.size))
+        drop = -0.5 * self.size - 0.6 * size
+        style = {"transform": self._moved(y=drop), "zorder": 3, "clip_on": False}
+        self.axes.plot(*self.places[END, self.goal], **style, **goal_mark(size))
+        for end in () if self.layout.is_whole else self.layout.leaves:
+            way = tuple(decision_to(self.graph, node) for node in way_to(self.graph, end)[1:])
+            under = 0, drop - 0.6 * size
+            self._note(in_digits(way), self.places[END, end], under, fontsize=6, ha="center", va="top")
+
+    def _draw_loops(self) -> None:
+        """A ring at each wait state where waiting may stay there."""
+        if self.graph.wait_prob > 0:
+            points = [place for (kind, _), place in self.places.items() if kind == WAIT]
+            ring = RING | {"markersize": 0.7 * self.size, "transform": self._moved(x=-0.55 * self.size)}
+            self.axes.plot(*zip(*points, strict=True), zorder=2, **ring)
+
+    def _moved(self, x: float = 0.0, y: float = 0.0) -> Any:
+        """Places in the tree moved by points."""
+        from matplotlib.transforms import offset_copy
+
+        return offset_copy(self.axes.transData, fig=self.axes.figure, x=x, y=y, units="points")
+
+    def _draw_ways_to_fail(self) -> None:
+        """A short dashed arrow to the right of each state where an action fails, as wide as that is likely."""
+        base = {"arrowstyle": "<|-", "linestyle": DASHES, "color": colour(FAIL), "shrinkB": 0, "mutation_scale": 6}
+        for (kind, node), place in self.places.items():
+            if kind in (WAIT, DECISION):
+                wrong = self._wrong((kind, node))
+                arrow = base | {"linewidth": 0.8 + 2 * sum(_of(self.policy.get((kind, node), ()), wrong))}
+                self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
+                numbers, side = self._numbers((kind, node), wrong), -1 if kind == WAIT else 1  # away from branches
+                style = {"va": "top" if kind == WAIT else "bottom", "fontsize": 6, "color": colour(FAIL)}
+                self._note(numbers, place, (0.55 * self.size, 3 * side), **style)
+
+    def _wrong(self, state: Key) -> list[int]:
+        """The actions that fail in a state, those above b among them, which a curriculum's other tasks may have."""
+        b = self.graph.branching_factor
+        right = (WAIT_ACTION,) if state[0] == WAIT else range(1, b + 1)
+        most = max(b + 1, len(self.policy.get(state, ())), len(self.values.get(state, ())))
+        return [action for action in range(most) if action not in right]
+
+    def _note(self, words: str, place: Point, shift: Point, **style: Any) -> None:
+        """Words some points off a place."""
+        self.axes.annotate(words, place, xytext=shift, textcoords="offset points", **style)
+
+    def _draw_legend(self) -> None:
+        """Shapes and colours with their names, and what the lines mean."""
+        from matplotlib.lines import Line2D
+
+        kinds = [kind for kind in StateType if kind != WAIT or self.waits]
+        marks = [Line2D([], [], label=kind.name.lower(), **mark(kind, 7)) for kind in kinds]
+        marks.append(Line2D([], [], label="goal", **goal_mark(10)))
+        if self.has_room:
+            dashes: dict[str, Any] = {"color": colour(FAIL), "linestyle": DASHES, "linewidth": 1}
+            marks.append(Line2D([], [], label="a wrong action", **dashes))
+        if self.has_room and self.graph.wait_prob > 0:
+            marks.append(Line2D([], [], label="stays with p", markersize=6, **RING))
+        style = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.02), "fontsize": 7, "frameon": False}
+        style |= {"title": self._meaning(), "title_fontsize": 7, "handletextpad": 0.3, "columnspacing": 1.0}
+        self.axes.legend(handles=marks, ncols=len(marks), **style)
+
+    def _meaning(self) -> str:
+        """What the numbers and widths stand for."""
+        nodes = "visits" if self.visits else "observation ids" if self.ids else ""
+        numbers = [
+            name for name, given in (("probability", self.policy), ("Q", self.values)) if given and self.has_numbers
+        ]
+        at_edges = f"at edges: {', '.join(['action', *numbers])}" if self.has_room else ""
+        black = "black: the likeliest action" if self.policy else ""
+        return "; ".join(filter(None, [f"in nodes: {nodes}" if nodes else "", at_edges, black]))
+
+
+def _probabilities(choice: Any, branching_factor: int) -> list[float]:
+    """Action probabilities as they are given; a greedy action has all."""
+    if not isinstance(choice, Sequence) and getattr(choice, "ndim", 0) == 0:
+        return [float(action == int(choice)) for action in range(max(branching_factor, int(choice)) + 1)]
+    return [float(chance) for chance in choice]
+
+
+def _of(numbers: Sequence[float], actions: Sequence[int]) -> list[float]:
+    """The numbers of some actions, of those that have one."""
+    return [numbers[action] for action in actions if action < len(numbers)]
+
+
+def _short(count: float) -> str:
+    """A number in few characters: 950, 12k, 3M."""
+    if count >= 1e6:
+        return f"{count / 1e6:.0f}M"
+    return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:.4g}"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line, ``ctgraph-rl draw``."""
+    from ctgraph_rl.visualize.arguments import choose
+
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if not (arguments.figure or arguments.dot or arguments.gif):
+        parser.error("nothing to write: name a --figure, --dot or --gif")
+    try:
+        _write(choose(arguments), arguments)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+
+
+def _parser() -> argparse.ArgumentParser:
+    from ctgraph_rl.visualize.arguments import add_arguments
+
+    parser = argparse.ArgumentParser(description="Draw a task; with a policy, what it does there.")
+    add_arguments(parser)
+    what = "what a figure has: observation ids in the states, their kinds, or the images"
+    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
+    parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
+    parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
+    parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
+    parser.add_argument("--episodes", type=int, default=1000, help="that visits are counted in; default: 1000")
+    return parser
+
+
+def _write(choice: Choice, arguments: argparse.Namespace) -> None:
+    """Write all that is asked for."""
+    from ctgraph_rl.visualize.dot import to_dot
+    from ctgraph_rl.visualize.gif import save_gif
+
+    films = arguments.gif is None or choice.policy is not None
+    require(
+        (films, "a film needs somebody who acts: name a --policy or a --run"),
+        *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes),
+    )
+    if arguments.figure is not None:
+        _figure(choice, arguments).savefig(arguments.figure, dpi=arguments.dpi)
+    if arguments.dot is not None:
+        arguments.dot.write_text(to_dot(choice.task, choice.name), encoding="utf-8")
+    if arguments.gif is not None:
+        save_gif(choice.player(arguments.seed, not arguments.sampled), arguments.gif)
+
+
+def _figure(choice: Choice, arguments: argparse.Namespace) -> Any:
+    from ctgraph_rl.visualize.image_figure import image_figure
+
+    if arguments.show == "images":
+        return image_figure(choice.task, arguments.seed)
+    if choice.policy is None:
+        return task_figure(choice.task, ids=arguments.show == "ids")
+    seen = choice.visits(arguments.episodes, arguments.seed, not arguments.sampled)
+    return task_figure(choice.task, visits=seen.counts, policy=seen.actions)
+
+
+if __name__ == "__main__":
+    main()

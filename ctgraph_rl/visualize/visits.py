@@ -1,0 +1,89 @@
+"""How often a policy comes to each state of a task, and what it does there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.learn.lifelong import InitialState, Policy, evaluate
+from ctgraph_rl.policies import RandomPolicy
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+
+class Visits(NamedTuple):
+    """What was seen in a number of episodes, by (state type, node); home and fail have node 0."""
+
+    counts: dict[tuple[StateType, int], int]
+    """Steps that began in a home, wait or decision state, and episodes that ended in an end state or in fail."""
+    actions: dict[tuple[StateType, int], list[float]]
+    """The share of each action in home, wait and decision states; those above b are of other tasks, and fail."""
+
+
+def visits(
+    task: Task,
+    policy: Policy,
+    initial_state: InitialState | None = None,
+    num_episodes: int = 100,
+    seed: int = 0,
+    greedy: bool = True,
+    episodes_per_row: int = 1,
+    curriculum: Curriculum | None = None,
+) -> Visits:
+    """Let a policy play episodes and count; ``draw_task(axes, task, visits=counts, policy=actions)`` draws it.
+
+    Args:
+        task: what is played.
+        policy: as for `evaluate`, with all that follows.
+        initial_state: gives a recurrent policy's state for a number of rows.
+        num_episodes: episodes in all.
+        seed: decides the environment and, if not greedy, the policy's draws.
+        greedy: most likely actions; False samples and explores as in training.
+        episodes_per_row: episodes one after the other, for goals that change and policies that learn in a trial.
+        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
+
+    Raises:
+        ValueError: as `evaluate`.
+    """
+    seen: list[Tensor] = []
+
+    class Watched:
+        """The policy, with a note of each row's state and action."""
+
+        def __init__(self, env: CTGraphEnv) -> None:
+            self.env, self.acts = env, policy(env) if isinstance(policy, type) else policy
+            self.episode = torch.zeros_like(env.node)
+
+        def __call__(self, data: TensorDictBase) -> TensorDictBase:
+            self.episode += data["is_init"].squeeze(-1)
+            state = self.env.state_type, self.env.node
+            acted = self.acts(data)
+            counted = (self.episode <= episodes_per_row) & (state[0] != StateType.END)  # which may take one more action
+            seen.append(torch.stack([*state, acted["action"]], -1)[counted].cpu())
+            return acted
+
+    how = (num_episodes, seed, greedy, initial_state, "cpu", episodes_per_row, curriculum)
+    bound = isinstance(policy, RandomPolicy)  # to another environment, which evaluate refuses
+    ends = evaluate(policy if bound else Watched, [task], *how)[0]
+    return _count(task, torch.cat(seen), ends)
+
+
+def _count(task: Task, steps: Tensor, ends: TensorDictBase) -> Visits:
+    """Counts of steps, int64 [S, 3] of state type, node and action, and of where episodes ended."""
+    first, leaves = task.graph.num_decision_states, ends["leaf"].flatten().tolist()
+    num_actions = max(task.graph.branching_factor, int(steps[:, 2].max())) + 1
+    counts: Counter[tuple[StateType, int]] = Counter()
+    actions: dict[tuple[StateType, int], list[float]] = {}
+    for (kind, node, action), times in Counter(map(tuple, steps.tolist())).items():
+        key = StateType(kind), node
+        counts[key] += times
+        actions.setdefault(key, [0.0] * num_actions)[action] += times
+    shares = {key: [times / counts[key] for times in of] for key, of in actions.items()}
+    counts.update((StateType.END, first + leaf) if leaf >= 0 else (StateType.FAIL, 0) for leaf in leaves)
+    return Visits(dict(counts), shares)
