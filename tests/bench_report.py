@@ -8,7 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from made_runs import write_run
+from helpers.made_runs import write_run
 
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.style import require_packages

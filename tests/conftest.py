@@ -14,9 +14,9 @@ from typing import Any
 import hydra
 import pytest
 import torch
+from helpers.sweeping import UNLUCKY
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
-from sweeping import UNLUCKY
 
 from ctgraph_rl import run
 from ctgraph_rl.env import CTGraphEnv
@@ -34,7 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return
     for item in items:
         compiled = getattr(item, "callspec", None) and item.callspec.params.get("compiled")
-        if compiled or "test_native.py" in item.nodeid or "test_library.py" in item.nodeid or "compiled" in item.nodeid:
+        if compiled or "test_native.py" in item.nodeid or "test_kernel.py" in item.nodeid or "compiled" in item.nodeid:
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 

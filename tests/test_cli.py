@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from made_runs import write_run
+from helpers.made_runs import write_run
 
 import curricula
 from ctgraph_rl import cli, run

@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 import torch
-from oracles import act, confounding, one_hot, surjective, uniform
+from helpers.oracles import act, confounding, one_hot, surjective, uniform
 from rich.console import Console
 from torch import Tensor
 

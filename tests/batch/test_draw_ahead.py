@@ -1,0 +1,256 @@
+"""Draws: equal from a stock and from the bare core, however rows are run, and uniform where ids are drawn."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.oracles import WAIT, act, confounding, is_uniform, one_hot, optimal, scripts, surjective
+from test_switches import SWITCHED, VECTORS, read, seen
+from torch import Tensor
+
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.batch.rows import MAX_STOCK, Rows
+from ctgraph_rl.core import dynamics
+
+NOISY = replace(confounding(p=0.5, read_rotation=5), reward_std=0.3, goal_change=(1, 3), step_reward=0.5)
+TASKS = [*SWITCHED[:4], confounding(p=0.5), NOISY]
+PLAIN = [surjective(2, 3), surjective(3, 1)]
+"""Nothing to draw: p is 0, one image an id."""
+
+
+def bare(rows: Rows, name: str, *args: Tensor) -> dynamics.Shown | Tensor:
+    """A call of `Rows` by the function of the core alone, which makes every draw when it needs it."""
+    rows.state, shown = getattr(dynamics, name)(rows.state, *args, rows.params, rows.uses)
+    return shown
+
+
+def calls(num_calls: int, num_rows: int, seed: int = 0) -> list[tuple[str, tuple[Tensor, ...]]]:
+    """Steps with all kinds of resets in between; the first is a reset of all rows."""
+    generator = torch.Generator().manual_seed(seed)
+    made = [("reset", (torch.ones(num_rows, dtype=torch.bool),))]
+    for action, kind in zip(scripts(num_calls, num_rows, 4, seed), scripts(num_calls, 1, 8, seed + 1), strict=True):
+        mask = torch.rand(num_rows, generator=generator) < 0.3
+        steps = {5: ("reset", (mask,)), 6: ("restart", (mask,)), 7: ("step_or_reset", (action, mask))}
+        made.append(steps.get(kind.item(), ("step", (action,))))
+    return made
+
+
+def play(rows: Rows, twin: Rows, made: list) -> None:
+    """Make calls of rows, and those of a twin by the bare core: equal after each."""
+    for number, (name, args) in enumerate(made):
+        found, expected = getattr(rows, name)(*args), bare(twin, name, *args)
+        pairs = zip([*found, *rows.state], [*expected, *twin.state], strict=True)
+        assert all(torch.equal(*pair) for pair in pairs), (number, name)
+
+
+@pytest.mark.parametrize("tasks", [TASKS, VECTORS, PLAIN], ids=["images", "vectors", "plain"])
+def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps_with_resets(tasks):
+    rows, twin = (Rows(tasks, seed=3, first_row=2) for _ in range(2))
+
+    made = calls(270, len(tasks))
+
+    assert {name for name, _ in made} == {"step", "reset", "restart", "step_or_reset"}
+    play(rows, twin, made)
+
+
+@pytest.mark.parametrize("room", [0, 5, 6, 11, 12, 18, 6 * 256 + 5, 6 * 500])
+def test_a_stock_of_any_size_gives_the_same_draws(monkeypatch, room):
+    monkeypatch.setattr("ctgraph_rl.batch.rows.MAX_STOCK", room)
+    rows, twin = (Rows(TASKS, seed=4) for _ in range(2))
+
+    play(rows, twin, calls(30, 6, seed=room))
+
+
+@pytest.mark.parametrize("num_rows", [MAX_STOCK // 3 + 1, MAX_STOCK // 2, MAX_STOCK // 2 + 1, MAX_STOCK, MAX_STOCK + 1])
+def test_batches_around_the_size_without_a_stock_have_the_draws_of_the_bare_core(num_rows):
+    rows, twin = (Rows([one_hot(p=0.5)] * num_rows, seed=5) for _ in range(2))
+
+    play(rows, twin, calls(6, num_rows, seed=3))
+
+
+CHANGES = {
+    "a seed": lambda rows, saved: rows.set_seed(9),
+    "streams": lambda rows, saved: rows.set_streams(torch.arange(7, 13), torch.arange(5, -1, -1)),
+    "tasks": lambda rows, saved: rows.set_tasks(TASKS[::-1]),
+    "tasks without draws": lambda rows, saved: rows.set_tasks(PLAIN * 3),
+    "a state": lambda rows, saved: setattr(rows, "state", saved["state"]),
+    "a checkpoint": lambda rows, saved: rows.load_state_dict(saved["checkpoint"]),
+    "an assigned checkpoint": lambda rows, saved: rows.load_state_dict(copy.deepcopy(saved["checkpoint"]), assign=True),
+    "another's checkpoint": lambda rows, saved: rows.load_state_dict(saved["other"]),
+    "another's assigned checkpoint": lambda rows, saved: rows.load_state_dict(saved["other"], assign=True),
+    "goals": lambda rows, saved: rows.set_goals(torch.arange(6) % 2),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_after_a_change_in_the_middle_the_draws_are_those_of_the_bare_core(name):
+    pool = [*TASKS, *PLAIN]
+    rows, fresh, other = (Rows(TASKS, seed=seed, task_pool=pool) for seed in (3, 3, 8))
+    saved = {}
+    for number, (call, args) in enumerate(calls(30, 6)):
+        getattr(rows, call)(*args)
+        getattr(other, call)(*args)
+        if number == 20:
+            saved = {"state": rows.state, "checkpoint": copy.deepcopy(rows.state_dict())}
+    saved["other"] = copy.deepcopy(other.state_dict())
+
+    CHANGES[name](rows, saved)
+
+    twin = fresh
+    if name in ("tasks", "tasks without draws"):
+        twin.set_tasks(rows.tasks)
+    twin.set_streams(rows.seed.clone(), rows.row.clone())
+    twin.state = rows.state
+    play(rows, twin, calls(25, 6, seed=1))
+
+
+def test_new_tasks_have_draws_for_all_that_they_use():
+    rows, twin = (
+        Rows([surjective()] * 3, seed=1, task_pool=[surjective(), confounding(p=0.5), NOISY]) for _ in range(2)
+    )
+
+    for task in (surjective(), confounding(p=0.5), NOISY, surjective(), NOISY):
+        for batch in (rows, twin):
+            batch.set_tasks([task] * 3)
+        play(rows, twin, calls(20, 3))
+
+
+def test_a_checkpoint_of_another_batch_is_continued_as_there():
+    for assign in (False, True):
+        rows, other = Rows(TASKS, seed=1), Rows(TASKS, seed=2, first_row=5)
+        for batch, steps in ((rows, 30), (other, 50)):
+            for name, args in calls(steps, 6):
+                getattr(batch, name)(*args)
+
+        rows.load_state_dict(copy.deepcopy(other.state_dict()), assign=assign)
+
+        data = [seen(batch, scripts(30, 6)) for batch in (rows, other)]
+        assert all(torch.equal(*pair) for pair in zip(*data, strict=True)), assign
+
+
+@pytest.mark.parametrize(
+    "clone", [copy.deepcopy, lambda rows: pickle.loads(pickle.dumps(rows))], ids=["copy", "pickle"]
+)
+def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
+    rows, twin = (Rows(TASKS, seed=3) for _ in range(2))
+    play(rows, twin, calls(40, 6))
+
+    cloned, alike = clone(rows), copy.deepcopy(twin)
+
+    play(cloned, alike, calls(40, 6, seed=1))
+    play(rows, twin, calls(40, 6, seed=2))
+
+
+def test_a_step_that_was_refused_changes_nothing():
+    rows, twin = (Rows(TASKS, seed=3) for _ in range(2))
+    made = calls(30, 6)
+
+    for call in made:
+        play(rows, twin, [call])
+        with pytest.raises(RuntimeError):
+            rows.step(torch.zeros(5, dtype=torch.int64))
+
+
+def test_rows_can_be_moved_in_the_middle_of_an_episode():
+    rows = Rows(TASKS)
+    play(rows, Rows(TASKS), calls(20, 6))
+
+    shown = rows.to("meta").step(torch.zeros(6, dtype=torch.int64, device="meta"))
+
+    assert shown.observation.device.type == "meta"
+
+
+def test_a_step_or_reset_is_a_step_of_some_rows_and_a_reset_of_the_others():
+    rows, stepped, begun = (Rows(TASKS, seed=6) for _ in range(3))
+    for batch in (rows, stepped, begun):
+        batch.reset()
+
+    for action, mask in zip(scripts(50, 6, 4), scripts(50, 6, 2, seed=1).bool(), strict=True):
+        shown, steps, begins = rows.step_or_reset(action, mask), stepped.step(action), begun.reset()
+        found, step, begin = ([*shown, *rows.state], [*steps, *stepped.state], [*begins, *begun.state])
+        for value, going, new in zip(found, step, begin, strict=True):
+            assert torch.equal(value[mask], new[mask]) and torch.equal(value[~mask], going[~mask])
+        stepped.state = begun.state = rows.state
+
+
+@pytest.mark.parametrize("tasks", [TASKS, SWITCHED, VECTORS], ids=["draws", "images", "vectors"])
+def test_an_act_of_running_rows_is_a_step_that_tells_less(tasks):
+    rows, twin = (Rows(tasks, seed=7) for _ in range(2))
+    assert torch.equal(rows.restart(), twin.reset().observation)
+
+    for action in scripts(60, len(tasks), 3):
+        (observation, done), shown = rows.act(action), twin.step(action)
+        found = [
+            observation,
+            done,
+            *(torch.where(done, *pair) for pair in zip(rows.result(done), (0, -1), strict=True)),
+        ]
+        assert all(torch.equal(*pair) for pair in zip(found, [shown[0], shown[3], *shown[1:3]], strict=True))
+        assert torch.equal(rows.restart(done), twin.reset(done).observation)
+        assert all(torch.equal(*pair) for pair in zip(rows.state, twin.state, strict=True))
+
+
+# The same bits
+
+
+def test_rows_with_all_switches_do_not_depend_on_how_a_batch_is_split():
+    actions = scripts(60, len(SWITCHED), 4)
+
+    whole = seen(Rows(SWITCHED, seed=2), actions)
+    parts = [seen(Rows([task], seed=2, first_row=i), actions[:, i : i + 1]) for i, task in enumerate(SWITCHED)]
+
+    for i, part in enumerate(parts):
+        assert all(torch.equal(x[:, i : i + 1], y) for x, y in zip(whole, part, strict=True))
+
+
+def test_all_switches_compile_into_one_graph_and_map_with_vmap():
+    rows = Rows(SWITCHED, seed=1)
+    rows.reset()
+    params, uses = rows.params, rows.uses
+    compiled = torch.compile(dynamics.step, fullgraph=True, backend="eager")
+
+    for actions in scripts(24, 2 * len(SWITCHED), 3).view(24, 2, -1):
+        expected = [flat(dynamics.step(rows.state, action, params, uses)) for action in actions]
+        mapped = flat(torch.vmap(lambda action: dynamics.step(rows.state, action, params, uses))(actions))
+        found = flat(compiled(rows.state, actions[0], params, uses))
+        assert all(torch.equal(*pair) for pair in zip(found, expected[0], strict=True))
+        assert all(torch.equal(x, torch.stack(y)) for x, y in zip(mapped, zip(*expected, strict=True), strict=True))
+        rows.reset(rows.step(actions[0]).done)
+
+
+def flat(pair: tuple) -> list[Tensor]:
+    state, shown = pair
+    return [*state, *shown]
+
+
+# Ids that are drawn
+
+
+def test_a_wait_state_draws_another_id_at_every_look_without_unique_ids():
+    env = CTGraphEnv([read(p=0.999)] * 20_000, seed=1)
+    env.reset()
+    act(env, [0] * 20_000)
+    before = env.observation_id.clone()
+
+    act(env, [0] * 20_000)
+
+    stayed = env.state_type == WAIT
+    pairs = (before - 2) * 5 + env.observation_id - 2
+    assert stayed.sum() > 19_900
+    assert is_uniform(pairs[stayed].bincount(minlength=25).tolist())
+
+
+def test_the_ids_of_decision_and_end_states_are_drawn_independently_without_unique_ids():
+    env, shown = CTGraphEnv([read()] * 20_000, seed=1), []
+    env.reset()
+    for _ in range(6):
+        act(env, optimal(env))
+        shown.append(env.observation_id.clone())
+
+    triples = ((shown[1] - 7) * 3 + shown[3] - 7) * 4 + shown[5] - 10
+
+    assert is_uniform(triples.bincount(minlength=36).tolist())

@@ -1,0 +1,232 @@
+"""The fast path: the same data as the standard path, for every kind of task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.oracles import confounding, fully_observable, one_hot, record, scripts, surjective
+from torchrl.envs import StepCounter, TransformedEnv
+
+from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, rollout
+from ctgraph_rl.batch import rollout as fast
+from ctgraph_rl.core import philox
+
+FILE = {
+    "general_seed": 3,
+    "graph_shape": {"d": 2, "b": 3, "p": 0.2},
+    "reward": {
+        "high_r": 1.0,
+        "fail_r": -0.1,
+        "std_r": 0.2,
+        "reward_distribution": "linear",
+        "min_static_reward_episodes": 2,
+        "max_static_reward_episodes": 4,
+    },
+    "observations": {"MDP_D": True, "MDP_W": False, "W_IDs": [2, 4], "D_IDs": [5, 8], "graph_ends": [9, 17]},
+    "image_dataset": {"seed": 1, "1D": False, "nr_of_images": 18, "noise_on_read": 9, "rotation_on_read": 8},
+}
+MIXED = [
+    confounding(p=0.5, read_noise=20, read_rotation=5, reward_cue=True),
+    replace(surjective(3, 3, 0.3), reward_fn=Gradient(), step_reward=0.01, goal_change=(1, 3)),
+    replace(fully_observable(2, 3), reward_fn=ReferenceLinear(), reward_std=0.5, fail_reward=-1.0),
+    Task.from_json(FILE, goal=(1, 2)),
+]
+FAMILIES = {
+    "surjective": [surjective()],
+    "fully observable": [fully_observable(2, 3, 0.5)],
+    "confounding": [confounding(p=0.5)],
+    "rotation": [surjective(read_rotation=9)],
+    "noise": [surjective(read_noise=10)],
+    "one-hot": [one_hot(p=0.5)],
+    "reference": [Task.from_json(FILE, goal=(1, 2))],
+    "mixed": MIXED,
+}
+every_family = pytest.mark.parametrize("tasks", FAMILIES.values(), ids=FAMILIES)
+NUM_ROWS, NUM_STEPS = 8, 60
+
+
+def rows_of(tasks: list[Task]) -> list[Task]:
+    return (tasks * NUM_ROWS)[:NUM_ROWS]
+
+
+def actions_of(tasks: list[Task], num_steps: int = NUM_STEPS) -> torch.Tensor:
+    return scripts(num_steps, NUM_ROWS, 1 + max(task.graph.branching_factor for task in tasks))
+
+
+def assert_same(steps: Steps, data) -> None:
+    """``data`` [N, T] of the standard path."""
+    assert torch.equal(steps.observation[:-1], data["observation"].transpose(0, 1))
+    for field in ("is_init", "action"):
+        ours = getattr(steps, field)[: steps.action.shape[0]]
+        assert torch.equal(ours, data[field].transpose(0, 1).view(ours.shape))
+    for field in ("reward", "done", "outcome"):
+        ours = getattr(steps, field)
+        assert torch.equal(ours, data["next", field].transpose(0, 1).view(ours.shape))
+
+
+@every_family
+def test_the_fast_path_gives_the_data_of_the_standard_path(tasks):
+    env, rows = CTGraphEnv(rows_of(tasks), seed=3, first_row=2), Rows(rows_of(tasks), seed=3, first_row=2)
+    actions = actions_of(tasks)
+
+    data = record(env, actions)
+    steps = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
+
+    assert_same(steps, data)
+
+
+@every_family
+def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks):
+    alone = CTGraphEnv(rows_of(tasks), seed=3)
+    wrapped = TransformedEnv(CTGraphEnv(rows_of(tasks), seed=3), StepCounter(step_count_key="steps"))
+    actions = actions_of(tasks)
+
+    data, other = record(alone, actions), record(wrapped, actions)
+
+    assert (other.select(*data.keys(True, True)) == data).all()
+    assert all(torch.equal(*pair) for pair in zip(alone.rows.state, wrapped.base_env.rows.state, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_rows", [1, 8, 37])
+@pytest.mark.parametrize("tasks", [FAMILIES["noise"], FAMILIES["mixed"]])
+def test_what_compiles_the_fast_path_elsewhere_gives_the_same_bits(tasks, num_rows, monkeypatch):
+    rows, twin = (Rows((tasks * num_rows)[:num_rows]) for _ in range(2))
+    actions = scripts(NUM_STEPS, num_rows)
+    monkeypatch.setattr(fast, "_native", lambda rows, policy, steps: fast._tensors(rows, policy, steps, True))
+
+    eager = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
+    compiled = rollout(twin, actions, Steps.empty(rows, NUM_STEPS), compiled=True)
+
+    assert all(torch.equal(*pair) for pair in zip(eager, compiled, strict=True))
+    assert all(torch.equal(*pair) for pair in zip(rows.state, twin.state, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_rows", [1, 5, 16])
+@pytest.mark.parametrize("options", [None, {"cpp.simdlen": 1}])
+def test_compiled_draws_are_the_same_words(num_rows, options):
+    compiled = torch.compile(philox.draw, fullgraph=True, dynamic=False, options=options)
+    wide = torch.compile(philox.randint_wide, fullgraph=True, dynamic=False, options=options)
+    seed, row = torch.tensor([2**62 + 12345]), torch.arange(num_rows) * 2**27 + 2**31
+    high = torch.arange(1, num_rows + 1) * 2**57 - 1
+
+    words, found = philox.draw(seed, row, row + 2**40, 3), compiled(seed, row, row + 2**40, 3)
+
+    assert all(torch.equal(*pair) for pair in zip(words, found, strict=True))
+    assert torch.equal(philox.randint_wide((words[0], words[1]), high), wide((words[0], words[1]), high))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tasks", [FAMILIES["confounding"], FAMILIES["noise"]])
+def test_the_compiled_environment_gives_the_same_bits(tasks):
+    eager, compiled = (CTGraphEnv(rows_of(tasks), check_actions=False) for _ in range(2))
+    compiled.compile(warmup=2)
+    actions = actions_of(tasks)
+
+    with torch.no_grad():
+        data, other = record(eager, actions), record(compiled, actions)
+
+    assert (data == other).all()
+
+
+def test_a_rollout_goes_on_where_the_last_one_ended():
+    rows, twin = Rows(rows_of(MIXED)), Rows(rows_of(MIXED))
+    actions = actions_of(MIXED)
+    whole = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
+
+    parts = [rollout(twin, part, Steps.empty(twin, len(part))) for part in actions.split(23)]
+
+    for field in ("action", "reward", "done", "outcome"):
+        assert torch.equal(torch.cat([getattr(part, field) for part in parts]), getattr(whole, field))
+    for field in ("observation", "is_init"):
+        assert torch.equal(torch.cat([getattr(part, field)[:-1] for part in parts]), getattr(whole, field)[:-1])
+        assert torch.equal(getattr(parts[-1], field)[-1], getattr(whole, field)[-1])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_policy_gets_what_it_shall_act_on_and_where_episodes_begin(compiled):
+    rows, seen = Rows([surjective(goal=(1, 2))] * 2), []
+
+    def policy(observation: torch.Tensor, is_init: torch.Tensor) -> torch.Tensor:
+        seen.append((observation.clone(), is_init.tolist()))
+        return torch.tensor([[0, 0, 1, 0, 2, 0][(len(seen) - 1) % 6], 1])
+
+    steps = rollout(rows, policy, Steps.empty(rows, 7), compiled)
+
+    assert torch.equal(torch.stack([observation for observation, _ in seen]), steps.observation[:-1])
+    assert [is_init for _, is_init in seen] == steps.is_init[:-1].tolist()
+    assert steps.done[:, 0].tolist() == [False] * 5 + [True, False]
+    assert steps.outcome[:, 0].tolist() == [0, 0, 0, 0, 0, 3, 0]
+    assert steps.reward[:, 0].tolist() == [0, 0, 0, 0, 0, 1, 0]
+    assert steps.outcome[:, 1].tolist() == [0, 1, 0, 1, 0, 1, 0]
+    assert steps.is_init[:, 1].tolist() == [True, False] * 4
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (torch.zeros(5, 2, dtype=torch.int32), r"actions must be int64 of shape \[5, 2\].*got torch.int32 \[5, 2\]"),
+        (torch.zeros(4, 2, dtype=torch.int64), r"got torch.int64 \[4, 2\]"),
+        (torch.full((5, 2), 3), r"with values in 0..2, got 3..3"),
+        (torch.full((5, 2), -1), r"got -1..-1"),
+        (lambda observation, is_init: torch.zeros(3, dtype=torch.int64), r"shape \[2\].*got torch.int64 \[3\]"),
+        (lambda observation, is_init: torch.tensor([0, 9]), r"got 0..9"),
+    ],
+)
+def test_what_is_no_action_is_refused_and_the_rows_stay(actions, message):
+    rows = Rows([surjective()] * 2)
+    rows.reset()
+    before = rows.state
+
+    with pytest.raises(ValueError, match=message):
+        rollout(rows, actions, Steps.empty(rows, 5))
+
+    assert all(torch.equal(*pair) for pair in zip(rows.state, before, strict=True))
+
+
+def test_buffers_of_other_rows_are_refused():
+    rows, other = Rows([surjective()] * 2), Rows([surjective()] * 3)
+    actions, steps = torch.zeros(5, 2, dtype=torch.int64), Steps.empty(rows, 5)
+
+    with pytest.raises(
+        ValueError, match=r"Steps.empty\(rows, 5\), got observation torch.uint8 \[6, 3, 1, 12, 12\] on cpu"
+    ):
+        rollout(rows, actions, Steps.empty(other, 5))
+    with pytest.raises(ValueError, match=r"got reward torch.int64 \[5, 2\] on cpu"):
+        rollout(rows, actions, steps._replace(reward=steps.reward.long()))
+    with pytest.raises(ValueError, match="num_steps must be an integer >= 1, got 0"):
+        Steps.empty(rows, 0)
+
+
+@pytest.mark.parametrize("change", ["goals", "tasks", "reset"])
+def test_a_policy_that_changes_the_rows_is_refused(change):
+    rows = Rows([surjective()] * 2)
+    changes = {"goals": lambda: rows.set_goals([(2, 2)] * 2), "tasks": lambda: rows.set_tasks(rows.tasks)}
+
+    def policy(observation: torch.Tensor, is_init: torch.Tensor) -> torch.Tensor:
+        changes.get(change, rows.reset)()
+        return torch.zeros(2, dtype=torch.int64)
+
+    with pytest.raises(ValueError, match="a policy must leave the rows as they are during a rollout"):
+        rollout(rows, policy, Steps.empty(rows, 3))
+
+
+@pytest.mark.parametrize("policy", [None, [[0, 0]], torch.zeros(1, 2).numpy()])
+def test_what_is_no_policy_is_refused(policy):
+    rows = Rows([surjective()] * 2)
+
+    with pytest.raises(ValueError, match="policy must be a function or a tensor of actions"):
+        rollout(rows, policy, Steps.empty(rows, 1))
+    with pytest.raises(ValueError, match=r"actions must be int64 of shape \[2\]"):
+        rollout(rows, lambda observation, is_init: policy, Steps.empty(rows, 1))
+
+
+def test_nothing_is_learned_through_a_rollout():
+    rows, weight = Rows([surjective()] * 2), torch.ones(1, requires_grad=True)
+
+    steps = rollout(rows, lambda observation, _: (observation[:, 0, 0, 0] * weight > 300).long(), Steps.empty(rows, 5))
+
+    assert not any(buffer.requires_grad for buffer in steps)

@@ -1,0 +1,81 @@
+"""The page about agents: its list is the present one, and its example runs as an outsider would run it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+import torch
+from helpers.paths import CHECKOUT
+from test_agents import AGENTS
+
+from baselines.__main__ import agents, main
+from ctgraph_rl import RunLog, agent
+from curricula.paper import ct_su_b1
+
+TEXT = (CHECKOUT / "docs" / "agents.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """The code blocks of the page in a language."""
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["baselines"])
+    main()
+
+    assert capsys.readouterr().out == blocks("")[0]
+
+
+def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):
+    listed = dict(agents())
+
+    assert sorted(listed) == AGENTS
+    for name, kind in listed.items():
+        assert compose(f"agent={name}").agent._target_ == f"{kind.__module__}.{kind.__name__}"
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_hyperparameter_has_a_comment_in_its_yaml(name):
+    first, *lines = (CHECKOUT / "conf" / "agent" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+
+    assert first.startswith("# ")
+    assert [line for line in lines[1:] if not re.fullmatch(r"\w+: \S+ +# \S.*", line)] == []
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_an_agent_has_all_members_of_the_protocol(build_agent, name):
+    built = build_agent(name, [ct_su_b1()])
+    members = {key for key in vars(agent.Agent) if not key.startswith("_")} | set(agent.Agent.__annotations__)
+
+    assert {"policy", "learn", "start_task", "num_envs"} <= members
+    assert [key for key in members if not hasattr(built, key)] == []
+
+
+def test_the_page_has_every_member_of_the_protocol():
+    members = {key for key in vars(agent.Agent) if not key.startswith("_")} | set(agent.Agent.__annotations__)
+
+    assert [key for key in members if f"`{key}" not in TEXT] == []
+
+
+def test_an_outsiders_agent_is_one_file_and_one_yaml(tmp_path):
+    (tmp_path / "my_conf" / "agent").mkdir(parents=True)
+    (tmp_path / "my_agent.py").write_text(blocks("python")[0])
+    (tmp_path / "my_conf" / "agent" / "mine.yaml").write_text(blocks("yaml")[0])
+    command = shlex.split(blocks("bash")[0])
+    env = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+
+    result = subprocess.run(
+        [sys.executable, *command[1:], "hydra.run.dir=out"], cwd=tmp_path, env=env, capture_output=True, text=True
+    )
+
+    assert result.returncode == 0, result.stderr
+    training = RunLog.read(tmp_path / "out" / "run.jsonl").of_kind("training")
+    assert training[-1]["frames"] == 4 * 4096
+    assert all(abs(m["loss_policy"]) < 10 for m in training)
+    assert "_extra_state" in torch.load(tmp_path / "out" / "agent.pt", weights_only=True)

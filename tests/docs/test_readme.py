@@ -1,0 +1,34 @@
+"""README shows only what runs: CI executes its two commands, this test its Python."""
+
+import re
+from ast import literal_eval
+
+import pytest
+from helpers.paths import CHECKOUT
+
+README = CHECKOUT / "README.md"
+
+
+def test_the_python_in_readme_runs_and_prints_what_it_says(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+    for code in blocks:
+        exec(compile(code, str(README), "exec"), {})
+
+    *evaluations, backward_transfer, closed_forms, goals, mean_return = capsys.readouterr().out.splitlines()
+    assert [list(literal_eval(line)) for line in evaluations] == [["goal1.1", "goal1.2", "goal2.1", "goal2.2"]] * 4
+    assert [literal_eval(evaluations[i])[goal] for i, goal in ((0, "goal1.1"), (1, "goal1.2"))] == [1.0, 1.0]
+    assert float(backward_transfer) < 0
+    assert closed_forms == f"32 {1 / 16875} 12.0"
+    assert goals.endswith("goals reached at random in 51200 frames")
+    assert mean_return == "mean return 1.0"
+
+
+@pytest.mark.parametrize("name", ["run-command", "test-command"])
+def test_each_of_the_two_commands_is_one_line_behind_its_marker(name):
+    text = README.read_text(encoding="utf-8")
+
+    blocks = re.findall(rf"<!-- {name} -->\n```bash\n(.*?)```", text, re.DOTALL)
+
+    assert len(blocks) == 1
+    assert len(blocks[0].splitlines()) == 1

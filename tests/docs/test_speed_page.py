@@ -1,0 +1,81 @@
+"""What the page about speed shows."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+from helpers.paths import CHECKOUT
+
+from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, rollout
+from ctgraph_rl.core import reading
+from ctgraph_rl.tasks.configurations import ct_co_b1
+
+PAGE = CHECKOUT / "docs" / "speed.md"
+
+
+def test_the_example_of_the_fast_path_learns_the_task(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+    exec(compile(code, str(PAGE), "exec"), {})
+
+    assert float(capsys.readouterr().out.split()[0]) >= 0.9
+
+
+def test_the_benchmark_prints_a_row_for_every_way(capsys):
+    benchmark.main(["--rows", "2", "--tasks", "SU", "--rounds", "1", "--seconds", "0.001", "--skip-compiled"])
+
+    lines = capsys.readouterr().out.splitlines()
+    ways = [line.split("|")[3].strip() for line in lines if line.startswith("| 2 ")]
+    assert ways == [
+        "memset",
+        "memcpy",
+        "trivial environment: TorchRL rollout",
+        "trivial environment: TorchRL Collector",
+        "core, observations of the step and of the reset",
+        "fast rollout",
+        "TorchRL rollout",
+        "TorchRL Collector",
+        "TorchRL rollout, info=False",
+        "TorchRL Collector, info=False",
+        "Gymnasium VectorEnv",
+    ]
+
+
+def test_the_benchmark_measures_co_with_waiting_and_rotation_and_both_with_noise():
+    tasks = benchmark.configurations()
+
+    assert list(tasks) == ["SU", "CO", "SU, noise 10", "CO, noise 10"]
+    assert (tasks["CO"].graph.wait_prob, tasks["CO"].observations.read_rotation) == (0.5, 10)
+    assert [task.observations.read_noise for task in tasks.values()] == [0, 0, 10, 10]
+
+
+def test_a_noise_bank_repeats_each_of_its_noises_and_no_other():
+    task = benchmark.configurations()["SU, noise 10"]
+    rows = Rows([task] * 2000, noise_bank=8)
+    steps = rollout(rows, torch.zeros(1, 2000, dtype=torch.int64), Steps.empty(rows, 1))
+
+    known = reading.add_saturating(
+        task.images.bank(0)[:1].expand(8, -1, -1, -1), reading.noise_bank((10,), 8, (1, 12, 12))
+    )
+    counts = (steps.observation[0].flatten(1).unsqueeze(1) == known.flatten(1)).all(-1).sum(0)
+
+    assert counts.sum() == 2000
+    assert ((counts - 250).abs() < 5 * 250**0.5).all()
+
+
+def test_noise_of_a_bank_saturates_and_follows_each_rows_amplitude():
+    task = benchmark.configurations()["SU, noise 10"]
+    images = torch.tensor([[250, 3]], dtype=torch.uint8)
+
+    assert reading.add_saturating(images, torch.tensor([[10, 10]], dtype=torch.uint8)).tolist() == [[255, 13]]
+    assert reading.noise_bank((0, 200), 50, (1, 8, 8))[:50].max() == 0
+    assert reading.noise_bank((0, 200), 50, (1, 8, 8))[50:].max() == 200
+    env = CTGraphEnv([task, benchmark.configurations()["SU"]], noise_bank=4)
+    assert torch.equal(env.reset()["observation"][1], task.images.bank(0)[0])
+
+
+def test_a_noise_bank_of_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"noise_bank must be an integer in 0..2\*\*31, got -1"):
+        Rows([ct_co_b1()], noise_bank=-1)

@@ -1,0 +1,177 @@
+"""Stable-Baselines3 and sb3-contrib, unchanged: through Gymnasium's ids, and through the fast adapter."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from helpers.gym_steps import IDS, assert_equal
+from helpers.oracles import confounding, fully_observable, surjective
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from ctgraph_rl.gym import CTGraphGymEnv, make_task
+from ctgraph_rl.sb3 import SB3VecEnv
+from ctgraph_rl.tasks import configurations as paper
+
+GOAL = (1, 2)
+
+
+def adapter(name, num_envs):
+    return VecMonitor(SB3VecEnv(num_envs, name, goal=GOAL))
+
+
+def ids(name, num_envs):
+    return make_vec_env(f"ctgraph/{name}-v0", n_envs=num_envs, env_kwargs={"goal": GOAL})
+
+
+def mean_return(model, name):
+    mean, _ = evaluate_policy(model, make_vec_env(f"ctgraph/{name}-v0", seed=1000, env_kwargs={"goal": GOAL}), 50)
+    return mean
+
+
+def play(envs, num_steps, seed):
+    rng, results = np.random.default_rng(seed), []
+    envs.seed(seed)
+    results.append((envs.reset(), envs.reset_infos))
+    for _ in range(num_steps):
+        actions = rng.integers(3, size=envs.num_envs) * rng.integers(2, size=envs.num_envs)
+        results.append((*envs.step(actions), [dict(info) for info in envs.reset_infos]))
+    return results
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        surjective(),
+        fully_observable(p=0.5),
+        confounding(p=0.3, read_noise=9),
+        replace(surjective(), extra_end_step=True, fail_reward=-0.5, goal_change=(1, 2)),
+    ],
+    ids=["deterministic", "waits", "noise", "switches"],
+)
+def test_the_adapter_equals_dummy_vec_env_step_for_step(task):
+    ours, theirs = SB3VecEnv(4, task), DummyVecEnv([lambda: CTGraphGymEnv(task)] * 4)
+
+    assert_equal(play(ours, 200, seed=3), play(theirs, 200, seed=3))
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+
+
+def test_seeds_are_used_once():
+    envs, task = SB3VecEnv(3, confounding()), confounding()
+
+    envs.seed(5)
+    first, second = (envs.reset() is not None and envs.step(np.zeros(3, int))[0] for _ in range(2))
+
+    theirs = DummyVecEnv([lambda: CTGraphGymEnv(task)] * 3)
+    theirs.seed(5)
+    expected = [theirs.reset() is not None and theirs.step(np.zeros(3, int))[0] for _ in range(2)]
+    assert np.array_equal([first, second], expected)
+    assert not np.array_equal(first, second)
+
+
+def test_a_monitor_records_episodes_of_the_adapter():
+    envs = VecMonitor(SB3VecEnv(2, "CT-SU-B1"))
+    envs.reset()
+
+    infos = [envs.step(np.array([action, min(step, 1)]))[3] for step, action in enumerate((0, 0, 1, 0, 1, 0))]
+
+    assert [infos[-1][0]["episode"][key] for key in ("r", "l")] == [1.0, 6]
+    assert [infos[1][1]["episode"][key] for key in ("r", "l")] == [0.0, 2]
+
+
+def test_attributes_and_methods_are_those_of_the_batch():
+    pool = [paper.ct_su_b1(), paper.ct_su_b1((2, 2))]
+    envs = VecMonitor(SB3VecEnv(2, task_pool=pool, task=pool[0], render_mode="rgb_array"))
+    envs.env_method("set_tasks", pool)
+    envs.reset()
+
+    assert [info["task"] for info in envs.unwrapped.reset_infos] == [0, 1]
+    assert envs.get_attr("num_envs") == [2, 2]
+    assert envs.get_attr("num_envs", indices=[1]) == [2]
+    assert envs.has_attr("task_pool") and not envs.has_attr("task_poll")
+    assert envs.env_is_wrapped(gymnasium.Wrapper) == [False, False]
+    assert envs.render().shape == (2 * 192, 384, 3)
+    assert len(envs.env_method("render")) == 2
+    with pytest.raises(ValueError, match=r"the rows are one batch: indices must be None, got \[0\]"):
+        envs.env_method("set_tasks", pool, indices=[0])
+
+
+def test_without_stable_baselines3_the_error_says_what_to_install(checkout):
+    code = "import sys; sys.modules['stable_baselines3'] = None; import ctgraph_rl.sb3"
+
+    result = subprocess.run([sys.executable, "-c", code], cwd=checkout, capture_output=True, text=True)
+
+    assert result.stderr.endswith(
+        "ImportError: ctgraph_rl.sb3 needs Stable-Baselines3: pip install stable-baselines3\n"
+    )
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_their_check_env_finds_images_small_and_nothing_else(name):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(gymnasium.make(name))
+
+    assert all("minimal resolution for an image is 36x36" in str(warning.message) for warning in caught)
+
+
+def test_their_check_env_has_nothing_to_say_about_one_hot_observations():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(CTGraphGymEnv(one_hot=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [ids, adapter])
+def test_ppo_learns_ct_fo_b1(make):
+    model = PPO(
+        "MlpPolicy", make("CT-FO-B1", 8), n_steps=128, batch_size=128, learning_rate=1e-3, ent_coef=0.01, seed=0
+    )
+
+    model.learn(10_240)
+
+    assert mean_return(model, "CT-FO-B1") >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [ids, adapter])
+def test_dqn_learns_ct_fo_b1(make):
+    schedule = {"learning_starts": 500, "exploration_fraction": 0.7, "target_update_interval": 200}
+    model = DQN("MlpPolicy", make("CT-FO-B1", 4), learning_rate=1e-3, gamma=0.9, buffer_size=20_000, seed=0, **schedule)
+
+    model.learn(10_000)
+
+    assert mean_return(model, "CT-FO-B1") >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [ids, adapter])
+def test_recurrent_ppo_learns_ct_su_b1(make):
+    sizes = {"n_steps": 32, "batch_size": 128, "policy_kwargs": {"lstm_hidden_size": 32, "net_arch": [32]}}
+    model = RecurrentPPO(
+        "MlpLstmPolicy", make("CT-SU-B1", 16), learning_rate=2e-3, ent_coef=0.02, gamma=0.95, seed=0, **sizes
+    )
+
+    model.learn(25_600)
+
+    assert mean_return(model, "CT-SU-B1") >= 0.9
+
+
+@pytest.mark.slow
+def test_ppo_without_memory_does_not_learn_ct_su_b1():
+    model = PPO("MlpPolicy", adapter("CT-SU-B1", 16), n_steps=64, batch_size=256, learning_rate=1e-3, seed=0)
+
+    model.learn(20_480)
+
+    assert make_task("CT-SU-B1", goal=GOAL).memoryless_ceiling(deterministic=True) == 0
+    assert mean_return(model, "CT-SU-B1") == 0

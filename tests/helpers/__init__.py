@@ -1,0 +1,1 @@
+"""Builders, oracles and made-up runs that several test files use."""

@@ -1,0 +1,71 @@
+"""Real processes that are stopped by real signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.kill_runs import command, differences
+
+from ctgraph_rl.runs.checkpoints import Checkpoints
+
+
+def kill_runs(checkout: Path, *arguments: str) -> None:
+    """``python -m tests.helpers.kill_runs ARGUMENTS``; fails if a run ends differently."""
+    result = subprocess.run(
+        [sys.executable, "-m", "tests.helpers.kill_runs", *arguments], cwd=checkout, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_runs_that_are_killed_end_as_if_never_stopped(checkout):
+    kill_runs(checkout, "--kills", "2", "--agents", "a2c")
+
+
+@pytest.mark.slow
+def test_runs_of_three_agents_that_are_killed_end_as_if_never_stopped(checkout):
+    kill_runs(checkout, "--kills", "6", "--agents", "dqn,lstm_ppo,rl2")
+
+
+def start(run_dir: Path, checkout: Path) -> subprocess.Popen:
+    """A run in a process of its own, with the signals of a shell's foreground."""
+    arguments = [sys.executable, "-m", "ctgraph_rl.run", *command("a2c", run_dir)]
+    env = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
+
+    def usual_signals() -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    return subprocess.Popen(
+        arguments, cwd=run_dir.parent, env=env, stderr=subprocess.PIPE, text=True, preexec_fn=usual_signals
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(checkout, tmp_path_factory) -> Path:
+    """The run that was never stopped."""
+    run_dir = tmp_path_factory.mktemp("whole") / "run"
+    assert start(run_dir, checkout).wait(120) == 0
+    return run_dir
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, whole, name, code):
+    run_dir = tmp_path / "run"
+    process = start(run_dir, checkout)
+    while process.poll() is None and not Checkpoints(run_dir / "checkpoints").files():
+        time.sleep(0.01)
+    process.send_signal(getattr(signal, name))
+
+    assert process.wait(60) == code
+    assert process.stderr is not None
+    line = f"{name}: saving after this update ... saved, the same command goes on from there"
+    assert line in process.stderr.read().splitlines()
+    assert not (run_dir / "metrics.json").exists() and not (run_dir / ".lock").exists()
+
+    assert start(run_dir, checkout).wait(120) == 0
+    assert differences(whole, run_dir) == []

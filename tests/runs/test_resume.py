@@ -1,0 +1,217 @@
+"""Runs that go on from any checkpoint end as if they had never been stopped, bit by bit."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from helpers.kill_runs import RUNS, equal
+from test_agents_rl2 import TWO_GOALS
+from test_lifelong import ONE, TWO, task
+
+from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
+from ctgraph_rl.learn.lifelong import Checkpoint
+from ctgraph_rl.run import target
+from ctgraph_rl.runs.checkpoints import decoded, encoded
+from ctgraph_rl.runs.train import new_agent
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
+
+ROWS, STEPS = 8, 4
+SMALL = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size=4"]
+MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=2"]
+REPLAY = ["agent.num_updates=2", "agent.batch_size=8", "agent.buffer_size=96", "agent.target_update_interval=3"]
+
+AGENTS: dict[str, tuple[str, list[str]]] = {
+    "a2c": ("a2c", ["agent.optimiser=rmsprop"]),
+    "dqn": ("dqn", REPLAY),
+    "prioritized dqn": ("dqn", [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"]),
+    "drqn": ("drqn", REPLAY),
+    "lstm_ppo": ("lstm_ppo", MINIBATCHES),
+    "ppo": ("ppo", MINIBATCHES),
+    "ppo_count": ("ppo_count", [*MINIBATCHES, "agent.num_hash_bits=6"]),
+    "qrdqn_lstm": ("qrdqn_lstm", [*REPLAY, "agent.num_quantiles=4"]),
+    "reinforce": ("reinforce", []),
+    "rl2": ("rl2", [*MINIBATCHES, "agent.trial_episodes=4"]),
+}
+
+THREE = task((2,), wait_prob=0.5)
+MIDDLE = Evaluation(4, every=96, greedy=False)
+
+
+def of(*blocks: Block, evaluation: Evaluation = MIDDLE, **protocol: Any) -> Curriculum:
+    return Curriculum("resumed", 1, "here", blocks, evaluation, Protocol(**protocol))
+
+
+def uneven(**how: Any) -> Curriculum:
+    """Blocks of no whole number of batches, which are of 32 frames; with hidden boundaries, batches go over them."""
+    return of(Block(ONE, 80), Block(THREE, 120), Block(ONE, 56), **how)
+
+
+def switching(switch: Any) -> Curriculum:
+    return of(Block((ONE, TWO, THREE), 96, switch), Block(TWO, 40), boundaries="hidden")
+
+
+CURRICULA = {
+    "announced": uneven(),
+    "hidden": uneven(boundaries="hidden"),
+    "ids with observations": uneven(task_id="one_hot", num_task_ids=3),
+    "ids at boundaries": uneven(task_id="at_boundaries"),
+    "hidden with ids": uneven(task_id="one_hot", boundaries="hidden"),
+    "rows apart": of(Block((ONE, THREE), 80), Block(TWO, 80)),
+    "by episode": switching(ByEpisode(2)),
+    "by episode, together": switching(ByEpisode(2, together=True)),
+    "at random": switching(AtRandom(0.5)),
+    "at random, together": switching(AtRandom(0.5, together=True)),
+    "drift": switching(Drift(8)),
+    "drift, together": switching(Drift(8, together=True)),
+    "evaluated at the end only": uneven(evaluation=Evaluation(4, before=False)),
+    "changing goals": of(
+        Block(TWO_GOALS, 160), Block(replace(TWO_GOALS, goal=(2,)), 64), evaluation=replace(MIDDLE, episodes_per_row=4)
+    ),
+}
+
+
+class Ended(NamedTuple):
+    """What a run leaves."""
+
+    agent: Mapping[str, Any]
+    log: list[dict[str, Any]]
+    random: torch.Tensor
+
+
+class Learner(NamedTuple):
+    """Learns a curriculum with a new agent, into a new log."""
+
+    curriculum: Curriculum
+    make_agent: Any
+    folder: Path
+
+    def learn(self, log: RunLog, saved: Mapping[str, Any] | None = None, checkpoint: Checkpoint | None = None) -> Ended:
+        agent = new_agent(self.curriculum, self.make_agent, 0)
+        torch.manual_seed(0 if saved is None else 1234)
+        learn_curriculum(self.curriculum, agent, 7, log, saved=saved, checkpoint=checkpoint)
+        log.close()
+        lines = [{key: value for key, value in line.items() if key != "seconds"} for line in log.measurements]
+        return Ended(agent.state_dict(), lines, torch.get_rng_state())
+
+    def whole(self) -> tuple[Ended, list[Path]]:
+        """A run that is never stopped, and its states after every update."""
+        states: list[Path] = []
+
+        def keep(state: Any, at_block_end: bool) -> None:
+            states.append(self.folder / f"{len(states)}.pt")
+            states[-1].write_bytes(encoded(state()))
+
+        return self.learn(RunLog(self.folder / "whole.jsonl"), checkpoint=keep), states
+
+    def resumed(self, state: Path) -> Ended:
+        """The run that goes on from a state, and from the log as it was later."""
+        saved, path = decoded(state), self.folder / f"{state.stem}.jsonl"
+        path.write_bytes((self.folder / "whole.jsonl").read_bytes())
+        return self.learn(RunLog.resume(path, saved["log"]), saved)
+
+
+@pytest.fixture
+def learner(compose, tmp_path):
+    """Makes a `Learner` of a curriculum and an agent's name in `AGENTS`."""
+
+    def make(curriculum: Curriculum, name: str) -> Learner:
+        agent, overrides = AGENTS[name]
+        return Learner(curriculum, target(compose(f"agent={agent}", *SMALL, *overrides), "agent"), tmp_path)
+
+    return make
+
+
+def check_some(learner: Learner, count: int | None = None) -> None:
+    """The first, the last and ``count`` other states, or all, lead to the same end."""
+    whole, states = learner.whole()
+    others = random.Random(str(learner.curriculum)).sample(states, len(states) if count is None else count)
+    chosen = {states[0], states[-1], *others}
+
+    for state in chosen:
+        resumed = learner.resumed(state)
+        assert equal(resumed.agent, whole.agent), state
+        assert resumed.log == whole.log, state
+        assert torch.equal(resumed.random, whole.random), state
+
+
+def test_every_agent_is_resumed_and_killed(compose, checkout):
+    names = [path.stem for path in (checkout / "conf" / "agent").glob("*.yaml")]
+    targets = {name: compose(f"agent={name}").agent._target_ for name in names}
+
+    resumed = {targets[name] for name, _ in AGENTS.values()}
+
+    assert resumed == {targets[name] for name in RUNS} == set(targets.values())
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_agent_goes_on_as_if_never_stopped(learner, name):
+    kind = "changing goals" if name == "rl2" else "announced"
+
+    check_some(learner(CURRICULA[kind], name), 1)
+
+
+@pytest.mark.parametrize("kind", CURRICULA)
+def test_every_kind_of_curriculum_goes_on_as_if_never_stopped(learner, kind):
+    check_some(learner(CURRICULA[kind], "a2c"), 1)
+
+
+@pytest.mark.parametrize("kind", ["hidden", "drift"])
+def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
+    check_some(learner(CURRICULA[kind], "qrdqn_lstm"), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CURRICULA)
+@pytest.mark.parametrize("name", AGENTS)
+def test_every_agent_goes_on_in_every_kind_of_curriculum_from_every_state(learner, name, kind):
+    check_some(learner(CURRICULA[kind], name))
+
+
+def test_a_state_may_be_used_again_for_resuming_does_not_change_it(learner):
+    its = learner(CURRICULA["hidden"], "prioritized dqn")
+    whole, states = its.whole()
+    before = states[4].read_bytes()
+
+    first, again = its.resumed(states[4]), its.resumed(states[4])
+
+    assert equal(first.agent, again.agent) and equal(first.agent, whole.agent)
+    assert states[4].read_bytes() == before
+
+
+def test_states_are_offered_after_every_update_and_say_where_blocks_end(learner):
+    told = []
+
+    learner(CURRICULA["announced"], "a2c").learn(
+        RunLog(), checkpoint=lambda state, at_block_end: told.append((state()["frames"], at_block_end))
+    )
+
+    assert told == [
+        *[(32, False), (64, False), (80, True)],
+        *[(112, False), (144, False), (176, False), (200, True)],
+        *[(232, False), (256, True)],
+    ]
+
+
+def test_another_state_gives_another_end(learner):
+    its = learner(CURRICULA["announced"], "a2c")
+    whole, states = its.whole()
+    saved = decoded(states[3])
+    saved["random"] = torch.Generator().manual_seed(99).get_state()
+
+    other = its.learn(RunLog(), saved)
+
+    assert not equal(other.agent, whole.agent)
+
+
+def test_a_state_of_another_agent_is_refused(learner):
+    _, states = learner(CURRICULA["announced"], "a2c").whole()
+    other = learner(CURRICULA["announced"], "dqn")
+
+    with pytest.raises(ValueError, match=r"the saved state does not fit this agent and curriculum, start anew \(overw"):
+        other.learn(RunLog(), decoded(states[0]))

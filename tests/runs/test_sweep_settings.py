@@ -1,0 +1,158 @@
+"""Settings of sweeps and their cells: which become choices, which are refused, and what a refusal leaves."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.sweeping import UNLUCKY, configs, sweep
+
+from ctgraph_rl import run as run_module
+
+
+@pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
+def test_a_setting_that_all_choices_of_a_swept_group_have_is_one_of_all_cells(whole, learned, monkeypatch, tmp_path):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    own = "# @package _global_\nhydra:\n  sweeper:\n    params: {method: 'ewc,l2'}\n"
+    (tmp_path / "mine" / "experiment" / "own.yaml").write_text(own)
+
+    code = sweep(monkeypatch, "--config-dir", str(tmp_path / "mine"), "method.coeff=2.5", *whole.split(), "seed=0")
+
+    coeffs = [config["method"]["coeff"] for config in configs(learned)]
+    assert (code, coeffs) == (0, [3, 3] if "3" in whole else [2.5, 2.5])
+
+
+@pytest.mark.parametrize("flag", ["-m", "--multi", "--multirun"])
+def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag):
+    as_they_are = [
+        "seed=3",
+        "agent.gamma=null",
+        "agent.optimiser='0.5'",
+        "agent.optimiser='true'",
+        r"agent.optimiser='it\'s (x)'",
+        "agent.num_envs=range(1,3)",
+        "agent.num_envs=1,2",
+        "agent.num_envs=[1,",
+        "other.num_envs=3",
+    ]
+
+    assert run_module.sweepable(
+        [flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]
+    ) == [
+        flag,
+        "method.coeff=choice(2.5)",
+        "method.heads=choice('multi')",
+        "agent.layers=choice([8, 8])",
+        *as_they_are,
+    ]
+    assert run_module.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
+
+
+def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
+    code = sweep(monkeypatch, "agent.num_envs=range(1,3)", "seed=0")
+
+    assert (code, [config["agent"]["num_envs"] for config in configs(learned)]) == (0, [1, 2])
+
+
+def test_null_is_a_setting_of_a_swept_group(learned, monkeypatch):
+    code = sweep(monkeypatch, "curriculum=ct20,ct28_mosaic_skips_d5", "++curriculum.agent=null", "seed=0")
+
+    assert (code, [config["curriculum"]["agent"] for config in configs(learned)]) == (0, [None, None])
+
+
+def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anything_runs(learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, "method=ewc,finetune", "method.coeff=2.5")
+
+    assert (code, learned) == (1, [])
+    assert "method.coeff" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["experiment=masks_ct8"],
+            ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(5): add -m",
+        ),
+        (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(5): add -m"),
+        (["hydra.sweeper.status=true"], "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+    ],
+)
+def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, capsys):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *settings])
+
+    with pytest.raises(SystemExit):
+        run_module.main()
+
+    assert message in capsys.readouterr().err
+    assert learned == [] and not list(Path().rglob("run.jsonl"))
+
+
+@pytest.mark.parametrize("prefix", ["", "++"])
+def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch, prefix):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3"])
+    monkeypatch.setattr(run_module, "show", lambda *_: None)
+
+    run_module.main()
+
+    assert [path.name.split("-")[:3] for path in learned] == [["ppo_published", "ewc", "seed3"]]
+
+
+@pytest.mark.parametrize(
+    "setting", ["resume=foo", "checkpoint_seconds=-1", "overwrite=0", "overwrite=maybe", "report=ye", "num_threads=0"]
+)
+def test_a_bad_value_is_refused_by_a_run_that_is_finished_too(setting, learned, monkeypatch, capsys):
+    sweep(monkeypatch, "seed=0")
+    (done,) = learned
+    before = sorted(done.iterdir())
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={done}", setting])
+
+    with pytest.raises(SystemExit):
+        run_module.main()
+
+    assert f"error: {setting.partition('=')[0]} must be " in capsys.readouterr().err
+    assert sorted(done.iterdir()) == before
+
+
+def test_a_bad_value_marks_neither_a_finished_cell_nor_a_stopped_run_alone(learned, monkeypatch):
+    sweep(monkeypatch, "seed=0")
+    codes = [sweep(monkeypatch, "seed=0", "overwrite=true", "resume=foo")]
+    (cell,) = learned
+    marks = [(cell / "failed.txt").exists()]
+    (cell / "metrics.json").unlink()
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "seed=0", f"hydra.run.dir={cell}", "resume=foo"])
+    with pytest.raises(ValueError, match="resume must be"):
+        run_module.main()
+    marks.append((cell / "failed.txt").exists())
+    codes.append(sweep(monkeypatch, "seed=0", "resume=foo"))
+
+    assert codes == [1, 1] and marks == [False, False]
+    assert (cell / "failed.txt").read_text() == "ValueError: resume must be one of warn, strict, got 'foo'\n"
+
+
+def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, capsys):
+    sweep(monkeypatch, f"seed={UNLUCKY}")
+    (learned[0] / "run.jsonl").write_text("{broken\n{}\n")
+    sweep(monkeypatch, f"seed={UNLUCKY}")
+    capsys.readouterr()
+
+    sweep(monkeypatch, f"seed={UNLUCKY}", "hydra.sweeper.status=true")
+
+    assert "line 1 is no measurement" in (learned[0] / "failed.txt").read_text()
+    assert "sweep of 1 cells: 0 done, 1 failed, 0 in use, 0 missing" in capsys.readouterr().out
+
+
+def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
+    (tmp_path / "failed.txt").write_text("ValueError: before\n")
+
+    with pytest.raises(ValueError), run_module.marked_if_it_fails(tmp_path):
+        raise ValueError("again")
+    assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
+    with run_module.marked_if_it_fails(tmp_path):
+        pass
+
+    assert not (tmp_path / "failed.txt").exists()

@@ -1,0 +1,358 @@
+"""Sweeps: what is launched, what a failing or busy cell does, and what is said while they run and at the end."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.sweeping import UNLUCKY, sweep
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import MissingConfigException
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from ctgraph_rl import run as run_module
+from ctgraph_rl.log.files import locked
+from ctgraph_rl.run import explain
+from ctgraph_rl.runs.sweep import SHOWN, Standing, SweepProgress, lock_holder, report, standing
+from hydra_plugins.ctgraph_rl_sweeper import shortened, sigterm_exits, why
+
+SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
+ALL_DONE = "sweep of {0} cells: {0} done, 0 failed, 0 in use, 0 missing\n"
+
+
+def plugin(name: str) -> Any:
+    """One of Hydra's plugins as it uses it: it imports their modules a second time."""
+    return Plugins.instance().class_name_to_class[name]
+
+
+def test_a_second_start_does_only_what_is_missing(learned, monkeypatch, capsys):
+    first = sweep(monkeypatch, "seed=0,1")
+    before = list(learned)
+
+    second = sweep(monkeypatch, "seed=range(4)", "agent=lstm_ppo,dqn")
+
+    assert (first, second) == (0, 0)
+    assert len(before) == 2 and len(learned) == len(set(learned)) == 8
+    assert capsys.readouterr() == (ALL_DONE.format(2) + ALL_DONE.format(8), "")
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["multirun.yaml", "su_b1_4tasks"]
+
+
+def test_a_failing_cell_stops_no_other_and_is_tried_again(learned, monkeypatch, capsys):
+    codes = [sweep(monkeypatch, f"seed=0,{UNLUCKY},-1,2") for _ in range(2)]
+
+    shown, errors = capsys.readouterr()
+    assert codes == [1, 1] and errors == ""
+    assert [path.name.split("-")[1] for path in learned] == ["seed0", f"seed{UNLUCKY}", "seed2", f"seed{UNLUCKY}"]
+    lines = shown.splitlines()
+    assert lines[:3] == [
+        "sweep of 4 cells: 2 done, 2 failed, 0 in use, 0 missing",
+        f"  failed   seed={UNLUCKY}  FloatingPointError: the loss is NaN",
+        "  failed   seed=-1  ValueError: seed must be an integer in [0, 2**63), got -1",
+    ]
+    assert lines[3].startswith("the same command runs what is not done")
+    (refused,) = Path("runs").rglob("*-seed_1-*")
+    (mark,) = refused.iterdir()
+    assert (mark.name, mark.read_text()) == (
+        "failed.txt",
+        "ValueError: seed must be an integer in [0, 2**63), got -1\n",
+    )
+
+
+def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, capsys):
+    sweep(monkeypatch, f"seed=0,{UNLUCKY}")
+    capsys.readouterr()
+    del learned[:]
+
+    code = sweep(monkeypatch, f"seed=0,{UNLUCKY},14", "hydra.sweeper.status=true")
+
+    assert (code, learned) == (1, [])
+    assert capsys.readouterr().out.splitlines()[:3] == [
+        "sweep of 3 cells: 1 done, 1 failed, 0 in use, 1 missing",
+        f"  failed   seed={UNLUCKY}  FloatingPointError: the loss is NaN",
+        "  missing  seed=14  not begun",
+    ]
+
+
+def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monkeypatch, capsys):
+    said = [sweep(monkeypatch, "seed=range(-30,0)", f"hydra.sweeper.status={status}") for status in ("true", "false")]
+
+    lines = capsys.readouterr().out.splitlines()
+    assert said == [1, 1]
+    assert [sum(line.startswith(f"  {state}") for line in lines) for state in ("missing", "failed")] == [30, SHOWN]
+
+
+def test_a_cell_that_another_process_runs_is_left_to_it(learned, monkeypatch, capsys):
+    sweep(monkeypatch, "seed=1")
+    (learned[0] / "metrics.json").unlink()
+
+    with locked(learned[0]):
+        code = sweep(monkeypatch, "seed=0,1,2")
+
+    assert code == 1
+    assert [path.name.split("-")[1] for path in learned] == ["seed1", "seed0", "seed2"]
+    numbers, busy, _ = capsys.readouterr().out.splitlines()[1:]
+    assert numbers == "sweep of 3 cells: 2 done, 0 failed, 1 in use, 0 missing"
+    assert busy.startswith(f"  in use   seed=1  by process {os.getpid()} on {socket.gethostname()} since ")
+
+
+def test_equal_cells_are_run_once(learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, "seed=0,0,1")
+
+    assert code == 0 and len(learned) == 2
+    assert "sweep of 2 cells (1 more are the same as others): 2 done" in capsys.readouterr().out
+
+
+def test_overwrite_runs_what_is_done_again(learned, monkeypatch):
+    sweep(monkeypatch, "seed=0,1")
+
+    code = sweep(monkeypatch, "seed=0,1", "overwrite=true")
+
+    assert code == 0 and len(learned) == 4
+
+
+def test_a_sweep_that_is_interrupted_says_where_it_stands(learned, monkeypatch, capsys):
+    def stop(cfg, run_dir, interrupt):
+        raise SystemExit(130)
+
+    monkeypatch.setattr(run_module, "learn", stop)
+
+    code = sweep(monkeypatch, "seed=0,1")
+
+    assert code == 130
+    assert capsys.readouterr().out.startswith("sweep of 2 cells: 0 done, 0 failed, 0 in use, 2 missing\n")
+
+
+def test_only_what_is_not_done_is_launched_in_batches_one_after_the_other(learned, monkeypatch):
+    launcher, sizes = plugin("hydra._internal.core_plugins.basic_launcher.BasicLauncher"), []
+    launch = launcher.launch
+
+    def noted(self, cells, initial_job_idx):
+        sizes.append(len(cells))
+        return launch(self, cells, initial_job_idx)
+
+    monkeypatch.setattr(launcher, "launch", noted)
+
+    codes = [sweep(monkeypatch, f"seed=range({end})", "hydra.sweeper.max_batch_size=2") for end in (2, 7, 7)]
+
+    assert (codes, sizes, len(learned)) == ([0, 0, 0], [2, 2, 2, 1], 7)
+
+
+def test_a_launcher_that_gives_up_is_reported(learned, monkeypatch, capsys):
+    def give_up(self, cells, initial_job_idx):
+        raise RuntimeError("a worker was killed")
+
+    monkeypatch.setattr(plugin("hydra._internal.core_plugins.basic_launcher.BasicLauncher"), "launch", give_up)
+
+    code = sweep(monkeypatch, "seed=0,1")
+
+    shown, errors = capsys.readouterr()
+    assert (code, errors) == (1, "the launcher stopped: RuntimeError: a worker was killed\n")
+    assert shown.startswith("sweep of 2 cells: 0 done, 0 failed, 0 in use, 2 missing\n")
+
+
+def test_sigterm_ends_a_sweep_between_cells_unless_it_is_ignored():
+    with pytest.raises(SystemExit) as end, sigterm_exits():
+        os.kill(os.getpid(), signal.SIGTERM)
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        with sigterm_exits():
+            os.kill(os.getpid(), signal.SIGTERM)
+        ignored = signal.getsignal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+    assert end.value.code == 143
+    assert (before, ignored) == (signal.SIG_DFL, signal.SIG_IGN)
+
+
+def test_what_cannot_be_composed_is_refused_before_anything_runs(learned, monkeypatch, capsys):
+    codes = [sweep(monkeypatch, *wrong) for wrong in (["agent=dqn,dqm"], ["agent.foo=1,2"], ["seed=0", "sed=1,2"])]
+
+    errors = capsys.readouterr().err
+    assert codes == [1, 1, 1] and learned == []
+    assert "Could not find 'agent/dqm'" in errors and "'agent.foo'" in errors and "'sed'" in errors
+
+
+def test_directories_that_are_not_named_after_the_configuration_are_refused(learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, "seed=0,1", "hydra.sweep.subdir=${hydra.job.num}")
+
+    assert code == 1 and learned == []
+    assert "hydra.sweep.subdir must be ${run_name:}, got ${hydra.job.num}; change" in capsys.readouterr().err
+
+
+def test_three_hundred_cells_are_named_as_they_would_be_run_from_few_compositions(learned, monkeypatch, capsys):
+    original, compositions = ConfigLoaderImpl.load_sweep_config, []
+
+    def counted(self, master, overrides):
+        compositions.append(overrides)
+        return original(self, master, overrides)
+
+    swept = ("agent=lstm_ppo,dqn", "agent.learning_rate=0.1,0.01,1e-3", "seed=range(50)", "protocol.task_id=one_hot")
+    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counted)
+
+    sweep(monkeypatch, *swept, "hydra.sweeper.status=true")
+    few = len(compositions)
+    chosen = ("agent=dqn", "agent.learning_rate=0.01,1e-3", "seed=49", "protocol.task_id=one_hot")
+    code = sweep(monkeypatch, *chosen)  # each is composed again, whole, where it is run
+    sweep(monkeypatch, *swept, "hydra.sweeper.status=true")
+
+    assert (few, code) == (2, 0)
+    assert "sweep of 300 cells: 2 done, 0 failed, 0 in use, 298 missing" in capsys.readouterr().out
+
+
+def test_lists_and_dictionaries_can_be_swept(learned, monkeypatch):
+    axes = ("curriculum=axes", "curriculum.goals=[[1,1]],[[1,2],[2,1]]", "evaluation={every:512},{greedy:true}")
+
+    code = sweep(monkeypatch, *axes)
+
+    settings = [json.loads((path / "run.jsonl").read_text())["config"] for path in learned]
+    assert code == 0
+    found = [(cfg["curriculum"]["goals"], cfg["evaluation"]["every"], cfg["evaluation"]["greedy"]) for cfg in settings]
+    two = [(goals, *evaluation) for goals in ([[1, 1]], [[1, 2], [2, 1]]) for evaluation in ((512, None), (None, True))]
+    assert found == two
+
+
+def test_a_sweep_on_processes_runs_every_cell_and_shows_no_bars(checkout, tmp_path):
+    pytest.importorskip("joblib")
+    command = [sys.executable, "-m", "ctgraph_rl.run", "-m", "hydra/launcher=joblib", *SHORT, "seed=0,-1,1"]
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+
+    result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+
+    assert (result.returncode, result.stderr) == (1, "")
+    assert result.stdout.splitlines()[:2] == [
+        "sweep of 3 cells: 2 done, 1 failed, 0 in use, 0 missing",
+        "  failed   seed=-1  ValueError: seed must be an integer in [0, 2**63), got -1",
+    ]
+    assert len(list(tmp_path.glob("runs/*/*/agent.pt"))) == 2
+
+
+@pytest.mark.parametrize(("num_threads", "n_jobs", "expected"), [(1, -1, 8), (3, -1, 2), (16, -1, 1), (3, 5, 5)])
+def test_processes_and_threads_together_use_no_more_than_the_cores(num_threads, n_jobs, expected, monkeypatch):
+    launcher = {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher", "n_jobs": n_jobs}
+    cfg = OmegaConf.create({"num_threads": num_threads, "hydra": {"launcher": launcher}})
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda *_, **__: None)
+
+    sweeper = plugin("hydra_plugins.ctgraph_rl_sweeper.CellSweeper")(None, None, False)
+
+    sweeper.setup(hydra_context=None, task_function=None, config=cfg)
+
+    assert cfg.hydra.launcher.n_jobs == expected
+
+
+def test_a_launcher_that_is_not_installed_names_the_extra():
+    error = MissingConfigException("Could not find it", missing_cfg_file="hydra/launcher/submitit_slurm")
+
+    assert explain(error) == "this launcher is another package: pip install 'ctgraph_rl[slurm]'"
+
+
+def test_a_failed_job_says_why_and_hydra_prints_nothing(capsys):
+    job = JobReturn(status=JobStatus.FAILED)
+    job.return_value = RuntimeError("ValueError: no")
+
+    assert why(job) == "ValueError: no"
+    assert capsys.readouterr() == ("", "")
+
+
+def test_where_a_cell_stands_is_read_from_its_directory(tmp_path):
+    found = [standing(tmp_path / "none")]
+    (tmp_path / "run.jsonl").touch()
+    found.append(standing(tmp_path))
+    (tmp_path / "failed.txt").write_text("ValueError: no\n")
+    found.append(standing(tmp_path))
+    with locked(tmp_path):
+        found.append(standing(tmp_path))
+    (tmp_path / "metrics.json").touch()
+    found.append(standing(tmp_path))
+
+    assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
+    assert [reason for _, reason in found[:3]] == ["not begun", "stopped; the next start goes on", "ValueError: no\n"]
+    later = (tmp_path / "metrics.json").stat().st_mtime + 1
+    assert standing(tmp_path, since=later).state == "missing"
+
+
+def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    texts = [f"process {gone.pid} on {host} since now" for host in (socket.gethostname(), "elsewhere")] + [""]
+
+    found = []
+    for text in texts:
+        (tmp_path / ".lock").write_text(text)
+        found.append(lock_holder(tmp_path))
+
+    assert found == [None, texts[1], "another process"]
+
+
+def test_a_report_names_the_first_cells_that_are_not_done():
+    cells = {f"seed={seed}": Standing("missing", "not\nbegun") for seed in range(SHOWN + 5)}
+
+    lines = report({"seed=-1": Standing("done"), **cells}).splitlines()
+
+    assert lines[0] == f"sweep of {SHOWN + 6} cells: 1 done, 0 failed, 0 in use, {SHOWN + 5} missing"
+    assert lines[1] == "  missing  seed=0  not begun"
+    assert lines[SHOWN + 1] == "  and 5 more" and len(lines) == SHOWN + 3
+
+
+def test_cells_are_named_by_what_differs():
+    assert shortened([("a=1", "b=1"), ("a=1", "b=2")]) == ["b=1", "b=2"]
+    assert shortened([("a=1", "b=1")]) == ["a=1 b=1"]
+
+
+def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
+    cells = [tmp_path / str(number) for number in range(300)]
+    for cell in cells[:10]:
+        cell.mkdir()
+        (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).touch()
+    progress = SweepProgress(cells, console=Console(file=io.StringIO()))
+
+    done, failed, running = progress.look()
+
+    assert (done, failed, running) == (9, 1, 0)
+    line = progress.describe(done, failed, running, ended=5, seconds=600)
+    assert line == "9/300 cells done  1 failed  0 running  0.5/min  9:40:00 left"
+    assert progress.describe(9, 1, 0, ended=0, seconds=1).endswith("? left")
+
+
+def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr("ctgraph_rl.runs.sweep.SECONDS_BETWEEN_LINES", 0.0)
+
+    (tmp_path / "metrics.json").touch()  # done before, so it tells nothing of the rate
+
+    with SweepProgress([tmp_path, tmp_path / "b"], console=Console(file=shown)) as progress:
+        progress._stop.wait(1.5)
+
+    assert shown.getvalue() == "1/2 cells done  0 failed  0 running  0/min  ? left\n"
+
+
+def test_the_search_of_the_page_finds_the_best_trial_and_goes_on(checkout, console_script, tmp_path):
+    pytest.importorskip("optuna")
+    code = (checkout / "docs" / "sweeps.md").read_text().split("<!-- search -->\n```python\n")[1].split("```")[0]
+    short = ", ".join(f'"{setting}"' for setting in SHORT)
+    for old, new in {"30, 3": "1, 1", '"curriculum=su_b1_4tasks"': short}.items():
+        assert old in code
+        code = code.replace(old, new)
+
+    shown = []
+    for text in (code, code, code.replace("1, 1", "2, 1")):
+        result = subprocess.run([sys.executable, "-c", text], cwd=tmp_path, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+        shown.append(result.stdout)
+
+    best = [text.splitlines()[-1] for text in shown]
+    assert best[0] == best[1] and best[0].startswith("trial 0 is best, 0.")
+    assert [text.count("sweep of 1 cells: 1 done") for text in shown] == [1, 0, 1]
+    assert len(list(tmp_path.glob("search/1/*/*/metrics.json"))) == 1
