@@ -6,6 +6,7 @@ Soltoggio et al. 2023 (arXiv 2302.10887), sections 2 and 3, with the misprints t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
@@ -67,7 +68,7 @@ class CTGraph:
     @property
     def num_decision_states(self) -> int:
         """1 + b + ... + b^(d-1) decision states."""
-        return (self.num_end_states - 1) // (self.branching_factor - 1)
+        return self.first_node(self.depth)
 
     @property
     def num_wait_states(self) -> int:
@@ -78,6 +79,40 @@ class CTGraph:
     def num_states(self) -> int:
         """|S|, home and fail included."""
         return self.num_wait_states + self.num_decision_states + self.num_end_states + 2
+
+    def first_node(self, level: int) -> int:
+        """Return the first node after ``level`` decisions, (b^level - 1) / (b - 1); nodes are heap indices."""
+        return (self.branching_factor**level - 1) // (self.branching_factor - 1)
+
+    def parent(self, node: int) -> int:
+        """Return the node that ``node``, any but the root 0, is a branch of."""
+        return (node - 1) // self.branching_factor
+
+    def decision(self, node: int) -> int:
+        """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
+        return (node - 1) % self.branching_factor + 1
+
+    def nodes_to(self, node: int) -> tuple[int, ...]:
+        """Return the nodes from the root 0 to ``node``, both included."""
+        nodes = [node]
+        while nodes[-1] > 0:
+            nodes.append(self.parent(nodes[-1]))
+        return tuple(reversed(nodes))
+
+    def path(self, node: int) -> tuple[int, ...]:
+        """Return the decisions, in 1..b, that lead from the root to ``node``: its goal, if it is an end state."""
+        return tuple(map(self.decision, self.nodes_to(node)[1:]))
+
+    def node_at(self, path: Iterable[int]) -> int:
+        """Return the node that the decisions of ``path`` lead to from the root."""
+        node = 0
+        for decision in path:
+            node = self.branching_factor * node + decision
+        return node
+
+    def leaf_of(self, goal: Iterable[int]) -> int:
+        """Return the number of the end state that d decisions lead to: its base-b digits are the decisions less 1."""
+        return self.node_at(goal) - self.num_decision_states
 
     @property
     def _exact_reward_prob_random(self) -> Fraction:

@@ -183,10 +183,7 @@ class Task:
     @property
     def goal_leaf(self) -> int:
         """Number of the end state with the goal: its base-b digits are the decisions, the first one leading."""
-        leaf = 0
-        for decision in self.goal:
-            leaf = leaf * self.graph.branching_factor + decision - 1
-        return leaf
+        return self.graph.leaf_of(self.goal)
 
     def optimal_value(self, gamma: float) -> float:
         """The best expected discounted return from the home state; see `values.optimal_value`."""

@@ -87,3 +87,23 @@ def test_a_graph_is_frozen_and_equal_and_hashable_by_value():
 
     assert {graph, CTGraph(2, 3, 0), CTGraph(2, 3, 0.0), CTGraph(3, 3)} == {CTGraph(2, 3), CTGraph(3, 3)}
     assert isinstance(CTGraph(2, 3, 0).wait_prob, float)
+
+
+def test_paths_and_nodes_follow_the_heap_whose_branch_a_of_node_n_is_b_n_plus_a():
+    graph = CTGraph(3, 3)
+    end = 3 * (3 * 2 + 1) + 3
+
+    assert graph.path(end) == (2, 1, 3) and graph.node_at((2, 1, 3)) == end
+    assert graph.nodes_to(end) == (0, 2, 7, end)
+    assert [graph.parent(node) for node in (end, 7, 2)] == [7, 2, 0]
+    assert [graph.decision(node) for node in (2, 7, end)] == [2, 1, 3]
+    assert [graph.first_node(level) for level in range(4)] == [0, 1, 4, graph.num_decision_states]
+    assert (graph.path(0), graph.nodes_to(0)) == ((), (0,))
+
+
+def test_the_leaf_of_a_goal_has_its_decisions_as_digits():
+    graph = CTGraph(3, 3)
+
+    assert graph.leaf_of((1, 1, 1)) == 0
+    assert graph.leaf_of((2, 1, 3)) == 1 * 9 + 0 * 3 + 2
+    assert graph.leaf_of((3, 3, 3)) == graph.num_end_states - 1
