@@ -116,9 +116,7 @@ def graph_goals(environment: dict[str, Any]) -> int:
 
 def _task(environment: dict[str, Any], leaf: int) -> Task:
     graph = environment["graph"]
-    b = graph.branching_factor
-    goal = tuple(leaf // b**place % b + 1 for place in reversed(range(graph.depth)))
-    return Task(**{**environment, "goal": goal})
+    return Task(**{**environment, "goal": graph.path(graph.num_decision_states + leaf)})
 
 
 def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:

@@ -96,10 +96,11 @@ class Observations:
         """Whether any kind of state shows an id drawn from several."""
         return any(not self.is_unique(kind) and self.ids(kind)[0] < self.ids(kind)[1] for kind in StateType)
 
-    def first_of_level(self, level: int, branching_factor: int) -> int:
-        """What a level of the tree adds to the unique ids of its states: the ids before it, or the legacy number."""
-        before = branching_factor**level - 1
-        return before if self.legacy_index else before // (branching_factor - 1)
+    def first_of_level(self, graph: CTGraph, kind: StateType, level: int) -> int:
+        """Return how many unique ids of a kind precede those of a level of the tree, or the legacy number instead."""
+        if self.legacy_index:
+            return graph.branching_factor**level - 1
+        return 0 if kind == StateType.END else graph.first_node(level)
 
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
         """What must hold on a graph: unique ids need as many ids as there are states."""

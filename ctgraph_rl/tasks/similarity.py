@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ctgraph_rl.batch.params import bank_bytes
 from ctgraph_rl.checks import fraction, require, require_all
-from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet
 from ctgraph_rl.tasks.task import Task
@@ -121,8 +121,7 @@ def graph_containment(tasks: Sequence[Task]) -> Tensor:
 
     def share(one: Task, other: Task) -> float:
         smaller = min(task.graph.num_decision_states for task in (one, other))
-        b, d = _common(one, other)
-        return (b**d - 1) // (b - 1) / smaller
+        return _common(one, other).num_decision_states / smaller
 
     return _matrix(_tasks(tasks), share)
 
@@ -193,10 +192,10 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
     return matrix
 
 
-def _common(one: Task, other: Task) -> tuple[int, int]:
-    """Branching factor and depth of the common tree."""
+def _common(one: Task, other: Task) -> CTGraph:
+    """Return the common tree."""
     graphs = (one.graph, other.graph)
-    return min(graph.branching_factor for graph in graphs), min(graph.depth for graph in graphs)
+    return CTGraph(min(graph.branching_factor for graph in graphs), min(graph.depth for graph in graphs))
 
 
 @dataclass(frozen=True)
@@ -213,10 +212,9 @@ class _Choices:
     @cached_property
     def goal_nodes(self) -> list[int]:
         """Number of the goal's node within each level."""
-        b, nodes = self.task.graph.branching_factor, [0]
-        for decision in self.task.goal:
-            nodes.append(nodes[-1] * b + decision - 1)
-        return nodes
+        graph = self.task.graph
+        nodes = graph.nodes_to(graph.node_at(self.task.goal))
+        return [node - graph.first_node(level) for level, node in enumerate(nodes)]
 
     def of_path(self, kind: StateType, path: tuple[int, ...]) -> int:
         """The set at a node of a collapsed tree by the decisions that lead to it."""
@@ -276,11 +274,11 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
 
 def _equal_share(one: _Choices, other: _Choices) -> float:
     """Share of the states of the common tree with equal sets."""
-    b, d = _common(one.task, other.task)
+    tree = _common(one.task, other.task)
+    b, d = tree.branching_factor, tree.depth
     count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
     equal = sum(count(one, other, kind, level, b) for kind in CHOOSING for level in range(d + (kind == StateType.WAIT)))
-    decisions = (b**d - 1) // (b - 1)
-    return equal / (2 * decisions + b**d)
+    return equal / (tree.num_decision_states + tree.num_wait_states)
 
 
 def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
@@ -356,8 +354,7 @@ def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
     states, limit = graph.num_states, MAX_ENUMERATED_STATES
     require((states <= limit, f"unique ids on this graph need a visit to each of its {states} states, limit {limit}"))
     first, last = x.ids(kind)
-    before = 0 if kind == StateType.END and not x.legacy_index else x.first_of_level(level, graph.branching_factor)
-    size = last - first + 1
+    before, size = x.first_of_level(graph, kind, level), last - first + 1
     return [first + (before + node) % size for node in range(graph.branching_factor**level)]
 
 

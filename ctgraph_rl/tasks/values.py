@@ -230,7 +230,7 @@ class _Memoryless:
         b, (first, last) = self.task.graph.branching_factor, self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
             return self.policy[first : last + 1].mean(0, keepdim=True)
-        number = self.task.observations.first_of_level(level, b) + torch.arange(b**level)
+        number = self.task.observations.first_of_level(self.task.graph, kind, level) + torch.arange(b**level)
         return self.policy[first + number % (last - first + 1)]
 
 

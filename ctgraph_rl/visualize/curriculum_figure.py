@@ -14,7 +14,7 @@ from typing import Any
 from ctgraph_rl.batch.render import GOAL, PALETTE
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.visualize.layout import MOST_WAYS, Layout, Way, end_of, in_digits, lay_out, parent, way_to
+from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
@@ -31,6 +31,7 @@ MARKERS = {
 }
 """Pentagon, circle, diamond, square and octagon."""
 
+Goal = tuple[int, ...]
 Point = tuple[float, float]
 
 
@@ -111,25 +112,25 @@ def shape_of(graph: CTGraph) -> str:
     return f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
 
 
-def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Way, str]]:
+def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     """For each graph its goals, each with a label of its decisions and the blocks that train it."""
-    blocks: dict[CTGraph, dict[Way, list[int]]] = {}
+    blocks: dict[CTGraph, dict[Goal, list[int]]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(block.tasks):
             blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
     return {graph: {goal: _label(goal, of) for goal, of in goals.items()} for graph, goals in blocks.items()}
 
 
-def _label(goal: Way, blocks: Sequence[int]) -> str:
+def _label(goal: Goal, blocks: Sequence[int]) -> str:
     numbers = sorted(set(blocks))
     where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
     where = f"block {numbers[0]}" if len(numbers) == 1 else where
     return f"{in_digits(goal)}\n{where}"
 
 
-def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Way, str]) -> None:
-    labels = {end_of(graph, goal): label for goal, label in goals.items()}
-    layout = lay_out(graph, list(labels)[:MOST_WAYS])
+def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
+    labels = {graph.node_at(goal): label for goal, label in goals.items()}
+    layout = lay_out(graph, list(labels)[:MOST_PATHS])
     shown = [end for end in layout.leaves if end in labels]
     places = {node: (x, -float(layout.level[node])) for node, x in layout.x.items()}
     level = len(layout.leaves) <= MOST_LEVEL
@@ -155,12 +156,13 @@ def _room(depth: int, level: bool) -> float:
 
 
 def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
-    """The ways to goals are thick and black."""
-    graph, ways = layout.graph, {node for goal in goals for node in way_to(layout.graph, goal)}
-    lines = {node: [places[parent(graph, node)], places[node]] for node in places if node}
-    plain = [line for node, line in lines.items() if node not in ways]
+    """Draw the edges; the paths to goals are thick and black."""
+    graph = layout.graph
+    on_path = {node for goal in goals for node in graph.nodes_to(goal)}
+    lines = {node: [places[graph.parent(node)], places[node]] for node in places if node}
+    plain = [line for node, line in lines.items() if node not in on_path]
     draw_lines(axes, [*plain, *stub_lines(layout, places, 0.45)], colors="0.6", linewidths=0.8)
-    draw_lines(axes, [line for node, line in lines.items() if node in ways], linewidths=1.6)
+    draw_lines(axes, [line for node, line in lines.items() if node in on_path], linewidths=1.6)
 
 
 def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:

@@ -37,7 +37,7 @@ SHAPES: Mapping[StateType, str] = {
 def to_dot(task: Task, name: str = "") -> str:
     """All states with the ids they show, and all transitions with their actions; the goal has two lines around it.
 
-    Of a tree with more than 1,024 end states the way to the goal is written, with one node for the branches left out
+    Of a tree with more than 1,024 end states the path to the goal is written, with one node for the branches left out
     of each decision state.
 
     Args:
@@ -48,7 +48,7 @@ def to_dot(task: Task, name: str = "") -> str:
 
 
 def _statements(task: Task, name: str) -> Iterator[str]:
-    goal = task.graph.num_decision_states + task.goal_leaf
+    goal = task.graph.node_at(task.goal)
     layout = lay_out(task.graph, [goal], MOST_LEAVES)
     b, p = task.graph.branching_factor, task.graph.wait_prob
     yield _attributes("graph", label=name, labelloc="t")

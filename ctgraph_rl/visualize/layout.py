@@ -1,28 +1,25 @@
-"""Where the nodes of a tree stand in a picture: leaves side by side, every other in the middle of what is below it.
+"""The layout of a tree in a figure: leaves side by side, every other node in the middle of what is below it.
 
-A tree with few end states is laid out whole, a larger one as the ways to some of them. Nodes are heap indices: branch a
-of node n is b * n + a, and the root is 0. Time and memory grow with the nodes laid out, not with the tree. The pixels
+A tree with few end states is laid out whole, a larger one as the paths to some of them. Nodes are heap indices: branch
+a of node n is b * n + a, and the root is 0. Time and memory grow with the nodes laid out, not with the tree. The pixels
 of `ctgraph_rl.batch.render` have a rasteriser and places of their own, for the speed of whole batches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ctgraph_rl.core.graph import CTGraph
 
 MOST_LEAVES = 32
 """End states up to which a tree is drawn whole."""
-MOST_WAYS = 8
+MOST_PATHS = 8
 """End states that are drawn of a larger tree."""
 MOST_STUBS = 3
 """Branches left out that are hinted at on each side of those drawn."""
 MOST_DIGITS = 14
-"""Characters up to which the decisions on a way are written out."""
-
-Way = tuple[int, ...]
-"""Decisions in 1..b, as a goal."""
+"""Characters up to which the decisions of a path are written out."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +67,12 @@ class Layout:
         branches: dict[int, list[int]] = {}
         for node in self.x:
             if node:
-                branches.setdefault(parent(self.graph, node), []).append(decision_to(self.graph, node))
+                branches.setdefault(self.graph.parent(node), []).append(self.graph.decision(node))
         return branches
 
 
 def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES) -> Layout:
-    """Place the whole tree, or the ways to some of its end states where it has more than ``most_leaves``.
+    """Place the whole tree, or the paths to some of its end states where it has more than ``most_leaves``.
 
     Args:
         graph: the tree.
@@ -89,39 +86,13 @@ def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES)
     for depth in reversed(range(graph.depth)):
         row: dict[int, list[float]] = {}
         for node, place in below.items():
-            row.setdefault(parent(graph, node), []).append(place)
+            row.setdefault(graph.parent(node), []).append(place)
         below = {node: (places[0] + places[-1]) / 2 for node, places in row.items()}
         x, level = below | x, dict.fromkeys(below, depth) | level
     return Layout(graph, x, level)
 
 
-def parent(graph: CTGraph, node: int) -> int:
-    """The node that a node other than the root is a branch of."""
-    return (node - 1) // graph.branching_factor
-
-
-def decision_to(graph: CTGraph, node: int) -> int:
-    """The decision that leads to a node other than the root, in 1..b."""
-    return (node - 1) % graph.branching_factor + 1
-
-
-def way_to(graph: CTGraph, node: int) -> list[int]:
-    """The nodes from the root to a node."""
-    way = [node]
-    while way[-1] > 0:
-        way.append(parent(graph, way[-1]))
-    return way[::-1]
-
-
-def end_of(graph: CTGraph, way: Way) -> int:
-    """The node that decisions lead to from the root."""
-    node = 0
-    for decision in way:
-        node = graph.branching_factor * node + decision
-    return node
-
-
-def in_digits(way: Way, sign: str = "") -> str:
-    """Decisions in short, as ``121``, or with a sign between them; a dot where one has two digits."""
-    text = (sign if max(way) < 10 else ".").join(map(str, way))
+def in_digits(decisions: Sequence[int], sign: str = "") -> str:
+    """Write decisions in short, as ``121``, or with a sign between them; a dot where one has two digits."""
+    text = (sign if max(decisions) < 10 else ".").join(map(str, decisions))
     return text if len(text) <= MOST_DIGITS else f"{text[: MOST_DIGITS // 2]}...{text[-MOST_DIGITS // 2 :]}"

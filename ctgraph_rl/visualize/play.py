@@ -26,7 +26,7 @@ from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_E
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.visualize.arguments import Choice, add_arguments, choose
-from ctgraph_rl.visualize.layout import decision_to, lay_out, parent
+from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.states import kind_of
 
@@ -128,7 +128,7 @@ class Game:
 
 
 def truth(graph: CTGraph, kind: StateType, place: int, goal_leaf: int) -> Tree:
-    """A tree as text, with the goal and a place in it; of a large one the ways to both.
+    """A tree as text, with the goal and a place in it; of a large one the paths to both.
 
     Args:
         graph: the tree.
@@ -143,10 +143,10 @@ def truth(graph: CTGraph, kind: StateType, place: int, goal_leaf: int) -> Tree:
     root = Tree(Text("home" + (_here(kind) if kind == StateType.HOME else "")))
     drawn: dict[int, Tree] = {}
     for node in layout.x:
-        label = f"{decision_to(graph, node)}: " if node else ""
+        label = f"{graph.decision(node)}: " if node else ""
         label += f"{kind_of(layout, node).name.lower()} state" + (", the goal" if node == goal else "")
         at_node = node == place and kind != StateType.HOME
-        above = drawn[parent(graph, node)] if node else root
+        above = drawn[graph.parent(node)] if node else root
         drawn[node] = above.add(Text(label + (_here(kind) if at_node else "")))
     for node, left_out in layout.left_out.items():
         drawn[node].add(f"{left_out:,} more branches")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.layout import Layout, decision_to, parent
+from ctgraph_rl.visualize.layout import Layout
 
 HOME, WAIT, DECISION, END, FAIL = StateType
 
@@ -49,8 +49,8 @@ def edges(layout: Layout, waits: bool = True) -> Iterator[Edge]:
     """All transitions between them; without wait states, to what these lead to."""
     for node in layout.x:
         here = kind_of(layout, node), node
-        above = (DECISION, parent(layout.graph, node)) if node else HOME_KEY
-        action = decision_to(layout.graph, node) if node else None
+        above = (DECISION, layout.graph.parent(node)) if node else HOME_KEY
+        action = layout.graph.decision(node) if node else None
         yield Edge(above, (WAIT, node) if waits else here, action)
         if waits:
             yield Edge((WAIT, node), here, WAIT_ACTION)
@@ -64,12 +64,12 @@ def ids_at(task: Task, state: Key, level: int) -> tuple[int, int]:
         state: a state of its graph.
         level: the decisions taken before it.
     """
-    (kind, node), x, b = state, task.observations, task.graph.branching_factor
+    (kind, node), x, graph = state, task.observations, task.graph
     first, last = x.ids(kind)
     if not x.is_unique(kind):
         return first, last
-    before = 0 if kind == END and not x.legacy_index else x.first_of_level(level, b)
-    number = first + (before + node - (b**level - 1) // (b - 1)) % (last - first + 1)
+    within_level = node - graph.first_node(level)
+    number = first + (x.first_of_level(graph, kind, level) + within_level) % (last - first + 1)
     return number, number
 
 

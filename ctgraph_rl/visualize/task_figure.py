@@ -24,7 +24,7 @@ from ctgraph_rl.visualize.curriculum_figure import (
     shape_of,
     stub_lines,
 )
-from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_WAYS, decision_to, in_digits, lay_out, way_to
+from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_PATHS, in_digits, lay_out
 from ctgraph_rl.visualize.states import (
     DECISION,
     END,
@@ -61,7 +61,7 @@ RING: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markeredgecol
 def task_figure(task: Task, **overlays: Any) -> Any:
     """A figure of its own, of a size that fits, for `draw_task` with the same arguments."""
     graph = task.graph
-    side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_WAYS
+    side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_PATHS
     beside = 0.9 if overlays.get("policy") or overlays.get("values") else 0.65
     width = min(max(5.5, beside * side_by_side), 14.0)
     figure = new_figure(width, 1.2 + 0.75 * min(2 * graph.depth + 2, 9))
@@ -82,7 +82,7 @@ def draw_task(
 
     Wait states that may be stayed in have a loop, and dashed arrows are the actions that fail. In the nodes stand the
     ids of their observations, the first and the last where one is drawn each time. Of a tree with more than 32 end
-    states the way to the goal is drawn, and those to the end states visited most.
+    states the path to the goal is drawn, and those to the end states visited most.
 
     States are keys (state type, node), as ``env.state_type`` and ``env.node`` give them; home and fail have node 0.
     What is not in a mapping is not drawn.
@@ -106,7 +106,7 @@ class _TaskPicture:
 
     def __init__(self, axes: Any, task: Task, visits: Counts, policy: PerAction, values: PerAction, ids: bool) -> None:
         self.axes, self.task, self.visits, self.ids = axes, task, visits, ids
-        self.graph, self.goal = task.graph, task.graph.num_decision_states + task.goal_leaf
+        self.graph, self.goal = task.graph, task.graph.node_at(task.goal)
         self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
         self.values = {key: [float(value) for value in of] for key, of in values.items()}
         self.layout = lay_out(self.graph, [self.goal, *self._most_visited()])
@@ -117,7 +117,7 @@ class _TaskPicture:
 
     def _most_visited(self) -> list[int]:
         counts = {node: count for (kind, node), count in self.visits.items() if kind == END and node != self.goal}
-        return sorted(counts, key=lambda node: -counts[node])[: MOST_WAYS - 1]
+        return sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
 
     def _place(self, state: Key) -> Point:
         """x in (0, 1), y a row of states below 0."""
@@ -182,13 +182,13 @@ class _TaskPicture:
                 self._write_at_edge(edge, line)
 
     def _is_strong(self, edge: Edge) -> bool:
-        """Black: the likeliest action, else what was visited, else the way to the goal."""
+        """Black: the likeliest action, else what was visited, else the path to the goal."""
         chances = self.policy.get(edge.start)
         if chances is not None and edge.action is not None:
             return chances[edge.action] == max(chances)
         if self.visits or self.policy:
             return bool(self.visits.get(edge.end, 0))
-        return edge.end[1] in way_to(self.graph, self.goal)
+        return edge.end[1] in self.graph.nodes_to(self.goal)
 
     def _width(self, edge: Edge) -> float:
         if self.visits:
@@ -242,9 +242,8 @@ class _TaskPicture:
         style = {"transform": self._moved(y=drop), "zorder": 3, "clip_on": False}
         self.axes.plot(*self.places[END, self.goal], **style, **goal_mark(size))
         for end in () if self.layout.is_whole else self.layout.leaves:
-            way = tuple(decision_to(self.graph, node) for node in way_to(self.graph, end)[1:])
             under = 0, drop - 0.6 * size
-            self._note(in_digits(way), self.places[END, end], under, fontsize=6, ha="center", va="top")
+            self._note(in_digits(self.graph.path(end)), self.places[END, end], under, fontsize=6, ha="center", va="top")
 
     def _draw_loops(self) -> None:
         """A ring at each wait state where waiting may stay there."""

@@ -10,7 +10,7 @@ from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, make_task
 from ctgraph_rl.visualize.dot import to_dot
-from ctgraph_rl.visualize.layout import decision_to, end_of, in_digits, lay_out, parent, way_to
+from ctgraph_rl.visualize.layout import in_digits, lay_out
 from ctgraph_rl.visualize.states import Edge, edges, ids_at, ids_text, states
 
 HOME, WAIT, DECISION, END, FAIL = StateType
@@ -26,38 +26,29 @@ def test_a_small_tree_is_laid_out_whole_with_parents_in_the_middle():
     assert (layout.stubs, layout.left_out) == ([], {})
 
 
-def test_of_a_large_tree_only_the_ways_asked_for_are_laid_out():
+def test_of_a_large_tree_only_the_paths_asked_for_are_laid_out():
     graph = CTGraph(5, 6)
-    first, last = end_of(graph, (1,) * 6), end_of(graph, (1, 5, 5, 5, 5, 5))
+    first, last = graph.node_at((1,) * 6), graph.node_at((1, 5, 5, 5, 5, 5))
 
     layout = lay_out(graph, [last, first, first])
 
     assert not layout.is_whole
     assert layout.leaves == [first, last]
-    assert set(layout.x) == {*way_to(graph, first), *way_to(graph, last)}
+    assert set(layout.x) == {*graph.nodes_to(first), *graph.nodes_to(last)}
     assert (layout.x[first], layout.x[last]) == (0.25, 0.75)
     assert layout.left_out[0] == 4 and layout.left_out[1] == 3
     assert [side for node, side in layout.stubs if node == 0] == [1, 2, 3]  # at most three of the four on a side
-    assert [side for node, side in layout.stubs if node == parent(graph, last)] == [-1, -2, -3]
+    assert [side for node, side in layout.stubs if node == graph.parent(last)] == [-1, -2, -3]
 
 
 def test_the_time_to_lay_out_does_not_grow_with_the_tree():
     graph = CTGraph(10**9, 2)
-    end = end_of(graph, (10**9, 5))
+    end = graph.node_at((10**9, 5))
 
     layout = lay_out(graph, [end])
 
     assert list(layout.x) == [0, 10**9, end]
     assert layout.left_out == {0: 10**9 - 1, 10**9: 10**9 - 1}
-
-
-def test_ways_and_decisions_follow_the_heap():
-    graph = CTGraph(3, 3)
-    end = end_of(graph, (2, 1, 3))
-
-    assert end == 3 * (3 * 2 + 1) + 3
-    assert [decision_to(graph, node) for node in way_to(graph, end)[1:]] == [2, 1, 3]
-    assert end - graph.num_decision_states == replace(make_task(branching_factor=3, depth=3), goal=(2, 1, 3)).goal_leaf
 
 
 @pytest.mark.parametrize(
