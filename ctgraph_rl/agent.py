@@ -1,4 +1,4 @@
-"""The Agent protocol: what `learn_curriculum` asks of a learner; and what a run asks of a method that it wears."""
+"""The Agent protocol: what `learn_curriculum` asks of a learner; and what a run asks of a lifelong-learning method."""
 
 from __future__ import annotations
 
@@ -89,17 +89,21 @@ class Method(Protocol):
     """A lifelong-learning method: it changes how an agent learns. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
-        """What is learned in place of a curriculum: mostly the same.
+        """Return the curriculum to learn in place of the given one, mostly the same.
 
         Raises:
-            ValueError: if the curriculum does not tell what the method needs to know.
+            ValueError: if the curriculum's protocol hides what the method needs.
         """
         ...
 
-    def worn_by(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """A new agent with the method, for what `prepare` gave.
+    def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
+        """Return the agent with this method attached.
+
+        Args:
+            agent: a new agent, which is part of what is returned.
+            curriculum: what `prepare` returned.
 
         Raises:
-            ValueError: if the two cannot go together.
+            ValueError: if agent and method do not fit together.
         """
         ...

@@ -265,7 +265,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
 
     from ctgraph_rl.runs.checkpoints import Checkpoints
     from ctgraph_rl.runs.experts import expert_curriculum
-    from ctgraph_rl.runs.train import new_agent, remove_results, train, wearing
+    from ctgraph_rl.runs.train import new_agent, remove_results, train, with_method
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     device = checked_device(cfg.device)
@@ -277,7 +277,7 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
     make_alone = target(cfg, "agent")
 
-    make_agent = wearing(make_alone, make_method, curriculum)
+    make_agent = with_method(make_alone, make_method, curriculum)
     new_agent(curriculum, make_agent, cfg.seed)
     for task in curriculum.tasks if cfg.experts else ():
         new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)

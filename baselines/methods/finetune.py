@@ -12,6 +12,6 @@ class Finetune(Method):
 
     needs_boundaries = False
 
-    def worn_by(self, agent: Agent, curriculum: Curriculum) -> Agent:
+    def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
         """The agent itself."""
         return agent

@@ -67,7 +67,7 @@ class Method(nn.Module):
         )
         return curriculum
 
-    def worn_by(self, agent: Agent, curriculum: Curriculum) -> Agent:
+    def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
         """An agent with this method for a curriculum.
 
         Raises:

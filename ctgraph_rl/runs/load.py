@@ -21,7 +21,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.checkpoints import Checkpoints, read_plain
-from ctgraph_rl.runs.train import MakeAgent, new_agent, wearing
+from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
 
@@ -65,7 +65,7 @@ def load(
             class is not one of the baselines, such as ``partial(MyAgent, **settings)``.
         curriculum: what was learned; needed where it has parts of classes that are not this package's.
         device: where the agent shall live.
-        make_method: builds the method that the agent wears; needed where its class is not one of the baselines'.
+        make_method: builds the agent's method; needed where its class is not one of the baselines'.
 
     Raises:
         FileNotFoundError: if there is no run, or none that has been saved.
@@ -116,7 +116,7 @@ def _builder(
         make_method = _ours(run_dir, "method", config["method"])
     if make_method is None:
         return alone
-    return wearing(alone, make_method, curriculum)
+    return with_method(alone, make_method, curriculum)
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:

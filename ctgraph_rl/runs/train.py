@@ -73,9 +73,9 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     return agent
 
 
-def wearing(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
-    """Builds agents, each with a new method for a curriculum."""
-    return lambda observation_spec, action_spec: make_method().worn_by(
+def with_method(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
+    """Return a function that builds an agent and attaches a new method to it."""
+    return lambda observation_spec, action_spec: make_method().attach(
         make_agent(observation_spec, action_spec), curriculum
     )
 

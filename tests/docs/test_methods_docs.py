@@ -100,7 +100,7 @@ def test_a_method_stores_the_bytes_that_the_page_says(compose, name):
     cfg = compose("curriculum=ct8", "agent=a2c", f"method={name}", *single)
     make_method = target(cfg, "method")
     curriculum = make_method().prepare(target(cfg, "curriculum")())
-    agent = new_agent(curriculum, lambda *specs: make_method().worn_by(target(cfg, "agent")(*specs), curriculum), 0)
+    agent = new_agent(curriculum, lambda *specs: make_method().attach(target(cfg, "agent")(*specs), curriculum), 0)
 
     method = agent.agent.method
     stored = sum(each.numel() * each.element_size() for each in (*method.buffers(), *method.parameters()))
@@ -114,7 +114,7 @@ def test_the_page_has_every_hook():
     hooks = {name for name, value in vars(Method).items() if isfunction(value) and not name.startswith("_")}
 
     assert {"prepare", "loss", "settle"} <= hooks
-    assert [hook for hook in hooks - {"worn_by"} if f"`{hook}(" not in TEXT] == []
+    assert [hook for hook in hooks - {"attach"} if f"`{hook}(" not in TEXT] == []
 
 
 def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(tmp_path):

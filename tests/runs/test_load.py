@@ -126,7 +126,7 @@ def learn_with(method: dict, run_dir: Path):
     made = []
 
     def make_worn(*specs):
-        made.append(instantiate(method).worn_by(make_agent(*specs), told))
+        made.append(instantiate(method).attach(make_agent(*specs), told))
         return made[-1]
 
     train(told, make_worn, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})

@@ -91,7 +91,7 @@ def life(compose, agent: str, method: str, *overrides: str, curriculum: Curricul
     make_alone = made(compose, "agent", agent, *SMALL, *AGENTS[agent])
     make_method = made(compose, "method", method, *METHODS[method], *overrides)
     prepared = make_method().prepare(curriculum)
-    return Life(prepared, lambda *specs: make_method().worn_by(make_alone(*specs), prepared))
+    return Life(prepared, lambda *specs: make_method().attach(make_alone(*specs), prepared))
 
 
 def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
@@ -105,7 +105,7 @@ def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
 def wearing(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> Wearing:
     """A small agent with a method, which is told the ids of tasks that have a block each."""
     curriculum = method.prepare(of(*(Block(task, 160) for task in tasks), task_id="at_boundaries"))
-    return method.worn_by(small(compose, agent, tasks, *overrides), curriculum)
+    return method.attach(small(compose, agent, tasks, *overrides), curriculum)
 
 
 def stay(worn: Wearing, number: int, tasks=TASKS, number_of_batches: int = 2) -> None:
@@ -190,7 +190,7 @@ def test_an_agent_that_is_no_learner_is_refused_before_it_is_touched(compose, me
     with pytest.raises(
         ValueError, match=r" needs an agent that derives from baselines\.learner\.Learner, got Scripted; "
     ):
-        made(compose, "method", method)().worn_by(agent, CURRICULUM)
+        made(compose, "method", method)().attach(agent, CURRICULUM)
 
     assert vars(agent) == before
 
@@ -354,7 +354,7 @@ def test_a_first_block_that_is_no_whole_batch_can_be_learned_with_replayed_rows(
 def test_fine_tuning_is_the_agent_itself(compose, agent):
     alone = new_agent(CURRICULUM, made(compose, "agent", agent, *SMALL, *AGENTS[agent]), 0)
 
-    assert made(compose, "method", "finetune")().worn_by(alone, CURRICULUM) is alone
+    assert made(compose, "method", "finetune")().attach(alone, CURRICULUM) is alone
 
 
 @pytest.mark.parametrize("agent", AGENTS)
@@ -371,4 +371,4 @@ def test_the_hooks_of_no_method_change_no_bit(compose, agent):
 def test_fine_tuning_takes_an_agent_that_is_no_learner(compose):
     agent = Scripted()
 
-    assert made(compose, "method", "finetune")().worn_by(agent, CURRICULUM) is agent
+    assert made(compose, "method", "finetune")().attach(agent, CURRICULUM) is agent
