@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ctgraph_rl.core.rewards import Needle as Needle
     from ctgraph_rl.core.rewards import ReferenceLinear as ReferenceLinear
     from ctgraph_rl.env import CTGraphEnv as CTGraphEnv
-    from ctgraph_rl.learn.lifelong import evaluate as evaluate
+    from ctgraph_rl.learn.evaluate import evaluate as evaluate
     from ctgraph_rl.learn.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log.run_log import RunLog as RunLog
     from ctgraph_rl.runs.load import Trained as Trained
@@ -70,7 +70,7 @@ _HOMES = {
     "Trained": "runs.load",
     "count_repeats": "tasks.images",
     "distances": "tasks.images",
-    "evaluate": "learn.lifelong",
+    "evaluate": "learn.evaluate",
     "learn_curriculum": "learn.lifelong",
     "load": "runs.load",
     "rollout": "batch.rollout",

@@ -1,20 +1,127 @@
-"""One step of all rows as the collecting loop takes it: TorchRL's data in plain tensors."""
+"""Batches of experience: the environment of a curriculum, and a policy that acts in it step after step."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ctgraph_rl.batch.native import is_native
+from ctgraph_rl.checks import at_least_one, is_int, require
 from ctgraph_rl.core.dynamics import NO_LEAF
 from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+"""Reads a TensorDict of all environments, [num_envs], and writes ``action`` into it."""
+
+InitialState = Callable[[int], TensorDict]
+"""Return the initial recurrent state of a number of environments."""
+
+TRIAL = "trial"
+"""A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
 
 Step = dict[Any, Tensor]
 """What was seen, done and written in a step of all rows, and under keys ``("next", key)`` what came after it."""
+
+
+def make_env(
+    curriculum: Curriculum, tasks: Sequence[Task], seed: int, device: torch.device | str = "cpu"
+) -> CTGraphEnv:
+    """An environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
+
+    Held-out tasks have no id, which shows as zeros. The environment is a C kernel where there can be one, with the same
+    bits.
+    """
+    how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    place: dict[str, Any] = {"task_pool": pool, "device": device}
+    place["compiled"] = is_native((task.reward_fn for task in pool), device)
+    if how.task_id != "one_hot":
+        return CTGraphEnv(tasks, seed, **place)
+    length = how.length(len(curriculum.tasks))
+    return CTGraphEnv(tasks, seed, task_ids=curriculum.task_ids, num_task_ids=length, **place)
+
+
+def collect(
+    env: CTGraphEnv,
+    policy: Policy,
+    num_frames: int,
+    num_steps: int,
+    initial_state: InitialState | None = None,
+    between_steps: Callable[[int], object] | None = None,
+) -> Iterator[TensorDictBase]:
+    """Yield batches of [rows, num_steps] in time order, from a reset on; the last one may be shorter.
+
+    Args:
+        env: where to act.
+        policy: writes ``action`` and, if recurrent, its state under ``("next", key)``.
+        num_frames: frames in all, a multiple of the rows.
+        num_steps: steps in a batch.
+        initial_state: gives the recurrent state that the rows start with.
+        between_steps: called before every step with the frames collected so far; after a batch, once it was used.
+
+    Raises:
+        ValueError: for a number of frames that is not a multiple of the rows, and less than one step.
+    """
+    whole = is_int(num_frames, 1) and num_frames % env.numel() == 0
+    require(
+        (whole, f"num_frames must be a multiple of the {env.numel()} rows, got {num_frames!r}"),
+        *at_least_one(num_steps=num_steps),
+    )
+    collected = batches(env, policy, num_frames, num_steps, initial_state, between_steps=between_steps)
+    return (batch for batch, _ in collected)
+
+
+@torch.no_grad()
+def batches(
+    env: CTGraphEnv,
+    policy: Policy,
+    num_frames: int,
+    num_steps: int,
+    initial_state: InitialState | None = None,
+    *,
+    between_steps: Callable[[int], object] | None = None,
+    carried: TensorDictBase | None = None,
+    done: int = 0,
+) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+    """Yield the batches of `collect`, each with the data ``carried`` into the next step.
+
+    With ``carried`` and ``done`` it resumes after ``done`` frames.
+    """
+    start = start_of_episodes(env, initial_state)
+    carried = env.reset().update(start) if carried is None else carried
+    steps: list[Step] = []
+    for frames in range(done, num_frames, env.numel()):
+        if between_steps is not None:
+            between_steps(frames)
+        with set_exploration_type(ExplorationType.RANDOM):
+            step, carried = act(env, policy, carried, start)
+        steps.append(step)
+        if len(steps) == num_steps or frames + env.numel() == num_frames:
+            yield in_time_order(steps, env), carried
+            steps = []
+
+
+def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> TensorDict:
+    """Return the recurrent state that every episode starts with; empty without memory."""
+    return TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
+
+
+def act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict) -> tuple[Step, TensorDictBase]:
+    """Take a step in every row; return it, and the data of the next one, reset where an episode ended."""
+    step, following = take_step(env, policy(carried))
+    lasts = TRIAL in start.keys()  # noqa: SIM118, a TensorDict iterates over rows
+    for key, value in start.items():
+        state = step["next", key]
+        begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
+        following.set(key, state if lasts else torch.where(begins, value, state))
+    return step, following
 
 
 def take_step(env: EnvBase, data: TensorDictBase) -> tuple[Step, TensorDictBase]:

@@ -17,7 +17,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.learn.lifelong import Examiner, Policy, by_slices
+from ctgraph_rl.learn.collect import Policy
+from ctgraph_rl.learn.evaluate import Evaluator, by_slices
 from ctgraph_rl.log.files import CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
@@ -82,7 +83,7 @@ class Recorder:
             path.parent.mkdir(parents=True, exist_ok=True)
         self.log = RunLog(path)
         self.log.append("run", **provenance(curriculum), config={"seed": seed, **(about or {})})
-        self._examiner = Examiner(curriculum, seed, self.log)
+        self._evaluator = Evaluator(curriculum, seed, self.log)
         self._frames, self._trained = -1, 0
 
     @property
@@ -120,7 +121,7 @@ class Recorder:
         require((frames > self._frames, f"frames must grow: {frames} comes after {self._frames}"))
         acts = self._adapted(policy, policy_for, frames)
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
-        self._examiner.evaluate(acts, frames, where)
+        self._evaluator.evaluate(acts, frames, where)
         self._frames = frames
         return {m["label"]: m["return_mean"] for m in _last(self.log.of_kind("evaluation"), frames)}
 
@@ -181,10 +182,10 @@ class Recorder:
         if policy_for is None:
             return adapt(policy, greedy, told == "one_hot")
         require((told != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
-        unknown = [task for task in self._examiner.examined(frames) if task not in ids]
+        unknown = [task for task in self._evaluator.tasks_at(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
         return by_slices(
-            [adapt(policy_for(ids[task]), greedy, told == "one_hot") for task in self._examiner.examined(frames)]
+            [adapt(policy_for(ids[task]), greedy, told == "one_hot") for task in self._evaluator.tasks_at(frames)]
         )
 
 

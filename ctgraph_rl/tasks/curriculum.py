@@ -300,10 +300,13 @@ class Curriculum:
         return "during" if within else None
 
     @property
-    def stretches(self) -> tuple[tuple[Block, ...], ...]:
+    def segments(self) -> tuple[tuple[Block, ...], ...]:
         """The blocks between two announced boundaries: each alone, or all of them where boundaries are hidden."""
         announced = self.protocol.boundaries == "announced"
         return tuple((block,) for block in self.blocks) if announced else (self.blocks,)
+
+    stretches = segments
+    """The former name of `segments`."""
 
     @property
     def task_ids(self) -> dict[Task, int]:

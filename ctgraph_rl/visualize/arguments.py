@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.cli import curriculum_named
-from ctgraph_rl.learn.lifelong import InitialState, Policy
+from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum

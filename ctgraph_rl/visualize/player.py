@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.lifelong import TRIAL, InitialState, Policy, make_env
+from ctgraph_rl.learn.collect import TRIAL, InitialState, Policy, make_env
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
 

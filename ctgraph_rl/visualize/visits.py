@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.lifelong import InitialState, Policy, evaluate
+from ctgraph_rl.learn.collect import InitialState, Policy
+from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -68,10 +69,18 @@ def visits(
             seen.append(torch.stack([*state, acted["action"]], -1)[counted].cpu())
             return acted
 
-    how = (num_episodes, seed, greedy, initial_state, "cpu", episodes_per_row, curriculum)
     bound = isinstance(policy, RandomPolicy)  # to another environment, which evaluate refuses
-    ends = evaluate(policy if bound else Watched, [task], *how)[0]
-    return _count(task, torch.cat(seen), ends)
+    ends = evaluate(
+        policy if bound else Watched,
+        [task],
+        num_episodes,
+        seed=seed,
+        greedy=greedy,
+        episodes_per_row=episodes_per_row,
+        initial_state=initial_state,
+        curriculum=curriculum,
+    )
+    return _count(task, torch.cat(seen), ends[0])
 
 
 def _count(task: Task, steps: Tensor, ends: TensorDictBase) -> Visits:

@@ -55,8 +55,8 @@ def measured(run_dir: Path) -> dict[str, Any]:
         "fingerprint": trained.curriculum.fingerprint,
     }
     for way, greedy in (("greedy", True), ("sampled", False)):
-        state = trained.agent.initial_state
-        ends = evaluate(trained.policy_for(task), [task], EPISODES, SEED, greedy, state, curriculum=trained.curriculum)
+        how = {"seed": SEED, "greedy": greedy, "initial_state": trained.agent.initial_state}
+        ends = evaluate(trained.policy_for(task), [task], EPISODES, **how, curriculum=trained.curriculum)
         line[f"{way}_return"] = round(ends["episode_reward"].double().mean().item(), 6)
         line[f"{way}_success"] = (ends["outcome"] == 3).double().mean().item()
     finished = (run_dir / "metrics.json").exists()

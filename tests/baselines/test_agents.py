@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from baselines.networks import Encoder
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Observations, OneHot, Task, learn_curriculum, run
-from ctgraph_rl.learn.lifelong import collect
+from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.run import conf_dir
 from curricula.paper import ct_su_b1
 

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import set_exploration_type
 
 from ctgraph_rl import Block, Curriculum, learn_curriculum
-from ctgraph_rl.learn.lifelong import collect
+from ctgraph_rl.learn.collect import collect
 
 every_agent = pytest.mark.parametrize("name", AGENTS)
 

@@ -13,7 +13,7 @@ from baselines.prioritized import PrioritySampler
 from baselines.qrdqn_lstm import QRDQNLSTM
 from ctgraph_rl import CTGraphEnv, evaluate
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
-from ctgraph_rl.learn.lifelong import collect
+from ctgraph_rl.learn.collect import collect
 from curricula.paper import ct_su_b1
 
 

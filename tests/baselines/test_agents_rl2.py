@@ -133,7 +133,7 @@ def test_rl2_searches_like_the_best_policy_and_returns_to_what_it_found(build_ag
     played = Evaluation(num_episodes=40, episodes_per_row=40)
     learn_curriculum(Curriculum("two_goals", 1, "theory", [Block(TWO_GOALS, 299_008)], evaluation=played), agent)
 
-    ends = evaluate(agent.policy, [TWO_GOALS], 4000, 1, initial_state=agent.initial_state, episodes_per_row=40)
+    ends = evaluate(agent.policy, [TWO_GOALS], 4000, seed=1, initial_state=agent.initial_state, episodes_per_row=40)
 
     later_trials = episodes_to_goal(ends, 4).view(100, 10)[:, 1:]  # the first goal is always the same
     success = (ends["outcome"] == 3).view(-1, 4).double().mean(dim=0)

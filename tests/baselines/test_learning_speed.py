@@ -19,8 +19,7 @@ from baselines import benchmark
 from baselines.compiled import whole_step
 from baselines.networks import distinct, packed_lstm
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.learn.collect import in_time_order, take_step
-from ctgraph_rl.learn.lifelong import collect
+from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
 
 COMPILED = ("a2c", "dqn", "ppo", "ppo_count", "ppo_published", "reinforce")

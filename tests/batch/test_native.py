@@ -24,7 +24,7 @@ from ctgraph_rl.batch import native
 from ctgraph_rl.core import kernel as library
 from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
-from ctgraph_rl.learn.lifelong import collect, make_env
+from ctgraph_rl.learn.collect import collect, make_env
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
 

@@ -11,7 +11,7 @@ from test_lifelong import Scripted, curriculum
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ctgraph_rl import Block, CTGraphEnv, Evaluation, Gradient, evaluate, learn_curriculum, metrics
-from ctgraph_rl.learn.lifelong import collect
+from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy
 
 CHANGING = replace(one_hot(2, 2, goal=(1, 1)), goal_change=(1, 1))

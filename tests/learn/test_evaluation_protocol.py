@@ -20,7 +20,8 @@ from torch import Tensor
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, OneHot, RunLog, evaluate, learn_curriculum, run
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
-from ctgraph_rl.learn.lifelong import Examiner, make_env
+from ctgraph_rl.learn.collect import make_env
+from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.tasks.curriculum import Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
@@ -313,7 +314,7 @@ def test_evaluations_with_changing_goals_need_several_episodes_a_row_of_held_out
 def no_evaluation() -> Iterator[None]:
     """Nothing is evaluated, whatever a curriculum says."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Examiner, "examine", lambda self, agent, frames: None)
+        patch.setattr(Evaluator, "evaluate_if_due", lambda self, agent, frames: None)
         yield
 
 

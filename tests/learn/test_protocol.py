@@ -15,7 +15,7 @@ from torchrl.envs import check_env_specs
 
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, Rows, Steps, learn_curriculum, rollout
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_OTHER_END
-from ctgraph_rl.learn.lifelong import make_env
+from ctgraph_rl.learn.collect import make_env
 from ctgraph_rl.tasks.curriculum import Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
@@ -113,13 +113,13 @@ def test_a_curriculum_of_wrong_parts_is_refused(parts):
         sequence(**parts)
 
 
-def test_boundaries_cut_a_curriculum_into_stretches_only_where_they_are_announced():
+def test_boundaries_cut_a_curriculum_into_segments_only_where_they_are_announced():
     blocks = (Block(ONE, 8), Block(TWO, 8), Block(ONE, 4))
 
     announced, hidden = (sequence(*blocks, protocol=Protocol(boundaries=how)) for how in ("announced", "hidden"))
 
-    assert announced.stretches == ((blocks[0],), (blocks[1],), (blocks[2],))
-    assert hidden.stretches == (blocks,)
+    assert announced.segments == ((blocks[0],), (blocks[1],), (blocks[2],))
+    assert hidden.stretches == hidden.segments == (blocks,)
 
 
 # Task ids in the data

@@ -15,7 +15,7 @@ from test_agents_rl2 import TWO_GOALS
 from test_lifelong import ONE, TWO, task
 
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
-from ctgraph_rl.learn.lifelong import Checkpoint
+from ctgraph_rl.learn.lifelong import OfferCheckpoint
 from ctgraph_rl.run import target
 from ctgraph_rl.runs.checkpoints import decoded, encoded
 from ctgraph_rl.runs.train import new_agent
@@ -91,7 +91,9 @@ class Learner(NamedTuple):
     make_agent: Any
     folder: Path
 
-    def learn(self, log: RunLog, saved: Mapping[str, Any] | None = None, checkpoint: Checkpoint | None = None) -> Ended:
+    def learn(
+        self, log: RunLog, saved: Mapping[str, Any] | None = None, checkpoint: OfferCheckpoint | None = None
+    ) -> Ended:
         agent = new_agent(self.curriculum, self.make_agent, 0)
         torch.manual_seed(0 if saved is None else 1234)
         learn_curriculum(self.curriculum, agent, 7, log, saved=saved, checkpoint=checkpoint)

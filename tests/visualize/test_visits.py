@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.learn.lifelong import evaluate
+from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
 from ctgraph_rl.tasks.curriculum import Block, Curriculum
@@ -31,7 +31,7 @@ def test_counts_agree_with_the_episodes_that_evaluate_plays():
     task = ct_fo_b2()
 
     counts, actions = visits(task, RandomPolicy, num_episodes=500, seed=3, greedy=False)
-    episodes = evaluate(RandomPolicy, [task], 500, 3, greedy=False)
+    episodes = evaluate(RandomPolicy, [task], 500, seed=3, greedy=False)
 
     fails = int((episodes["leaf"] < 0).sum())
     assert counts[FAIL, 0] == fails and 450 < fails <= 500

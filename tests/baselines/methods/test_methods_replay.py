@@ -31,7 +31,7 @@ from baselines.methods.scratch import Scratch
 from baselines.methods.si import SI
 from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block
-from ctgraph_rl.learn.lifelong import collect, make_env
+from ctgraph_rl.learn.collect import collect, make_env
 from ctgraph_rl.policies import OptimalPolicy
 
 OF_EWC = {"coeff": 10.0, "online": False, "alpha": 0.5, "fisher": "policy", "num_samples": 16}

@@ -1,0 +1,183 @@
+"""Evaluation: equally many episodes on every task, in environments of their own, at the moments of a curriculum."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_of_episodes
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.policies import RandomPolicy
+from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation
+from ctgraph_rl.tasks.task import Task
+
+
+@torch.no_grad()
+def evaluate(
+    policy: Policy,
+    tasks: Sequence[Task],
+    num_episodes: int = Evaluation.num_episodes,
+    *,
+    seed: int = 0,
+    greedy: bool = Evaluation.greedy,
+    episodes_per_row: int = Evaluation.episodes_per_row,
+    initial_state: InitialState | None = None,
+    device: torch.device | str = "cpu",
+    curriculum: Curriculum | None = None,
+) -> TensorDict:
+    """Play the same number of episodes on every task, all in one batch, and equally many in every environment.
+
+    The environment is one of its own, and torch's global generator is left as it was found.
+
+    Args:
+        policy: what plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment.
+        tasks: what is played.
+        num_episodes: episodes per task.
+        seed: decides the environment and, if not greedy, the policy's draws.
+        greedy: take the most likely actions; False samples and explores as in training.
+        episodes_per_row: episodes that a row plays one after the other; a divisor of ``num_episodes``. More than one is
+            needed where the goal changes from episode to episode.
+        initial_state: gives a recurrent policy's state for a number of environments.
+        device: where the environment lives.
+        curriculum: whose task ids the policy sees, if its protocol shows them with observations.
+
+    Returns:
+        ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
+        [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other.
+
+    Raises:
+        ValueError: for values out of range, a task with changing goals and one episode a row, and a reference policy
+            that was built on another environment.
+    """
+    Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
+    bound = isinstance(policy, RandomPolicy)
+    require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
+    rows = [task for task in tasks for _ in range(num_episodes // episodes_per_row)]
+    env = CTGraphEnv(rows, seed, device=device) if curriculum is None else make_env(curriculum, rows, seed, device)
+    acts = policy(env) if isinstance(policy, type) else policy
+    exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
+    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        with set_exploration_type(exploration):
+            result = _first_episodes(env, acts, initial_state, episodes_per_row)
+    return result.view(len(tasks), num_episodes)
+
+
+def _first_episodes(
+    env: CTGraphEnv, policy: Policy, initial_state: InitialState | None, num_episodes: int
+) -> TensorDict:
+    """Return the last data of each row's first episodes, [rows, num_episodes]."""
+    start = start_of_episodes(env, initial_state)
+    carried = env.reset().update(start)
+    result = carried.select("episode_reward", "step_count", "outcome", "leaf")
+    result = result.unsqueeze(-1).expand(env.numel(), num_episodes).clone()
+    played = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
+    while (played < num_episodes).any():
+        step, carried = act(env, policy, carried, start)
+        ends = (step["next", "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
+        for key, value in result.items():
+            value[ends, played[ends]] = step["next", key][ends]
+        played[ends] += 1
+    return result
+
+
+def episode_means(ends: TensorDictBase) -> dict[str, Any]:
+    """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
+
+    Means of no episode are NaN.
+
+    Args:
+        ends: the data of the last step of each episode.
+    """
+    return {
+        "episodes": ends.batch_size[0],
+        "return_mean": ends["episode_reward"].double().mean().item(),
+        "success_rate": (ends["outcome"] == OUTCOME_GOAL).double().mean().item(),
+        "end_rate": (ends["outcome"] != OUTCOME_FAIL).double().mean().item(),
+        "length_mean": ends["step_count"].double().mean().item(),
+    }
+
+
+def derive_seed(seed: int, *purpose: str | int) -> int:
+    """Return a seed in [0, 2**63) for a purpose, unrelated to the run's own and to other purposes'."""
+    text = "/".join(map(str, (seed, *purpose)))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+class Evaluator:
+    """Evaluates at the moments and in the way that a curriculum says, and appends the results to a log.
+
+    Args:
+        curriculum: says when and how.
+        seed: of the run; each evaluation derives its own.
+        log: where measurements are appended.
+        device: where the environments live.
+    """
+
+    def __init__(self, curriculum: Curriculum, seed: int, log: RunLog, device: torch.device | str = "cpu") -> None:
+        self.curriculum, self.seed, self.log, self.device = curriculum, seed, log, device
+
+    def evaluate_if_due(self, agent: Agent, frames: int) -> None:
+        """Evaluate an agent if the curriculum says so after ``frames`` frames of the run."""
+        moment = self.curriculum.moment(frames)
+        if moment is not None:
+            self.evaluate(self._policy(agent, self.tasks_at(frames)), frames, moment, agent.initial_state)
+
+    def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
+        """Evaluate a policy after ``frames`` frames and append one line for each task."""
+        tasks, curriculum = self.tasks_at(frames), self.curriculum
+        if not tasks:
+            return
+        how = curriculum.evaluation
+        result = evaluate(
+            policy,
+            list(tasks),
+            how.num_episodes,
+            seed=derive_seed(self.seed, "evaluation", frames),
+            greedy=how.greedy,
+            episodes_per_row=how.episodes_per_row,
+            initial_state=initial_state,
+            device=self.device,
+            curriculum=curriculum,
+        )
+        for (number, label), episodes in zip(tasks.values(), result, strict=True):
+            where = {"block": curriculum.block_at(frames), "frames": frames, "task": number, "label": label}
+            held_out = number > len(curriculum.tasks)
+            self.log.append("evaluation", moment=moment, **where, held_out=held_out, **episode_means(episodes))
+
+    def tasks_at(self, frames: int) -> dict[Task, tuple[int, str]]:
+        """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""
+        curriculum = self.curriculum
+        held_out = curriculum.evaluation.held_out
+        named = dict(zip((*curriculum.tasks, *held_out), enumerate(curriculum.evaluated_labels, 1), strict=True))
+        if curriculum.evaluation.tasks == "all":
+            return named
+        seen = {task for block in curriculum.blocks[: curriculum.block_at(frames)] for task in block.tasks}
+        return {task: name for task, name in named.items() if task in seen or task in held_out}
+
+    def _policy(self, agent: Agent, tasks: Iterable[Task]) -> Policy:
+        """Return the agent's policy; where task ids are given, the one for each task."""
+        if self.curriculum.protocol.task_id == "hidden":
+            return agent.policy
+        ids = self.curriculum.task_ids
+        policies = [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
+        return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
+
+
+def by_slices(policies: Sequence[Policy]) -> Policy:
+    """Return a policy that gives each of as many equal slices of the rows to one of the policies."""
+
+    def act(data: TensorDictBase) -> TensorDictBase:
+        slices = data.chunk(len(policies))
+        return torch.cat([policy(part) for policy, part in zip(policies, slices, strict=True)])
+
+    return act
