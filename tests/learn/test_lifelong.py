@@ -25,7 +25,7 @@ from ctgraph_rl import (
     learn_curriculum,
 )
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
-from ctgraph_rl.learn import lifelong
+from ctgraph_rl.learn import evaluate as evaluation
 
 DECISION_ID = 2
 OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
@@ -146,7 +146,7 @@ def test_no_episode_is_no_episode():
     env = CTGraphEnv([ONE, TWO])
     ends = env.reset()[torch.tensor([False, False])]
 
-    means = lifelong.episode_means(ends)
+    means = evaluation.episode_means(ends)
 
     assert means["episodes"] == 0
     assert all(math.isnan(means[name]) for name in ("return_mean", "success_rate", "length_mean"))
@@ -209,7 +209,7 @@ def test_evaluation_does_not_disturb_training(monkeypatch, greedy):
 
     torch.manual_seed(7)
     learn_curriculum(curriculum(*blocks, greedy=greedy), disturbed, seed=3)
-    monkeypatch.setattr(lifelong, "evaluate", lambda policy, tasks, *args: finished_episodes(len(tasks)))
+    monkeypatch.setattr(evaluation, "evaluate", lambda policy, tasks, *args, **how: finished_episodes(len(tasks)))
     torch.manual_seed(7)
     learn_curriculum(curriculum(*blocks, greedy=greedy), alone, seed=3)
 
@@ -402,11 +402,11 @@ def test_the_same_seed_gives_the_same_measurements_and_another_seed_others(kind)
 def test_every_evaluation_of_a_run_has_a_seed_of_its_own(monkeypatch):
     seeds = []
 
-    def evaluated(policy, tasks, num_episodes, seed, *args):
+    def evaluated(policy, tasks, num_episodes, *, seed, **how):
         seeds.append(seed)
         return finished_episodes(len(tasks))
 
-    monkeypatch.setattr(lifelong, "evaluate", evaluated)
+    monkeypatch.setattr(evaluation, "evaluate", evaluated)
     for run_seed in (0, 1):
         learn_curriculum(curriculum(Block(ONE, 12), Block(ONE, 12)), Scripted(), seed=run_seed)
 

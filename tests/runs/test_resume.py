@@ -215,5 +215,7 @@ def test_a_state_of_another_agent_is_refused(learner):
     _, states = learner(CURRICULA["announced"], "a2c").whole()
     other = learner(CURRICULA["announced"], "dqn")
 
-    with pytest.raises(ValueError, match=r"the saved state does not fit this agent and curriculum, start anew \(overw"):
+    with pytest.raises(
+        ValueError, match=r"the saved state does not fit this agent and curriculum, start again \(overw"
+    ):
         other.learn(RunLog(), decoded(states[0]))
