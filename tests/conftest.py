@@ -14,6 +14,7 @@ from typing import Any
 import hydra
 import pytest
 import torch
+from helpers.small_agents import SMALL_AGENT
 from helpers.sweeping import UNLUCKY
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
@@ -21,11 +22,6 @@ from omegaconf import DictConfig
 from ctgraph_rl import run
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
-
-SMALL_AGENT = {
-    "lstm_ppo": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8"],
-    "dqn": ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "agent.batch_size=32"],
-}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

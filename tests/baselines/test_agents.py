@@ -2,75 +2,34 @@
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
-
 import pytest
 import torch
-from conftest import SMALL_AGENT
-from omegaconf import OmegaConf
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from helpers.small_agents import (
+    AGENTS,
+    GREEDY,
+    POLICY_GRADIENTS,
+    Q_LEARNERS,
+    SAMPLED,
+    YAML,
+    agent_of,
+    batches,
+    learnt_from,
+    parameters_equal,
+    saved_and_loaded,
+)
+from torchrl.envs.utils import set_exploration_type
 
 from baselines.networks import Encoder
-from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Observations, OneHot, Task, learn_curriculum, run
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, learn_curriculum
 from ctgraph_rl.learn.collect import collect
-from ctgraph_rl.run import conf_dir
 from curricula.paper import ct_su_b1
 
-YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
-AGENTS = [name for name in YAML if "_target_" in YAML[name]]  # others only change some values of one of these
-OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
-ONE_HOT_TASK = Task(CTGraph(3, 1), (3,), OBSERVATIONS, OneHot(5))
-GREEDY, SAMPLED = ExplorationType.DETERMINISTIC, ExplorationType.RANDOM
-
-Q_LEARNERS = ("dqn", "drqn", "qrdqn_lstm")
-POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "reinforce", "rl2")
-RECURRENT = ("drqn", "lstm_ppo", "qrdqn_lstm", "rl2")
-
-for _name in YAML:
-    _less = ["agent.batch_size=4"] if _name in ("drqn", "qrdqn_lstm") else []
-    SMALL_AGENT.setdefault(_name, ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", *_less])
-
 every_agent = pytest.mark.parametrize("name", AGENTS)
-
-
-def batches(agent, task: Task, count: int, seed: int = 0) -> list:
-    """Batches that an agent collects, as `learn_curriculum` gives them."""
-    env = CTGraphEnv([task] * agent.num_envs, seed=seed)
-    frames = count * agent.num_envs * agent.num_steps
-    return list(collect(env, agent.policy, frames, agent.num_steps, agent.initial_state))
-
-
-def learnt_from(agent, batch) -> list:
-    """The batches of which the agent minimises the loss when it learns from a batch."""
-    seen, loss = [], agent.loss
-    agent.loss = lambda minibatch: (seen.append(dict(minibatch)), loss(minibatch))[1]
-    agent.learn(batch)
-    agent.loss = loss
-    return seen
 
 
 def reading(agent, batch):
     """Only what the agent's policy reads of a batch."""
     return batch.select(*agent.policy.in_keys)
-
-
-def agent_of(compose, name: str, env, *overrides: str):
-    """A small agent for the specs of any environment; equal weights for every call."""
-    cfg = compose(f"agent={name}", *SMALL_AGENT[name], *overrides)
-    torch.manual_seed(0)
-    return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
-
-
-def saved_and_loaded(state: dict) -> dict:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
-def parameters_equal(one, other) -> bool:
-    return all(torch.equal(*pair) for pair in zip(one.parameters(), other.parameters(), strict=True))
 
 
 def test_the_agents_are_those_with_a_yaml():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_agents import GREEDY, POLICY_GRADIENTS, batches, learnt_from
+from helpers.small_agents import GREEDY, POLICY_GRADIENTS, batches, learnt_from
 from torch import nn
 from torchrl.envs.utils import set_exploration_type
 

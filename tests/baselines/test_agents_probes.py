@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of
 from tensordict import TensorDict
-from test_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import set_exploration_type

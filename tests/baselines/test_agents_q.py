@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.small_agents import GREEDY, ONE_HOT_TASK, Q_LEARNERS, SAMPLED, batches, parameters_equal, saved_and_loaded
 from tensordict import TensorDict
-from test_agents import GREEDY, ONE_HOT_TASK, Q_LEARNERS, SAMPLED, batches, parameters_equal, saved_and_loaded
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 

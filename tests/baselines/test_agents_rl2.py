@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
+from helpers.small_agents import GREEDY, TWO_GOALS, batches
 from tensordict import TensorDict
-from test_agents import GREEDY, ONE_HOT_TASK, batches
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.rl2 import episodes_to_goal
-from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, evaluate, learn_curriculum
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, evaluate, learn_curriculum
 from ctgraph_rl.tasks.curriculum import Evaluation
 from curricula.paper import ct_su_b1
-
-TWO_GOALS = replace(ONE_HOT_TASK, graph=CTGraph(2, 1), goal=(1,), goal_change=(4, 4))
 
 
 def small_rl2(small_agent, *overrides):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hydra
 import pytest
-from test_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
+from helpers.small_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
 
 from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1

@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from test_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
 from torch import nn
 from torch.nn.utils.rnn import PackedSequence
 from torchrl.envs.utils import set_exploration_type

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_agents import ONE_HOT_TASK, batches, learnt_from
+from helpers.small_agents import ONE_HOT_TASK, batches, learnt_from
 from torch import nn
 
 from baselines.networks import Encoder

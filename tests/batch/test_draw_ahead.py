@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.oracles import WAIT, act, confounding, is_uniform, one_hot, optimal, scripts, surjective
-from test_switches import SWITCHED, VECTORS, read, seen
+from helpers.task_families import SWITCHED, VECTORS, calls, read, seen
 from torch import Tensor
 
 from ctgraph_rl import CTGraphEnv
@@ -26,17 +26,6 @@ def bare(rows: Rows, name: str, *args: Tensor) -> dynamics.Shown | Tensor:
     """A call of `Rows` by the function of the core alone, which makes every draw when it needs it."""
     rows.state, shown = getattr(dynamics, name)(rows.state, *args, rows.params, rows.uses)
     return shown
-
-
-def calls(num_calls: int, num_rows: int, seed: int = 0) -> list[tuple[str, tuple[Tensor, ...]]]:
-    """Steps with all kinds of resets in between; the first is a reset of all rows."""
-    generator = torch.Generator().manual_seed(seed)
-    made = [("reset", (torch.ones(num_rows, dtype=torch.bool),))]
-    for action, kind in zip(scripts(num_calls, num_rows, 4, seed), scripts(num_calls, 1, 8, seed + 1), strict=True):
-        mask = torch.rand(num_rows, generator=generator) < 0.3
-        steps = {5: ("reset", (mask,)), 6: ("restart", (mask,)), 7: ("step_or_reset", (action, mask))}
-        made.append(steps.get(kind.item(), ("step", (action,))))
-    return made
 
 
 def play(rows: Rows, twin: Rows, made: list) -> None:

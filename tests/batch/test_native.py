@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from helpers.any_tasks import batches, examples, seeds
 from helpers.oracles import confounding, fully_observable, record, scripts, surjective
+from helpers.task_families import FAMILIES, MIXED, SWITCHED, VECTORS, calls
 from hypothesis import given
 from tensordict import TensorDictBase
-from test_any_input import batches, examples, seeds
-from test_draw_ahead import calls
-from test_rollout import FAMILIES, MIXED
-from test_switches import SWITCHED, VECTORS
 from torch import Tensor
 from torchrl.envs import StepCounter, TransformedEnv
 

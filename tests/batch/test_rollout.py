@@ -2,47 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
-from helpers.oracles import confounding, fully_observable, one_hot, record, scripts, surjective
+from helpers.oracles import record, scripts, surjective
+from helpers.task_families import FAMILIES, MIXED
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import CTGraphEnv, Gradient, ReferenceLinear, Rows, Steps, Task, rollout
+from ctgraph_rl import CTGraphEnv, Rows, Steps, Task, rollout
 from ctgraph_rl.batch import rollout as fast
 from ctgraph_rl.core import philox
 
-FILE = {
-    "general_seed": 3,
-    "graph_shape": {"d": 2, "b": 3, "p": 0.2},
-    "reward": {
-        "high_r": 1.0,
-        "fail_r": -0.1,
-        "std_r": 0.2,
-        "reward_distribution": "linear",
-        "min_static_reward_episodes": 2,
-        "max_static_reward_episodes": 4,
-    },
-    "observations": {"MDP_D": True, "MDP_W": False, "W_IDs": [2, 4], "D_IDs": [5, 8], "graph_ends": [9, 17]},
-    "image_dataset": {"seed": 1, "1D": False, "nr_of_images": 18, "noise_on_read": 9, "rotation_on_read": 8},
-}
-MIXED = [
-    confounding(p=0.5, read_noise=20, read_rotation=5, reward_cue=True),
-    replace(surjective(3, 3, 0.3), reward_fn=Gradient(), step_reward=0.01, goal_change=(1, 3)),
-    replace(fully_observable(2, 3), reward_fn=ReferenceLinear(), reward_std=0.5, fail_reward=-1.0),
-    Task.from_json(FILE, goal=(1, 2)),
-]
-FAMILIES = {
-    "surjective": [surjective()],
-    "fully observable": [fully_observable(2, 3, 0.5)],
-    "confounding": [confounding(p=0.5)],
-    "rotation": [surjective(read_rotation=9)],
-    "noise": [surjective(read_noise=10)],
-    "one-hot": [one_hot(p=0.5)],
-    "reference": [Task.from_json(FILE, goal=(1, 2))],
-    "mixed": MIXED,
-}
 every_family = pytest.mark.parametrize("tasks", FAMILIES.values(), ids=FAMILIES)
 NUM_ROWS, NUM_STEPS = 8, 60
 

@@ -15,19 +15,19 @@ from helpers.oracles import (
     PlainCTGraph,
     act,
     binomial_p_value,
-    confounding,
     is_uniform,
     one_hot,
     record,
     scripts,
     surjective,
 )
+from helpers.task_families import RICH, env_of
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from ctgraph_rl import CTGraphEnv, Gradient, Rows
+from ctgraph_rl import CTGraphEnv, Rows
 from ctgraph_rl.core import philox
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
 from ctgraph_rl.tasks.task import Task
@@ -38,12 +38,6 @@ FORKS = [one_hot(2, 2, goal=goal) for goal in ((1, 1), (1, 2), (2, 1), (2, 2))]
 TREES = [surjective(2, 1, goal=(2,)), surjective(3, 2, goal=(3, 1), image_seed=2), surjective(2, 3, image_seed=3)]
 """Tasks that `PlainCTGraph` knows, with images of their own."""
 
-RICH = [
-    replace(confounding(p=0.5, read_noise=9, read_rotation=5, reward_cue=True), goal_change=(2, 3), step_reward=0.5),
-    replace(surjective(3, 2, p=0.2, goal=(3, 1), image_seed=2), reward_fn=Gradient(), reward_std=0.3, fail_reward=-1),
-    surjective(2, 1, goal=(2,), image_seed=3),
-]
-"""Tasks that differ in all that a batch may mix."""
 
 PER_ROW = [ByEpisode(2), AtRandom(0.4), Drift(3)]
 TOGETHER = [ByEpisode(2, True), AtRandom(0.4, True), Drift(3, True)]
@@ -59,17 +53,6 @@ def switching(tasks: list[Task], switch: Switch, num_rows: int, **arguments: Any
 def started(rows: Rows, num_episodes: int) -> Tensor:
     """The tasks' numbers in as many episodes, each ended by the start of the next: int64 [episodes, rows]."""
     return torch.stack([(rows.restart(), rows.task)[1] for _ in range(num_episodes)])
-
-
-def env_of(
-    tasks: list[Task], switch: Switch | None, num_rows: int = 6, seed: int = 3, first_row: int = 0
-) -> CTGraphEnv:
-    """An environment whose rows change between tasks and show the number of theirs."""
-    ids = {task: number for number, task in enumerate(tasks)}
-    env = CTGraphEnv(tasks[:1] * num_rows, seed, first_row, tasks, task_ids=ids)
-    if switch is not None:
-        env.switch_tasks(tasks, switch)
-    return env
 
 
 def same(first: TensorDict, second: TensorDict) -> bool:

@@ -25,6 +25,7 @@ from helpers.oracles import (
     tree_states,
     tree_step,
 )
+from helpers.task_families import LEGACY, SWITCHED, VECTORS, legacy_number, read, seen, unique
 from torch import Tensor
 
 from ctgraph_rl import (
@@ -33,7 +34,6 @@ from ctgraph_rl import (
     Needle,
     Observations,
     OneHot,
-    PaperImages,
     ReferenceImages,
     ReferenceLinear,
     ReferenceOneHot,
@@ -43,32 +43,6 @@ from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.philox import STREAM_GOAL, STREAM_NOISE, STREAM_STEP, draw
 from ctgraph_rl.core.rotation import rotate
-
-LEGACY = {"legacy_index": True, "noise_before_rotation": True, "reward_cue": True, "cue_wraps": True}
-
-
-def unique(b, d, p=0.0, room=0, goal=None, waits=True, decisions=True, images=OneHot, **variation) -> Task:
-    """Ranges of exactly as many ids as there are states, and room for more."""
-    graph, first, ranges = CTGraph(b, d, p), 2, []
-    for count in (graph.num_wait_states, graph.num_decision_states, graph.num_end_states):
-        ranges.append((first, first + count + room - 1))
-        first += count + room
-    x = Observations(*ranges, unique_waits=waits, unique_decisions=decisions, **variation)
-    return Task(graph, goal or (1,) * d, x, images(first))
-
-
-def read(d=2, p=0.0, episodes=(-1, -1), **shown) -> Task:
-    """A task of a configuration file in which ids are drawn, or what ``shown`` says."""
-    content = {
-        "graph_shape": {"d": d, "b": 2, "p": p},
-        "reward": {"high_r": 1.0, "fail_r": 0.0, "std_r": 0.0, "reward_distribution": "needle_in_haystack"}
-        | dict(zip(("min_static_reward_episodes", "max_static_reward_episodes"), episodes, strict=True)),
-        "observations": {"MDP_D": False, "MDP_W": False, "W_IDs": [2, 6], "D_IDs": [7, 9], "graph_ends": [10, 13]}
-        | shown,
-        "image_dataset": {"seed": 1, "1D": False, "nr_of_images": 64, "noise_on_read": 0, "rotation_on_read": 1},
-    }
-    return Task.from_json(content, goal=(1,) * d)
-
 
 # All switches at once
 
@@ -158,37 +132,6 @@ class PlainRow:
         return image
 
 
-def legacy_number(b: int, path: tuple[int, ...]) -> int:
-    """The digits of the path after a leading 1, read in base b, less one."""
-    return int("1" + "".join(str(a - 1) for a in path), b) - 1
-
-
-FIELDS = {"reward_fn": ReferenceLinear(), "goal_reward": 2.0, "fail_reward": -0.5, "goal_change": (1, 3)}
-READ = {"read_noise": 30, "read_rotation": 45}
-SWITCHED = [
-    replace(unique(3, 2, 0.3, images=PaperImages, **READ, **LEGACY), **FIELDS, extra_end_step=True),
-    replace(unique(4, 2, images=PaperImages, legacy_index=True), extra_end_step=True, step_reward=-0.25),
-    replace(unique(2, 3, 0.5, 5, decisions=False, images=PaperImages, **LEGACY), goal_change=(2, 2)),
-    replace(
-        confounding(p=0.9, read_noise=9, read_rotation=359, **LEGACY),
-        extra_end_step=True,
-        goal_change=(1, 1),
-        legacy_goal_change=True,
-    ),
-    replace(confounding(3, 2, reward_cue=True, **READ), goal_change=(1, 2)),
-    replace(read(), **FIELDS | {"goal_change": None}, images=ReferenceImages(64, 2, noise=10.5)),
-    replace(read(), observations=Observations((2, 4), (5, 5), (6, 9), (10, 12), (13, 14), unique_ends=True, **LEGACY)),
-    surjective(2, 3, goal=(2, 1, 2)),
-    unique(3, 2, 0.5, images=PaperImages, read_rotation=7),
-]
-VECTORS = [
-    replace(unique(3, 2, 0.3, images=ReferenceOneHot, **LEGACY), **FIELDS, legacy_goal_change=True),
-    replace(unique(2, 1, images=ReferenceOneHot, reward_cue=True), reward_fn=ReferenceLinear()),
-    replace(confounding(), images=OneHot(16), extra_end_step=True),
-    replace(confounding(reward_cue=True), images=ReferenceOneHot(20), step_reward=0.5),
-]
-
-
 @pytest.mark.parametrize("tasks", [SWITCHED, VECTORS], ids=["images", "vectors"])
 def test_a_mixed_batch_of_all_switches_follows_plain_rules_row_by_row(tasks):
     rows, steps = Rows(tasks, seed=5, first_row=3), 80
@@ -227,16 +170,6 @@ def expect(rows: Rows, shown: dynamics.Shown, plain: list[PlainRow]) -> None:
         assert rows.reward[i].item() == torch.tensor(row.reward, dtype=torch.float32).item(), (i, row.tick)
         found = shown.observation[i]
         assert torch.equal(found[: len(image)], image) and not found[len(image) :].any(), (i, row.tick)
-
-
-def seen(rows: Rows, actions: Tensor) -> list[Tensor]:
-    """All that rows show, and their rewards, under a script with finished rows reset: [steps, N, ...] each."""
-    shown, data = rows.reset(), []
-    for action in actions:
-        begins = rows.reset(shown.done).observation
-        shown = rows.step(action)
-        data.append([begins, *shown, rows.reward])
-    return [torch.stack(part) for part in zip(*data, strict=True)]
 
 
 # The index

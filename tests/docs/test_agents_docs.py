@@ -11,7 +11,7 @@ import sys
 import pytest
 import torch
 from helpers.paths import CHECKOUT
-from test_agents import AGENTS
+from helpers.small_agents import AGENTS
 
 from baselines.__main__ import agents, main
 from ctgraph_rl import RunLog, agent

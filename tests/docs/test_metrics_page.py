@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.paths import CHECKOUT
-from test_lifelong import curriculum, task
+from helpers.scripted import curriculum, task
 
 import curricula
 from ctgraph_rl import Block, RunLog, metrics

@@ -1,4 +1,4 @@
-"""Sweeps in the process of a test; the fixture `learned` of conftest.py learns their cells."""
+"""Runs and sweeps in the process of a test; the fixture `learned` of conftest.py learns their cells."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ UNLUCKY = 13
 """A seed that fails."""
 
 
-def sweep(monkeypatch, *settings: str) -> int:
-    """The exit code of ``ctgraph-rl -m SETTINGS`` in this process."""
+def command_line(monkeypatch, *arguments: str) -> int:
+    """The exit code of ``ctgraph-rl ARGUMENTS`` in this process."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "-m", *settings])
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *arguments])
     try:
         run_module.main()
     except SystemExit as end:
         return int(end.code or 0)
     return 0
+
+
+def sweep(monkeypatch, *settings: str) -> int:
+    """The exit code of ``ctgraph-rl -m SETTINGS`` in this process."""
+    return command_line(monkeypatch, "-m", *settings)
 
 
 def configs(runs: list[Path]) -> list[dict[str, Any]]:

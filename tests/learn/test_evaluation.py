@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from helpers.oracles import act, one_hot, surjective
-from test_lifelong import Scripted, curriculum
+from helpers.scripted import Scripted, curriculum
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ctgraph_rl import Block, CTGraphEnv, Evaluation, Gradient, evaluate, learn_curriculum, metrics

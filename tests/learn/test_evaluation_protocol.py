@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import SMALL_AGENT
 from helpers.oracles import surjective
+from helpers.scripted import OBSERVATIONS, ONE, TWO, Scripted, Told, decide, random_decision, sequence, task
+from helpers.small_agents import SMALL_AGENT
 from tensordict import TensorDict
-from test_lifelong import OBSERVATIONS, ONE, TWO, Scripted, decide, random_decision, task
-from test_protocol import Told, sequence
 from torch import Tensor
 
 import curricula

@@ -8,77 +8,19 @@ from fractions import Fraction
 
 import pytest
 import torch
+from helpers.scripted import DECISION_ID, ONE, TWO, Scripted, counting, curriculum, decide, random_decision, task
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ctgraph_rl import (
     Block,
-    CTGraph,
     CTGraphEnv,
-    Curriculum,
-    Evaluation,
-    Observations,
-    OneHot,
     RunLog,
-    Task,
     evaluate,
     learn_curriculum,
 )
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.learn import evaluate as evaluation
-
-DECISION_ID = 2
-OBSERVATIONS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
-
-
-def task(goal=(1,), wait_prob: float = 0.0) -> Task:
-    return Task(CTGraph(2, len(goal), wait_prob), goal, OBSERVATIONS, OneHot(5))
-
-
-ONE, TWO = task((1,)), task((2,))
-"""Depth 1: an optimal episode takes four steps."""
-
-
-def decide(decision):
-    """A policy that waits where it should and takes one decision, or the decision that a function gives per row."""
-
-    def policy(data):
-        deciding = data["observation"][..., DECISION_ID].long()
-        return data.set("action", deciding * (decision(data) if callable(decision) else decision))
-
-    return policy
-
-
-def random_decision(data):
-    return torch.randint(1, 3, data.batch_size)
-
-
-class Scripted:
-    """An agent that learns nothing and keeps what happens to it."""
-
-    def __init__(self, policy=None, num_envs: int = 4, num_steps: int = 3) -> None:
-        self.num_envs, self.num_steps = num_envs, num_steps
-        self.policy = decide(1) if policy is None else policy
-        self.events, self.batches, self.rng_states = [], [], []
-
-    def initial_state(self, num_envs: int) -> TensorDict:
-        return TensorDict(batch_size=[num_envs])
-
-    def start_task(self, task=None) -> None:
-        self.events.append("start")
-
-    def end_task(self) -> None:
-        self.events.append("end")
-
-    def learn(self, batch):
-        self.events.append(("learn", *batch.batch_size))
-        self.batches.append(batch.clone())
-        self.rng_states.append(torch.get_rng_state())
-        return {"loss_value": 0.5}
-
-
-def curriculum(*blocks: Block, num_episodes: int = 5, greedy: bool = True) -> Curriculum:
-    return Curriculum("scripted", 1, "here", blocks, Evaluation(num_episodes, greedy))
 
 
 def test_all_tasks_are_evaluated_before_training_and_after_every_block():
@@ -337,12 +279,6 @@ def test_a_measurement_that_is_not_finite_stops_the_run_and_names_block_frames_a
         learn_curriculum(curriculum(Block(ONE, 24), Block(TWO, 24)), agent)
 
     assert agent.events[-2:] == ["start", ("learn", 4, 3)]
-
-
-def counting(data):
-    """A recurrent policy: its memory counts the steps of the episode."""
-    memory = data["memory"].masked_fill(data["is_init"], 0) + 1
-    return decide(1)(data).set(("next", "memory"), memory)
 
 
 def test_recurrent_state_is_carried_through_batches_and_starts_anew_at_blocks():

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from helpers.oracles import one_hot
+from helpers.scripted import ONE, TWO, Told, counting, decide, sequence
+from helpers.task_families import RICH, env_of
 from tensordict import TensorDict
-from test_lifelong import ONE, TWO, Scripted, counting, decide
-from test_switch import RICH, env_of
 from torchrl.envs import check_env_specs
 
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, Rows, Steps, learn_curriculum, rollout
+from ctgraph_rl import Block, CTGraphEnv, Evaluation, Rows, Steps, learn_curriculum, rollout
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.learn.collect import make_env
 from ctgraph_rl.tasks.curriculum import Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 THREE = replace(ONE, goal_reward=3.0)
-
-
-def sequence(*blocks: Block, **parts: Any) -> Curriculum:
-    return Curriculum("told", 1, "here", blocks or (Block(ONE, 20), Block(TWO, 28)), **parts)
 
 
 # What a protocol says
@@ -349,16 +344,6 @@ def test_what_is_planned_moves_with_the_rows():
 
 
 # Learning with what is told
-
-
-class Told(Scripted):
-    """A scripted agent that keeps what it is told."""
-
-    def start_task(self, task=None) -> None:
-        self.events.append(("start", task))
-
-    def policy_for(self, task: int):
-        return self.policy
 
 
 HIDDEN = Protocol("one_hot", "hidden")

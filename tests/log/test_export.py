@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_log import learned
+from helpers.made_runs import learned
 
 from ctgraph_rl import RunLog
 from ctgraph_rl.log import export

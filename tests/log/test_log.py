@@ -7,6 +7,7 @@ import textwrap
 
 import pytest
 import torch
+from helpers.made_runs import evaluate, learned
 
 from ctgraph_rl import RunLog, metrics
 from ctgraph_rl.log import run_log as log_module
@@ -15,31 +16,11 @@ from ctgraph_rl.log.run_log import write_metrics, write_performance
 TRAINED = [(0,), (1,)]
 
 
-def evaluate(log: RunLog, moment: str, block: int, frames: int, *returns: float, held_out: int = 0) -> None:
-    """Evaluations of all tasks at one moment; the last ``held_out`` ones are held out."""
-    for task, value in enumerate(returns, 1):
-        where = {"block": block, "frames": frames, "task": task, "label": f"goal1.{task}"}
-        log.append("evaluation", moment=moment, **where, held_out=task > len(returns) - held_out, return_mean=value)
-
-
 def evaluated(log: RunLog) -> RunLog:
     """Two tasks, before training and after two blocks."""
     evaluate(log, "before", 0, 0, 0.0, 0.25)
     evaluate(log, "after", 1, 64, 1.0, 0.5)
     evaluate(log, "after", 2, 192, 0.75, 1.0)
-    return log
-
-
-def learned(log: RunLog, trained=((1,), (2,))) -> RunLog:
-    """A whole run of two tasks, evaluated during blocks too, with a held-out third task."""
-    log.append("run", schema=1, trained=trained)
-    evaluate(log, "before", 0, 0, 0.0, 0.25, 0.5, held_out=1)
-    for block, (middle, end) in enumerate((((0.5, 0.25), (1.0, 0.5)), ((1.0, 0.75), (0.75, 1.0))), 1):
-        start = 100 * (block - 1)
-        log.append("training", block=block, frames=start + 50, episodes=0, return_mean=float("nan"))
-        evaluate(log, "during", block, start + 50, *middle, 0.0, held_out=1)
-        log.append("training", block=block, frames=start + 100, episodes=4, return_mean=block / 4)
-        evaluate(log, "after", block, start + 100, *end, 0.0, held_out=1)
     return log
 
 

@@ -7,7 +7,7 @@ import sys
 import textwrap
 
 import pytest
-from test_lifelong import Scripted, curriculum, task
+from helpers.scripted import Scripted, curriculum, task
 
 from ctgraph_rl import Block, RunLog, learn_curriculum
 from ctgraph_rl.log import tables

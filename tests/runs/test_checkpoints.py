@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import errno
-import json
-import os
 import pickle
 import shutil
 import subprocess
 import warnings
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.stopped_runs import Bomb, bombs, flip_bit, with_header
 
 from ctgraph_rl.runs.checkpoints import KEPT, BrokenCheckpoint, Checkpoints, decoded, encoded
 
@@ -29,18 +27,6 @@ def saved(folder: Path, *frames: int, **how) -> Checkpoints:
     for each in frames:
         checkpoints.save(state(each))
     return checkpoints
-
-
-def flip_bit(file: Path, position: int) -> None:
-    content = bytearray(file.read_bytes())
-    content[position] ^= 1
-    file.write_bytes(content)
-
-
-def with_header(content: bytes, **changes) -> bytes:
-    """A checkpoint of a content, whose header is right but for changes."""
-    header = {"format": 1, "frames": 64, "bytes": len(content), "sha256": sha256(content).hexdigest()}
-    return json.dumps({**header, **changes}).encode() + b"\n" + content
 
 
 def test_what_is_saved_is_read_back_with_its_types(tmp_path):
@@ -171,26 +157,6 @@ def test_other_files_are_left_alone_and_what_a_kill_left_is_removed(tmp_path):
     names = sorted(path.name for path in checkpoints.folder.iterdir())
     assert names == ["000000000064.pt", "000000000128.pt", "best.pt"]
     assert checkpoints.newest()["frames"] == 128
-
-
-class Bomb:
-    """Writes a file when it is unpickled."""
-
-    def __init__(self, canary: Path) -> None:
-        self.canary = str(canary)
-
-    def __reduce__(self):
-        return os.mkdir, (self.canary,)
-
-
-def bombs(canary: Path) -> dict[str, bytes]:
-    """Files that would run code if they were unpickled: as `torch.save` writes them, its old form, and a plain one."""
-    folder = canary.parent / "bombs"
-    folder.mkdir()
-    torch.save({"frames": 64, "agent": Bomb(canary)}, folder / "new")
-    torch.save({"frames": 64, "agent": Bomb(canary)}, folder / "old", _use_new_zipfile_serialization=False)
-    (folder / "plain").write_bytes(pickle.dumps({"frames": 64, "agent": Bomb(canary)}))
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_a_file_with_code_and_the_right_sum_is_refused_and_the_code_never_runs(tmp_path):

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
-from test_lifelong import ONE, TWO
-from test_run import command_line
+from helpers.scripted import ONE, TWO
+from helpers.sweeping import command_line
 
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
 from ctgraph_rl.log import files

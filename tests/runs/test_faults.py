@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.paths import TESTS
-from test_checkpoints import with_header
-from test_lifelong import ONE
+from helpers.scripted import ONE
+from helpers.stopped_runs import with_header
 
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Observations, OneHot, RunLog
 from ctgraph_rl.log.files import locked

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.scripted import ONE, TWO
+from helpers.stopped_runs import LEARNED, OWN, SETTINGS, bombs, learn_into, make_agent, stopped_run
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from test_checkpoints import bombs
-from test_lifelong import ONE, TWO
 
 from baselines.a2c import A2C
 from baselines.methods.l2 import L2
@@ -24,51 +24,7 @@ from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.train import new_agent, train
 
-SETTINGS = {
-    **OmegaConf.to_container(OmegaConf.load(f"{conf_dir()}/agent/a2c.yaml")),
-    **{"num_envs": 8, "num_steps": 4, "hidden_size": 4},
-}
-OWN = {key: value for key, value in SETTINGS.items() if key != "_target_"}
-
-LEARNED = Curriculum("loaded", 1, "here", (Block(ONE, 96), Block(TWO, 64)), Evaluation(4))
-
 METHODS = sorted(path.stem for path in Path(conf_dir(), "method").glob("*.yaml"))
-
-
-class Stopped(Exception):
-    """Stands for a kill."""
-
-
-class StopsAfter(Checkpoints):
-    """Saves after every update, and stops the run after a number of frames."""
-
-    def __init__(self, folder, frames: int = 64) -> None:
-        super().__init__(folder, seconds=1e-9)
-        self.frames = frames
-
-    def offer(self, state, at_block_end):
-        super().offer(state, at_block_end)
-        if state()["frames"] == self.frames:
-            raise Stopped
-
-
-def make_agent(observation_spec, action_spec) -> A2C:
-    """A small A2C."""
-    return A2C(observation_spec, action_spec, **OWN)
-
-
-def learn_into(run_dir: Path, checkpoints: Checkpoints | None = None) -> Path:
-    """A short run in a directory, which is made or gone on with."""
-    run_dir.mkdir(exist_ok=True)
-    train(LEARNED, make_agent, run_dir, 3, config={"agent": SETTINGS, "seed": 3}, checkpoints=checkpoints)
-    return run_dir
-
-
-def stopped_run(run_dir: Path) -> Path:
-    """The run, stopped in the middle of its first block, with two checkpoints."""
-    with pytest.raises(Stopped):
-        learn_into(run_dir, StopsAfter(run_dir / "checkpoints"))
-    return run_dir
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +133,7 @@ class Own(L2):
 
 def test_a_method_of_someone_else_must_be_given(tmp_path):
     settings = {"coeff": 0.5, "heads": "single"}
-    learn_with({"_target_": "test_load.Own", **settings}, tmp_path)
+    learn_with({"_target_": f"{__name__}.Own", **settings}, tmp_path)
 
     with pytest.raises(ValueError, match=r"is of the method .*, no baseline: give load\(\.\.\., make_method=\)"):
         load(tmp_path)
@@ -207,7 +163,7 @@ class Outsiders(A2C):
 
 
 @pytest.mark.parametrize(
-    "name", ["os.system", "test_load.Outsiders", "baselines.a2c.A2C.x", "baselines..a2c", "builtins.eval", "x" * 500]
+    "name", ["os.system", f"{__name__}.Outsiders", "baselines.a2c.A2C.x", "baselines..a2c", "builtins.eval", "x" * 500]
 )
 def test_an_agent_that_is_no_baseline_must_be_given(copy, name):
     rewrite(copy, config={"agent": {**SETTINGS, "_target_": name}, "seed": 3})

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.oracles import surjective
+from helpers.scripted import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
 from stable_baselines3 import PPO
-from test_lifelong import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
 
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum

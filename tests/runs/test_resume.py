@@ -11,20 +11,15 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import RUNS, equal
-from test_agents_rl2 import TWO_GOALS
-from test_lifelong import ONE, TWO, task
+from helpers.scripted import MIDDLE, ONE, THREE, TWO, of
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, TWO_GOALS
 
-from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.lifelong import OfferCheckpoint
 from ctgraph_rl.run import target
 from ctgraph_rl.runs.checkpoints import decoded, encoded
 from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
-
-ROWS, STEPS = 8, 4
-SMALL = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size=4"]
-MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=2"]
-REPLAY = ["agent.num_updates=2", "agent.batch_size=8", "agent.buffer_size=96", "agent.target_update_interval=3"]
 
 AGENTS: dict[str, tuple[str, list[str]]] = {
     "a2c": ("a2c", ["agent.optimiser=rmsprop"]),
@@ -38,13 +33,6 @@ AGENTS: dict[str, tuple[str, list[str]]] = {
     "reinforce": ("reinforce", []),
     "rl2": ("rl2", [*MINIBATCHES, "agent.trial_episodes=4"]),
 }
-
-THREE = task((2,), wait_prob=0.5)
-MIDDLE = Evaluation(4, every=96, greedy=False)
-
-
-def of(*blocks: Block, evaluation: Evaluation = MIDDLE, **protocol: Any) -> Curriculum:
-    return Curriculum("resumed", 1, "here", blocks, evaluation, Protocol(**protocol))
 
 
 def uneven(**how: Any) -> Curriculum:
@@ -124,7 +112,7 @@ def learner(compose, tmp_path):
 
     def make(curriculum: Curriculum, name: str) -> Learner:
         agent, overrides = AGENTS[name]
-        return Learner(curriculum, target(compose(f"agent={agent}", *SMALL, *overrides), "agent"), tmp_path)
+        return Learner(curriculum, target(compose(f"agent={agent}", *TINY, *overrides), "agent"), tmp_path)
 
     return make
 

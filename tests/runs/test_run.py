@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.sweeping import command_line
 
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
@@ -24,17 +25,6 @@ from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
-
-
-def command_line(monkeypatch, *arguments: str) -> int:
-    """The exit code of ``ctgraph-rl ARGUMENTS`` in this process."""
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *arguments])
-    try:
-        run_module.main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def files_in(folder: Path) -> set[str]:

@@ -10,10 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import test_load
 from helpers.kill_runs import differences
-from test_checkpoints import flip_bit
-from test_load import LEARNED, Stopped, StopsAfter, learn_into, make_agent, stopped_run
+from helpers.stopped_runs import LEARNED, Stopped, StopsAfter, flip_bit, learn_into, make_agent, stopped_run
 
 from ctgraph_rl import Block, RunLog
 from ctgraph_rl.runs.checkpoints import Checkpoints
@@ -44,7 +42,7 @@ def newest(run_dir: Path) -> Path:
 
 def about(monkeypatch, **changes) -> None:
     """Let the machine and versions of this process seem others."""
-    provenance = test_load.train.__globals__["provenance"]
+    provenance = train.__globals__["provenance"]
     monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda curriculum: {**provenance(curriculum), **changes})
 
 

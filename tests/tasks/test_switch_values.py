@@ -23,8 +23,8 @@ from helpers.oracles import (
     tree_states,
     tree_step,
 )
+from helpers.task_families import SWITCHED, VECTORS, legacy_number, read, unique
 from tensordict import TensorDict
-from test_switches import SWITCHED, VECTORS, legacy_number, read, unique
 from torch import Tensor
 from torchrl.envs import check_env_specs
 

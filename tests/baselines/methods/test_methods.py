@@ -8,16 +8,15 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from conftest import SMALL_AGENT
 from helpers.kill_runs import equal
-from test_agents import batches, saved_and_loaded
-from test_lifelong import ONE, TWO, Scripted
-from test_resume import MINIBATCHES, REPLAY, SMALL, THREE, of
+from helpers.scripted import ONE, THREE, TWO, Scripted, of
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, saved_and_loaded
+from helpers.with_methods import made, weights_for
 
 from baselines.methods.importance import Samples
 from baselines.methods.method import Method
 from baselines.methods.wearing import Wearing
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Evaluation, RunLog, learn_curriculum, run
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum, run
 from ctgraph_rl.runs.train import new_agent
 
 AGENTS = {"a2c": [], "dqn": REPLAY, "drqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
@@ -42,16 +41,12 @@ METHODS: dict[str, tuple[str, ...]] = {
 OF_EACH_TASK = ("ewc_published", "l2", "mas", "mask_blc", "mask_lc", "mask_ri", "packnet", "scratch")
 """Those that act with other weights in another task, as they are set above."""
 
-TASKS = (ONE, TWO, THREE)
 BLOCKS = (Block(ONE, 80), Block(TWO, 64), Block(THREE, 96), Block(ONE, 40))
 CURRICULUM = of(*BLOCKS, evaluation=Evaluation(2, greedy=False, before=False), task_id="one_hot")
 """Batches of 32 frames, and at the end of blocks of less; the first task comes again."""
 
 KEPT = (4, 8)
 """Updates after which a state is kept: within the second block, and at the end of the third."""
-
-
-COMPOSED: dict[tuple[str, ...], Any] = {}
 
 
 class Life(NamedTuple):
@@ -79,46 +74,11 @@ class Life(NamedTuple):
         return agent, lines, states
 
 
-def made(compose, group: str, name: str, *overrides: str) -> Any:
-    """What builds the choice of a group of the configuration, which is composed once."""
-    choice = (f"{group}={name}", *overrides)
-    if choice not in COMPOSED:
-        COMPOSED[choice] = run.target(compose(*choice), group)
-    return COMPOSED[choice]
-
-
 def life(compose, agent: str, method: str, *overrides: str, curriculum: Curriculum = CURRICULUM) -> Life:
-    make_alone = made(compose, "agent", agent, *SMALL, *AGENTS[agent])
+    make_alone = made(compose, "agent", agent, *TINY, *AGENTS[agent])
     make_method = made(compose, "method", method, *METHODS[method], *overrides)
     prepared = make_method().prepare(curriculum)
     return Life(prepared, lambda *specs: make_method().attach(make_alone(*specs), prepared))
-
-
-def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
-    """An agent as the fixture ``small_agent`` builds it, whose configuration is composed once."""
-    env = CTGraphEnv(tasks)
-    torch.manual_seed(0)
-    make_agent = made(compose, "agent", agent, *SMALL_AGENT[agent], *overrides)
-    return make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
-
-
-def wearing(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> Wearing:
-    """A small agent with a method, which is told the ids of tasks that have a block each."""
-    curriculum = method.prepare(of(*(Block(task, 160) for task in tasks), task_id="at_boundaries"))
-    return method.attach(small(compose, agent, tasks, *overrides), curriculum)
-
-
-def stay(worn: Wearing, number: int, tasks=TASKS, number_of_batches: int = 2) -> None:
-    """A block of some batches."""
-    worn.start_task(number)
-    for batch in batches(worn, tasks[number], number_of_batches, seed=number):
-        worn.learn(batch)
-    worn.end_task()
-
-
-def weights_for(worn, number: int) -> list[torch.Tensor]:
-    """Copies of the weights that a task is acted in with."""
-    return [parameter.detach().clone() for parameter in worn.policy_for(number).parameters()]
 
 
 # What is refused
@@ -352,7 +312,7 @@ def test_a_first_block_that_is_no_whole_batch_can_be_learned_with_replayed_rows(
 
 @pytest.mark.parametrize("agent", AGENTS)
 def test_fine_tuning_is_the_agent_itself(compose, agent):
-    alone = new_agent(CURRICULUM, made(compose, "agent", agent, *SMALL, *AGENTS[agent]), 0)
+    alone = new_agent(CURRICULUM, made(compose, "agent", agent, *TINY, *AGENTS[agent]), 0)
 
     assert made(compose, "method", "finetune")().attach(alone, CURRICULUM) is alone
 

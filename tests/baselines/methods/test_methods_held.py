@@ -6,15 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.scripted import ONE, THREE, TWO, of
+from helpers.small_agents import batches
+from helpers.with_methods import RATE, TASKS, Tiny, seen, stay, wearing, weights_for
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from test_agents import batches
-from test_lifelong import ONE, TWO
-from test_methods import TASKS, stay, wearing, weights_for
-from test_resume import THREE, of
-from torch import Tensor, nn
+from torch import Tensor
 
-from baselines.learner import Learner
 from baselines.methods.ewc import EWC
 from baselines.methods.importance import Importance
 from baselines.methods.l2 import L2
@@ -24,30 +21,7 @@ from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block
 
 CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
-RATE = 0.1
 EWC_SETTINGS = {"online": False, "alpha": 0.5, "fisher": "policy", "num_samples": 100, "heads": "single"}
-
-
-class Tiny(Learner):
-    """Two inputs and three outputs, linear: logits of a policy, or action values; learns by plain gradient descent."""
-
-    output_keys = ("log_probs",)
-    minibatch_size = 0
-
-    def __init__(self) -> None:
-        super().__init__(num_envs=1, num_steps=1, max_grad_norm=1e9)
-        self.linear = nn.Linear(2, 3)
-        self.policy = TensorDictModule(self.linear, in_keys=["observation"], out_keys=["logits"])
-        self.optimiser = torch.optim.SGD(self.parameters(), RATE)
-
-    def outputs(self, data: Any) -> dict[str, Tensor]:
-        outputs = self.linear(data["observation"])
-        return {"log_probs": outputs.log_softmax(dim=-1), "action_value": outputs}
-
-    def loss(self, batch: Any) -> dict[str, Tensor]:
-        """Linear in the outputs: two parts, and something that is only measured."""
-        each = (batch["factor"] * self.linear(batch["observation"])).mean(dim=0)
-        return {"loss_first": each[0], "loss_others": each[1:].sum(), "entropy": each.sum() * 100}
 
 
 class Bowl(Tiny):
@@ -67,13 +41,6 @@ def vector(agent: Tiny) -> Tensor:
 def tiny(method: Importance, kind: type[Tiny] = Tiny) -> Wearing:
     torch.manual_seed(0)
     return Wearing(kind(), method, CURRICULUM)
-
-
-def seen(number: int, seed: int = 0) -> dict[str, Tensor]:
-    """A minibatch."""
-    generator = torch.Generator().manual_seed(seed)
-    observation, factor = (torch.randn(number, width, generator=generator) for width in (2, 3))
-    return {"observation": observation, "factor": factor, "action": torch.zeros(number, dtype=torch.int64)}
 
 
 def task_with(worn: Wearing, number: int, *minibatches: dict[str, Tensor]) -> None:

@@ -8,12 +8,10 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.scripted import ONE, THREE, TWO, of
+from helpers.small_agents import GREEDY, batches
+from helpers.with_methods import RATE, TASKS, Tiny, same, seen, small, stay, wearing, weights_for
 from tensordict.nn import TensorDictModule
-from test_agents import GREEDY, batches
-from test_lifelong import ONE, TWO
-from test_methods import TASKS, small, stay, wearing, weights_for
-from test_methods_held import RATE, Tiny, seen
-from test_resume import THREE, of
 from torch import Tensor, nn
 from torchrl.envs.utils import set_exploration_type
 
@@ -39,12 +37,6 @@ def said(worn: Wearing, number: int, data: Any) -> dict[Any, Tensor]:
     with torch.no_grad(), set_exploration_type(GREEDY):
         written = worn.policy_for(number)(data.select(*worn.policy.in_keys))
     return dict(written.items(True, True))
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two lists or dictionaries of tensors are equal bit by bit."""
-    pairs = zip(one, other, strict=True) if isinstance(one, list) else [(one[key], other[key]) for key in one]
-    return all(torch.equal(*pair) for pair in pairs)
 
 
 def masked(method: type[Masks]) -> Wearing:

@@ -9,11 +9,9 @@ from typing import Any
 
 import pytest
 import torch
-from test_agents import batches, saved_and_loaded
-from test_lifelong import ONE, TWO
-from test_methods import TASKS, small, stay, wearing, weights_for
-from test_methods_masks import same
-from test_resume import THREE, of
+from helpers.scripted import ONE, THREE, TWO, of
+from helpers.small_agents import batches, saved_and_loaded
+from helpers.with_methods import TASKS, same, small, stay, wearing, weights_for
 from torch import Tensor
 
 from baselines.compiled import whole_step

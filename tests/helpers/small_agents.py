@@ -1,0 +1,75 @@
+"""Every agent with a small network, what it collects and what it learns from."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from omegaconf import OmegaConf
+from torchrl.envs.utils import ExplorationType
+
+from ctgraph_rl import CTGraph, CTGraphEnv, OneHot, Task, run
+from ctgraph_rl.learn.collect import collect
+from ctgraph_rl.run import conf_dir
+from helpers.scripted import OBSERVATIONS
+
+YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
+
+AGENTS = [name for name in YAML if "_target_" in YAML[name]]  # others only change some values of one of these
+
+LESS = {"dqn": ["agent.batch_size=32"], "drqn": ["agent.batch_size=4"], "qrdqn_lstm": ["agent.batch_size=4"]}
+SMALL_AGENT = {
+    name: ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", *LESS.get(name, [])] for name in YAML
+}
+"""Overrides that make each agent small."""
+
+ONE_HOT_TASK = Task(CTGraph(3, 1), (3,), OBSERVATIONS, OneHot(5))
+TWO_GOALS = replace(ONE_HOT_TASK, graph=CTGraph(2, 1), goal=(1,), goal_change=(4, 4))
+
+GREEDY, SAMPLED = ExplorationType.DETERMINISTIC, ExplorationType.RANDOM
+
+Q_LEARNERS = ("dqn", "drqn", "qrdqn_lstm")
+POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "reinforce", "rl2")
+RECURRENT = ("drqn", "lstm_ppo", "qrdqn_lstm", "rl2")
+
+ROWS, STEPS = 8, 4
+TINY = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size=4"]
+MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=2"]
+REPLAY = ["agent.num_updates=2", "agent.batch_size=8", "agent.buffer_size=96", "agent.target_update_interval=3"]
+"""Overrides that make agents tiny: 32 frames a batch."""
+
+
+def batches(agent, task: Task, count: int, seed: int = 0) -> list:
+    """Batches that an agent collects, as `learn_curriculum` gives them."""
+    env = CTGraphEnv([task] * agent.num_envs, seed=seed)
+    frames = count * agent.num_envs * agent.num_steps
+    return list(collect(env, agent.policy, frames, agent.num_steps, agent.initial_state))
+
+
+def learnt_from(agent, batch) -> list:
+    """The batches of which the agent minimises the loss when it learns from a batch."""
+    seen, loss = [], agent.loss
+    agent.loss = lambda minibatch: (seen.append(dict(minibatch)), loss(minibatch))[1]
+    agent.learn(batch)
+    agent.loss = loss
+    return seen
+
+
+def agent_of(compose, name: str, env, *overrides: str):
+    """A small agent for the specs of any environment; equal weights for every call."""
+    cfg = compose(f"agent={name}", *SMALL_AGENT[name], *overrides)
+    torch.manual_seed(0)
+    return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+
+
+def saved_and_loaded(state: dict) -> dict:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def parameters_equal(one, other) -> bool:
+    return all(torch.equal(*pair) for pair in zip(one.parameters(), other.parameters(), strict=True))

@@ -1,0 +1,157 @@
+"""Tasks of every kind that a batch may mix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl import (
+    CTGraph,
+    CTGraphEnv,
+    Gradient,
+    Observations,
+    OneHot,
+    PaperImages,
+    ReferenceImages,
+    ReferenceLinear,
+    ReferenceOneHot,
+    Task,
+)
+from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.tasks.switch import Switch
+from helpers.oracles import confounding, fully_observable, one_hot, scripts, surjective
+
+LEGACY = {"legacy_index": True, "noise_before_rotation": True, "reward_cue": True, "cue_wraps": True}
+
+
+def unique(b, d, p=0.0, room=0, goal=None, waits=True, decisions=True, images=OneHot, **variation) -> Task:
+    """Ranges of exactly as many ids as there are states, and room for more."""
+    graph, first, ranges = CTGraph(b, d, p), 2, []
+    for count in (graph.num_wait_states, graph.num_decision_states, graph.num_end_states):
+        ranges.append((first, first + count + room - 1))
+        first += count + room
+    x = Observations(*ranges, unique_waits=waits, unique_decisions=decisions, **variation)
+    return Task(graph, goal or (1,) * d, x, images(first))
+
+
+def read(d=2, p=0.0, episodes=(-1, -1), **shown) -> Task:
+    """A task of a configuration file in which ids are drawn, or what ``shown`` says."""
+    content = {
+        "graph_shape": {"d": d, "b": 2, "p": p},
+        "reward": {"high_r": 1.0, "fail_r": 0.0, "std_r": 0.0, "reward_distribution": "needle_in_haystack"}
+        | dict(zip(("min_static_reward_episodes", "max_static_reward_episodes"), episodes, strict=True)),
+        "observations": {"MDP_D": False, "MDP_W": False, "W_IDs": [2, 6], "D_IDs": [7, 9], "graph_ends": [10, 13]}
+        | shown,
+        "image_dataset": {"seed": 1, "1D": False, "nr_of_images": 64, "noise_on_read": 0, "rotation_on_read": 1},
+    }
+    return Task.from_json(content, goal=(1,) * d)
+
+
+def legacy_number(b: int, path: tuple[int, ...]) -> int:
+    """The digits of the path after a leading 1, read in base b, less one."""
+    return int("1" + "".join(str(a - 1) for a in path), b) - 1
+
+
+FIELDS = {"reward_fn": ReferenceLinear(), "goal_reward": 2.0, "fail_reward": -0.5, "goal_change": (1, 3)}
+
+READ = {"read_noise": 30, "read_rotation": 45}
+
+SWITCHED = [
+    replace(unique(3, 2, 0.3, images=PaperImages, **READ, **LEGACY), **FIELDS, extra_end_step=True),
+    replace(unique(4, 2, images=PaperImages, legacy_index=True), extra_end_step=True, step_reward=-0.25),
+    replace(unique(2, 3, 0.5, 5, decisions=False, images=PaperImages, **LEGACY), goal_change=(2, 2)),
+    replace(
+        confounding(p=0.9, read_noise=9, read_rotation=359, **LEGACY),
+        extra_end_step=True,
+        goal_change=(1, 1),
+        legacy_goal_change=True,
+    ),
+    replace(confounding(3, 2, reward_cue=True, **READ), goal_change=(1, 2)),
+    replace(read(), **FIELDS | {"goal_change": None}, images=ReferenceImages(64, 2, noise=10.5)),
+    replace(read(), observations=Observations((2, 4), (5, 5), (6, 9), (10, 12), (13, 14), unique_ends=True, **LEGACY)),
+    surjective(2, 3, goal=(2, 1, 2)),
+    unique(3, 2, 0.5, images=PaperImages, read_rotation=7),
+]
+
+VECTORS = [
+    replace(unique(3, 2, 0.3, images=ReferenceOneHot, **LEGACY), **FIELDS, legacy_goal_change=True),
+    replace(unique(2, 1, images=ReferenceOneHot, reward_cue=True), reward_fn=ReferenceLinear()),
+    replace(confounding(), images=OneHot(16), extra_end_step=True),
+    replace(confounding(reward_cue=True), images=ReferenceOneHot(20), step_reward=0.5),
+]
+
+
+def seen(rows: Rows, actions: Tensor) -> list[Tensor]:
+    """All that rows show, and their rewards, under a script with finished rows reset: [steps, N, ...] each."""
+    shown, data = rows.reset(), []
+    for action in actions:
+        begins = rows.reset(shown.done).observation
+        shown = rows.step(action)
+        data.append([begins, *shown, rows.reward])
+    return [torch.stack(part) for part in zip(*data, strict=True)]
+
+
+RICH = [
+    replace(confounding(p=0.5, read_noise=9, read_rotation=5, reward_cue=True), goal_change=(2, 3), step_reward=0.5),
+    replace(surjective(3, 2, p=0.2, goal=(3, 1), image_seed=2), reward_fn=Gradient(), reward_std=0.3, fail_reward=-1),
+    surjective(2, 1, goal=(2,), image_seed=3),
+]
+"""Tasks that differ in all that a batch may mix."""
+
+
+def env_of(
+    tasks: list[Task], switch: Switch | None, num_rows: int = 6, seed: int = 3, first_row: int = 0
+) -> CTGraphEnv:
+    """An environment whose rows change between tasks and show the number of theirs."""
+    ids = {task: number for number, task in enumerate(tasks)}
+    env = CTGraphEnv(tasks[:1] * num_rows, seed, first_row, tasks, task_ids=ids)
+    if switch is not None:
+        env.switch_tasks(tasks, switch)
+    return env
+
+
+FILE = {
+    "general_seed": 3,
+    "graph_shape": {"d": 2, "b": 3, "p": 0.2},
+    "reward": {
+        "high_r": 1.0,
+        "fail_r": -0.1,
+        "std_r": 0.2,
+        "reward_distribution": "linear",
+        "min_static_reward_episodes": 2,
+        "max_static_reward_episodes": 4,
+    },
+    "observations": {"MDP_D": True, "MDP_W": False, "W_IDs": [2, 4], "D_IDs": [5, 8], "graph_ends": [9, 17]},
+    "image_dataset": {"seed": 1, "1D": False, "nr_of_images": 18, "noise_on_read": 9, "rotation_on_read": 8},
+}
+
+MIXED = [
+    confounding(p=0.5, read_noise=20, read_rotation=5, reward_cue=True),
+    replace(surjective(3, 3, 0.3), reward_fn=Gradient(), step_reward=0.01, goal_change=(1, 3)),
+    replace(fully_observable(2, 3), reward_fn=ReferenceLinear(), reward_std=0.5, fail_reward=-1.0),
+    Task.from_json(FILE, goal=(1, 2)),
+]
+
+FAMILIES = {
+    "surjective": [surjective()],
+    "fully observable": [fully_observable(2, 3, 0.5)],
+    "confounding": [confounding(p=0.5)],
+    "rotation": [surjective(read_rotation=9)],
+    "noise": [surjective(read_noise=10)],
+    "one-hot": [one_hot(p=0.5)],
+    "reference": [Task.from_json(FILE, goal=(1, 2))],
+    "mixed": MIXED,
+}
+
+
+def calls(num_calls: int, num_rows: int, seed: int = 0) -> list[tuple[str, tuple[Tensor, ...]]]:
+    """Steps with all kinds of resets in between; the first is a reset of all rows."""
+    generator = torch.Generator().manual_seed(seed)
+    made = [("reset", (torch.ones(num_rows, dtype=torch.bool),))]
+    for action, kind in zip(scripts(num_calls, num_rows, 4, seed), scripts(num_calls, 1, 8, seed + 1), strict=True):
+        mask = torch.rand(num_rows, generator=generator) < 0.3
+        steps = {5: ("reset", (mask,)), 6: ("restart", (mask,)), 7: ("step_or_reset", (action, mask))}
+        made.append(steps.get(kind.item(), ("step", (action,))))
+    return made
