@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "agents": "baselines.__main__",
     "curricula": "curricula.__main__",
-    "draw": "ctgraph_rl.visualize.task_figure",
+    "draw": "ctgraph_rl.visualize.draw",
     "export": "ctgraph_rl.log.export",
     "methods": "baselines.methods.__main__",
     "play": "ctgraph_rl.visualize.play",

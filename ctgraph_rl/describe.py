@@ -10,17 +10,19 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctgraph_rl.batch.params import bank_bytes
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import random_frames_to_goal
+from ctgraph_rl.visualize.curriculum_figure import draw_graphs
+from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 FRAMES_PER_SECOND = 18_000
 """What the LSTM-PPO agent of this package learns from on one core, roughly; for estimates of time."""
@@ -53,39 +55,6 @@ class Sheet:
     columns: Mapping[str, str]
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
-
-
-def random_episode_length(task: Task) -> float:
-    """Mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
-
-    A wait state takes (b + 1) / (b + 1 - p) steps and is left for what it leads to with probability
-    w = (1 - p) / (b + 1 - p); a decision state leads on with probability c = b / (b + 1). Hence
-
-        1 + (b + 1) / (b + 1 - p) sum_{k=0..d} (w c)^k + w sum_{k=0..d-1} (w c)^k,
-
-    and w (w c)^d more with an ``extra_end_step``. Correctly rounded, for the float that ``wait_prob`` is.
-    """
-    return float(_random_episode_length(task))
-
-
-def random_frames_to_goal(task: Task) -> float:
-    """Mean frames of the same policy until it first reaches the goal, that step included; failed episodes count.
-
-    Episodes are independent, so this is `random_episode_length` over P_R (Wald's identity), less the step after the
-    goal with an ``extra_end_step``. A goal that changes alters nothing, as the policy prefers none. inf beyond floats.
-    """
-    frames = _random_episode_length(task) / task.graph._exact_reward_prob_random - task.extra_end_step
-    try:
-        return float(frames)
-    except OverflowError:
-        return math.inf
-
-
-def _random_episode_length(task: Task) -> Fraction:
-    b, d, p = task.graph.branching_factor, task.graph.depth, Fraction(task.graph.wait_prob)
-    wait, leaves = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p)
-    reached = [(leaves * b / (b + 1)) ** k for k in range(d + 1)]
-    return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
 
 
 def memory(curriculum: Curriculum) -> tuple[int, int]:
@@ -319,9 +288,6 @@ def _parser(prog: str | None) -> argparse.ArgumentParser:
 
 
 def _describe(curriculum: Curriculum, arguments: argparse.Namespace) -> None:
-    from ctgraph_rl.tasks.similarity import draw_similarity
-    from ctgraph_rl.visualize.curriculum_figure import draw_graphs
-
     _show(describe(curriculum, arguments.frames_per_second), arguments.format)
     if arguments.figure is not None:
         draw_graphs(curriculum, arguments.figure)

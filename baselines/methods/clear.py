@@ -17,9 +17,9 @@ from baselines.methods.method import Method
 from baselines.methods.weights import Weights
 from baselines.networks import Data
 from baselines.policy_gradient import loss_weight
-from ctgraph_rl.batch.params import require_memory
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.memory import require_memory
 
 if TYPE_CHECKING:
     from baselines.learner import Learner

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +15,8 @@ from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
 from ctgraph_rl.core.rotation import taps_of
 from ctgraph_rl.core.tree import TreeParams, tree_params
-from ctgraph_rl.tasks.images import ImageSet, white_level
+from ctgraph_rl.tasks.images import white_level
+from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, require_memory, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
 
 MakeTensor = Callable[..., Tensor]
@@ -62,7 +62,7 @@ def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
 def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int) -> ObservationParams:
     observations = [task.observations for task in tasks]
     by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
-    views, starts = [_num_views(task) for task in tasks], [bank.start[_bank_key(task)] for task in tasks]
+    views, starts = [_num_views(task) for task in tasks], [bank.start[bank_key(task)] for task in tasks]
 
     def first_view(i: int, kind: StateType) -> int:
         skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
@@ -136,44 +136,13 @@ def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[
     )
 
 
-def _turns_late(task: Task) -> bool:
-    """Whether rotations come after noise, so that they cannot be in the bank; without noise the order is the same."""
-    return task.observations.noise_before_rotation and task.observations.read_noise > 0
-
-
 def _num_angles(task: Task) -> int:
-    return task.observations.read_rotation + 1 if _turns_late(task) else 1
+    return task.observations.read_rotation + 1 if rotates_after_noise(task) else 1
 
 
 def _num_views(task: Task) -> int:
     """Bank rows that one id of a task has."""
-    return task.images.num_variants * (_bank_key(task)[1] + 1)
-
-
-def _bank_key(task: Task) -> tuple[ImageSet, int]:
-    """The images of a task and the rotation that is in the bank."""
-    return task.images, 0 if _turns_late(task) else task.observations.read_rotation
-
-
-def bank_bytes(tasks: Iterable[Task]) -> int:
-    """Bytes of the images that an environment holds for tasks: each different set once, one-hot vectors padded."""
-    sets = {_bank_key(task): math.prod(task.images.shape) for task in tasks}
-    shown = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
-    return shown * max(sets.values())
-
-
-def require_memory(what: str, needed: int, fewer: str) -> None:
-    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
-
-    Args:
-        what: needs memory.
-        needed: bytes at least.
-        fewer: of what to use fewer.
-    """
-    if not hasattr(os, "sysconf"):
-        return
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    require((needed < memory, f"{what} need {needed:,} bytes, this machine has {memory:,}; use fewer {fewer}"))
+    return task.images.num_variants * (bank_key(task)[1] + 1)
 
 
 class Bank(NamedTuple):
@@ -181,7 +150,7 @@ class Bank(NamedTuple):
 
     images: Tensor  # uint8 [rows, *shape]
     shape: tuple[int, ...]  # of an observation
-    start: dict[tuple[ImageSet, int], int]  # the first row of each image set and rotation
+    start: dict[BankKey, int]  # the first row of each image set and rotation
     noise_levels: tuple[int, ...]  # the different values of ``read_noise``
 
 
@@ -199,7 +168,7 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     require_memory("images and observations", needed, "images or rows")
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
     banks, starts, rows = [], {}, 0
-    for key in dict.fromkeys(map(_bank_key, pool)):
+    for key in dict.fromkeys(map(bank_key, pool)):
         images, rotation = key
         bank = images.bank(rotation)
         if one_hot:

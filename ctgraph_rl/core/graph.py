@@ -115,8 +115,8 @@ class CTGraph:
         return self.node_at(goal) - self.num_decision_states
 
     @property
-    def _exact_reward_prob_random(self) -> Fraction:
-        """P_R without rounding, for the float that ``wait_prob`` is."""
+    def exact_reward_prob_random(self) -> Fraction:
+        """P_R without rounding, for the float that ``wait_prob`` is; see `reward_prob_random`."""
         b, p = self.branching_factor, Fraction(self.wait_prob)
         return (b + 1) * ((1 - p) / ((b + 1) * (b + 1 - p))) ** (self.depth + 1)
 
@@ -127,7 +127,7 @@ class CTGraph:
         (b + 1) * ((1 - p) / ((b + 1) (b + 1 - p)))^(d + 1), the paper's closed form, correctly rounded. Below the
         smallest float it is 0.0: see `log_reward_prob_random`.
         """
-        return float(self._exact_reward_prob_random)
+        return float(self.exact_reward_prob_random)
 
     @property
     def log_reward_prob_random(self) -> float:
@@ -138,7 +138,7 @@ class CTGraph:
     @property
     def end_prob_random(self) -> float:
         """P_E: the probability that a uniformly random policy reaches any end state, b^d P_R, correctly rounded."""
-        return float(self.num_end_states * self._exact_reward_prob_random)
+        return float(self.num_end_states * self.exact_reward_prob_random)
 
     @property
     def log_end_prob_random(self) -> float:

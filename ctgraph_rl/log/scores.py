@@ -10,12 +10,12 @@ from torch import Tensor
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import require
-from ctgraph_rl.describe import random_frames_to_goal
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric
 from ctgraph_rl.metrics.record import Undefined
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import random_frames_to_goal
 
 NO_EXPERTS = "no experts were given"
 

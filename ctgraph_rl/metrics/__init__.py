@@ -56,7 +56,6 @@ from ctgraph_rl.metrics.matrix import (
 )
 from ctgraph_rl.metrics.optimum import (
     STAGES,
-    expected_random_frames,
     frames_to_first_reward,
     normalised_performance,
     regret,
@@ -171,7 +170,6 @@ __all__ = [
     "continual_world_forward_transfer",
     "continual_world_performance",
     "definitions",
-    "expected_random_frames",
     "forgetting",
     "forward_transfer",
     "forward_transfer_contrast",

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -77,7 +76,7 @@ def frames_to_first_reward(
         frames: for each task, frames since its start at the end of each interval, [intervals].
         episodes: for each task, finished episodes of each interval.
         success_rates: for each task, share of each interval's episodes that reached the goal; NaN without episodes.
-        random_frames: for each task, `expected_random_frames`.
+        random_frames: for each task, `ctgraph_rl.tasks.values.random_frames_to_goal`.
     """
     return _at_first_success(frames, episodes, success_rates) / torch.tensor(random_frames, dtype=torch.float64)
 
@@ -117,24 +116,6 @@ def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MA
     """
     stages = (end_rates >= mastered).double() + (success_rates >= mastered).double()
     return torch.where(end_rates.isnan() | success_rates.isnan(), torch.nan, stages)
-
-
-def expected_random_frames(branching_factor: int, depth: int, wait_prob: float) -> float:
-    """Mean frames until the uniformly random policy gets the reward: E[episode length] / P_R, by Wald's identity.
-
-    With b + 1 actions, a wait state is left for what follows with probability w = (1 - p) / (b + 1 - p) after
-    (b + 1) / (b + 1 - p) steps on average, and a decision state with b / (b + 1) after one; one step is at home.
-
-    Args:
-        branching_factor: b.
-        depth: d.
-        wait_prob: p.
-    """
-    b, p = branching_factor, wait_prob
-    wait, leaves, decides = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p), b / (b + 1)
-    reached = list(accumulate(range(depth), lambda share, _: share * leaves * decides, initial=1.0))
-    length = 1 + sum(share * wait for share in reached) + sum(share * leaves for share in reached[:-1])
-    return length / (leaves ** (depth + 1) / (b + 1) ** depth)
 
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from ctgraph_rl.log.files import AGENT, CURRICULUM
 from ctgraph_rl.report.style import WIDTH, short
+from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
-
-if TYPE_CHECKING:
-    from ctgraph_rl.runs.load import Trained
-    from ctgraph_rl.tasks.curriculum import Curriculum
-    from ctgraph_rl.visualize.visits import Visits
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.visualize.task_figure import draw_task
+from ctgraph_rl.visualize.visits import Visits, visits
 
 MOST_TREES = 8
 COLUMNS = 2
@@ -29,9 +29,6 @@ class Trees(NamedTuple):
 def draw_trees(trees: Trees, seed: int) -> Any:
     """A panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     from matplotlib.figure import Figure
-
-    from ctgraph_rl.visualize.task_figure import draw_task
-    from ctgraph_rl.visualize.visits import Visits
 
     assert trees.curriculum is not None
     tasks = list(zip(trees.curriculum.tasks, trees.curriculum.labels, strict=True))[:MOST_TREES]
@@ -55,10 +52,6 @@ def _height(depth: int) -> float:
 
 def find_trees(run: Run) -> Trees:
     """The agent and the curriculum of a run as far as its directory has them."""
-    from ctgraph_rl.log.files import AGENT, CURRICULUM
-    from ctgraph_rl.runs.load import load
-    from ctgraph_rl.tasks.curriculum import Curriculum
-
     reason = f"{run.path} has no {AGENT}, the weights of its agent"
     try:
         if (run.path / AGENT).exists():
@@ -73,9 +66,15 @@ def find_trees(run: Run) -> Trees:
 
 
 def _visits(trained: Trained, task: Any, seed: int) -> Visits:
-    from ctgraph_rl.visualize.visits import visits
-
     curriculum, state = trained.curriculum, trained.agent.initial_state
     per_row = curriculum.evaluation.episodes_per_row
     episodes = per_row * math.ceil(EPISODES / per_row)
-    return visits(task, trained.policy_for(task), state, episodes, seed, True, per_row, curriculum)
+    return visits(
+        task,
+        trained.policy_for(task),
+        state,
+        num_episodes=episodes,
+        seed=seed,
+        episodes_per_row=per_row,
+        curriculum=curriculum,
+    )

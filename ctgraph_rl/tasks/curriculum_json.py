@@ -19,12 +19,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.batch.params import bank_bytes
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
 from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot, PaperImages
+from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.reference import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift

@@ -1,4 +1,4 @@
-"""How alike tasks are: exact measures of goals, optimal actions, images and graphs, as matrices and as heat maps.
+"""How alike tasks are: exact measures of goals, optimal actions, images and graphs, as matrices.
 
 All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the decisions that lead to them, in
 the *common tree*: decisions and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
@@ -15,30 +15,24 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.batch.params import bank_bytes
 from ctgraph_rl.checks import fraction, require, require_all
 from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet
+from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.tasks.values import MAX_ENUMERATED_STATES, _is_needle, _Optimal, _tree
-from ctgraph_rl.visualize.curriculum_figure import new_figure
+from ctgraph_rl.tasks.values import MAX_ENUMERATED_STATES, BestActions, is_needle, smallest_tree
 
 ROUNDING = 1e-9
 """Actions whose values differ by no more than this, relative to the largest value of the task, are equally good."""
 
 MAX_COMPARED_BYTES = 2**31
 """Largest image set whose images are compared."""
-
-MOST_NUMBERS, MOST_LABELS = 8, 40
-"""Tasks up to which a heat map shows numbers and labels."""
 
 CHOOSING = (StateType.WAIT, StateType.DECISION)
 """The states whose actions matter: home leads on whatever the action."""
@@ -136,55 +130,12 @@ MEASURES: dict[str, Callable[[Sequence[Task]], Tensor]] = {
 """All measures by what they measure."""
 
 
-def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
-    """Draw a heat map of each measure over a curriculum's tasks.
-
-    Args:
-        curriculum: its tasks, in order of first appearance.
-        path: the picture to write; its ending decides the format.
-
-    Raises:
-        ModuleNotFoundError: without matplotlib; names the extra to install.
-        ValueError: for tasks too large for a measure.
-    """
-    figure = new_figure(12, 7.6)
-    figure.suptitle(f"{curriculum.name}: similarity of {len(curriculum.tasks)} tasks")
-    *panels, last = figure.subplots(2, 3).flat
-    for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
-        image = _draw_matrix(axes, measure(curriculum.tasks), curriculum.labels, title)
-    last.axis("off")
-    figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
-    figure.savefig(path, dpi=160)
-
-
-def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -> Any:
-    axes.set_facecolor("white")
-    axes.patch.set(hatch="////", edgecolor="grey")
-    image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
-    axes.set_title(title, fontsize=9)
-    if len(labels) > MOST_LABELS:
-        axes.set(xlabel="task, from 0", ylabel="task, from 0")
-        return image
-    size = max(4, 8 - len(labels) // 8)
-    axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
-    axes.set_yticks(range(len(labels)), labels, fontsize=size)
-    if len(labels) <= MOST_NUMBERS:
-        for i, j in torch.cartesian_prod(*2 * [torch.arange(len(labels))]).tolist():
-            _write_number(axes, i, j, matrix[i, j].item())
-    return image
-
-
-def _write_number(axes: Any, i: int, j: int, value: float) -> None:
-    if not math.isnan(value):
-        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if value > 0.6 else "black")
-
-
 def _tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
     return require_all(Task, "tasks", tasks)
 
 
 def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
-    """A symmetric measure of all pairs; float64 [n, n]."""
+    """Return a symmetric measure of all pairs; float64 [n, n]."""
     matrix = torch.zeros(len(items), len(items), dtype=torch.float64)
     for i, one in enumerate(items):
         for j, other in enumerate(items[: i + 1]):
@@ -235,12 +186,12 @@ class _Choices:
 def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
     require(*fraction(gamma=gamma))
     num_actions = 1 + max(task.graph.branching_factor for task in tasks)
-    return [_Choices(task, _optimal_sets(task, gamma, num_actions), _is_needle(task)) for task in tasks]
+    return [_Choices(task, _optimal_sets(task, gamma, num_actions), is_needle(task)) for task in tasks]
 
 
 def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[StateType, int], list[int]]:
     """Backward induction from the end states, as `values` does it, that keeps what is optimal."""
-    tree, best = _tree(task, _is_needle(task)), _Optimal(task, gamma)
+    tree, best = smallest_tree(task, is_needle(task)), BestActions(task, gamma)
     step, p = task.step_reward, task.graph.wait_prob
     fails, margin = step + task.fail_reward, ROUNDING * _largest(task)
     arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)

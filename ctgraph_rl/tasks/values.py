@@ -1,4 +1,4 @@
-"""What policies are worth: exact values by backward induction, and the ceiling of policies without memory.
+"""Exact values of policies by backward induction, the ceiling of those without memory, and random episodes.
 
 The tree has no cycles but the waiting in place, so values follow from the end states back to home in one pass. With
 reward r_(t+1) for step t (the first step has t = 0) a return is sum_t gamma^t r_(t+1); every episode ends, so gamma
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import torch
@@ -51,7 +52,7 @@ def optimal_value(task: Task, gamma: float) -> float:
         ValueError: for a gamma out of range, and rewards other than `Needle` beyond `MAX_ENUMERATED_STATES` states.
     """
     require(*fraction(gamma=gamma))
-    return _value_at_home(_tree(task, _is_needle(task)), _Optimal(task, gamma))
+    return _value_at_home(smallest_tree(task, is_needle(task)), BestActions(task, gamma))
 
 
 def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
@@ -73,7 +74,7 @@ def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
     require(*fraction(gamma=gamma), *_policy_rules(task, policy))
     shared = not (task.observations.unique_waits or task.observations.unique_decisions)
     chooser = _Memoryless(task, gamma, policy.detach().to("cpu", torch.float64))
-    return _value_at_home(_tree(task, _is_needle(task) and shared), chooser)
+    return _value_at_home(smallest_tree(task, is_needle(task) and shared), chooser)
 
 
 def success_prob(task: Task, policy: Tensor) -> float:
@@ -112,6 +113,32 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     return task.goal_reward * math.prod(share**count for share, count in zip(shares, counts, strict=True))
 
 
+def random_episode_length(task: Task) -> float:
+    """Return the mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
+
+    A wait state takes (b + 1) / (b + 1 - p) steps and is left for what it leads to with probability
+    w = (1 - p) / (b + 1 - p); a decision state leads on with probability c = b / (b + 1). Hence
+
+        1 + (b + 1) / (b + 1 - p) sum_{k=0..d} (w c)^k + w sum_{k=0..d-1} (w c)^k,
+
+    and w (w c)^d more with an ``extra_end_step``. Correctly rounded, for the float that ``wait_prob`` is.
+    """
+    return float(_random_episode_length(task))
+
+
+def random_frames_to_goal(task: Task) -> float:
+    """Return the mean frames of that policy until it first reaches the goal, this step and failed episodes included.
+
+    Episodes are independent, so this is `random_episode_length` over P_R (Wald's identity), less the step after the
+    goal with an ``extra_end_step``. A goal that changes alters nothing, as the policy prefers none. inf beyond floats.
+    """
+    frames = _random_episode_length(task) / task.graph.exact_reward_prob_random - task.extra_end_step
+    try:
+        return float(frames)
+    except OverflowError:
+        return math.inf
+
+
 def _divided(num_ids: int, counts: list[int]) -> list[float]:
     """Shares n_a / K with sum n_a = K, integer n_a, that maximise prod (n_a / K)^c_a.
 
@@ -128,7 +155,14 @@ def _divided(num_ids: int, counts: list[int]) -> list[float]:
     return [n / num_ids for n in ids]
 
 
-def _value_at_home(tree: _EveryNode | _GoalPath, chooser: _Optimal | _Memoryless) -> float:
+def _random_episode_length(task: Task) -> Fraction:
+    b, d, p = task.graph.branching_factor, task.graph.depth, Fraction(task.graph.wait_prob)
+    wait, leaves = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p)
+    reached = [(leaves * b / (b + 1)) ** k for k in range(d + 1)]
+    return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
+
+
+def _value_at_home(tree: _EveryNode | _GoalPath, chooser: BestActions | _Memoryless) -> float:
     """Backward induction from the end states to home, whose step is not rewarded and leads to the root's wait state."""
     after_end = chooser.gamma * tree.task.step_reward if tree.task.extra_end_step else 0.0
     values = chooser.at_wait(tree.end_rewards() + after_end, tree.task.graph.depth)
@@ -138,7 +172,7 @@ def _value_at_home(tree: _EveryNode | _GoalPath, chooser: _Optimal | _Memoryless
     return tree.task.step_reward + chooser.gamma * values[0].item()
 
 
-def _tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
+def smallest_tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
     """The smallest tree that is exact."""
     if collapses:
         return _GoalPath(task)
@@ -187,7 +221,7 @@ class _GoalPath:
 
 
 @dataclass(frozen=True)
-class _Optimal:
+class BestActions:
     """The best choice at every node."""
 
     task: Task
@@ -234,7 +268,8 @@ class _Memoryless:
         return self.policy[first + number % (last - first + 1)]
 
 
-def _is_needle(task: Task) -> bool:
+def is_needle(task: Task) -> bool:
+    """Return whether only the goal pays, so that a tree collapses to the path to it and one node off it."""
     return task.reward_fn == Needle()
 
 
@@ -257,7 +292,7 @@ def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
     shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
     only = "the memoryless ceiling is exact only for"
     return [
-        (_is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
+        (is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
         (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
         (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
         (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),

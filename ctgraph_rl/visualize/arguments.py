@@ -10,6 +10,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.cli import curriculum_named
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
+from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -30,13 +31,13 @@ CHANGES: dict[str, type] = {
 """Arguments of `make_task` that are plain numbers."""
 
 
-class Choice(NamedTuple):
-    """What was chosen.
+class Selection(NamedTuple):
+    """A task, and the policy that acts in it.
 
     Args:
         task: the task.
         name: what to call it.
-        policy: who acts, as for `evaluate`; None: nobody was named.
+        policy: as for `evaluate`; None: none was named.
         initial_state: of a recurrent policy.
         curriculum: that a trained policy learned.
     """
@@ -48,20 +49,27 @@ class Choice(NamedTuple):
     curriculum: Curriculum | None = None
 
     def player(self, seed: int, greedy: bool = True) -> Player:
-        """The policy in an environment of its own."""
-        return Player(self.task, self.policy, self.initial_state, seed, greedy, self.curriculum)
+        """Return the policy in an environment of its own."""
+        return Player(self.task, self.policy, self.initial_state, seed=seed, greedy=greedy, curriculum=self.curriculum)
 
     def visits(self, num_episodes: int, seed: int, greedy: bool = True) -> Visits:
-        """Where the policy goes; as many episodes follow each other in a row as the curriculum says."""
+        """Count where the policy goes; as many episodes follow each other in a row as the curriculum says."""
         assert self.policy is not None
         in_row = 1 if self.curriculum is None else self.curriculum.evaluation.episodes_per_row
-        whole = max(1, num_episodes // in_row) * in_row
-        how = (whole, seed, greedy, in_row, self.curriculum)
-        return visits(self.task, self.policy, self.initial_state, *how)
+        return visits(
+            self.task,
+            self.policy,
+            self.initial_state,
+            num_episodes=max(1, num_episodes // in_row) * in_row,
+            seed=seed,
+            greedy=greedy,
+            episodes_per_row=in_row,
+            curriculum=self.curriculum,
+        )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What names a task and a policy."""
+    """Add the arguments that name a task and a policy."""
     names = ", ".join(CONFIGURATIONS)
     about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: numbers alone"
     parser.add_argument("name", nargs="?", help=about)
@@ -79,8 +87,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the environment")
 
 
-def choose(arguments: argparse.Namespace) -> Choice:
-    """The task and the policy that are named.
+def select(arguments: argparse.Namespace) -> Selection:
+    """Return the task and the policy that are named.
 
     Raises:
         ValueError: for names that are unknown and what does not go together.
@@ -97,12 +105,12 @@ def choose(arguments: argparse.Namespace) -> Choice:
 
 
 def decisions(text: str) -> tuple[int, ...]:
-    """``1.2`` as a goal."""
+    """Read ``1.2`` as a goal."""
     return tuple(map(int, text.split(".")))
 
 
-def _named(name: str | None, number: int, changes: dict[str, Any]) -> Choice:
-    """A task without a policy."""
+def _named(name: str | None, number: int, changes: dict[str, Any]) -> Selection:
+    """Return a task without a policy."""
     if name is None:
         return _called("CT-graph", make_task(**changes))
     if name.endswith(".json"):
@@ -113,21 +121,19 @@ def _named(name: str | None, number: int, changes: dict[str, Any]) -> Choice:
     return _of_curriculum(curriculum_named(name), number)
 
 
-def _called(name: str, task: Task) -> Choice:
-    return Choice(task, f"{name}, goal {in_digits(task.goal, '.')}")
+def _called(name: str, task: Task) -> Selection:
+    return Selection(task, f"{name}, goal {in_digits(task.goal, '.')}")
 
 
-def _of_curriculum(curriculum: Curriculum, number: int) -> Choice:
+def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
     tasks, labels = curriculum.tasks, curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
     require((is_int(number, 1, len(tasks)), rule))
-    return Choice(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
+    return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
 
 
-def _of_run(run: Path, number: int) -> Choice:
-    from ctgraph_rl.runs.load import load
-
+def _of_run(run: Path, number: int) -> Selection:
     trained = load(run)
-    chosen = _of_curriculum(trained.curriculum, number)
-    policy, initial_state = trained.policy_for(chosen.task), trained.agent.initial_state
-    return chosen._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)
+    selection = _of_curriculum(trained.curriculum, number)
+    policy, initial_state = trained.policy_for(selection.task), trained.agent.initial_state
+    return selection._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

@@ -1,7 +1,6 @@
-"""The style of all pictures of trees, and the graphs and goals of a curriculum as a figure with a panel for each graph.
+"""The graphs and goals of a curriculum as a figure with a panel for each graph.
 
-Every kind of state has a colour and a shape of its own, so a grey print and any colour vision keep them apart. The
-panels leave wait states out: there is one before each decision and end state.
+The panels leave wait states out: there is one before each decision and end state.
 """
 
 from __future__ import annotations
@@ -11,28 +10,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.batch.render import GOAL, PALETTE
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
+from ctgraph_rl.visualize.style import DPI, Point, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
 """End states up to which labels stand level."""
 COLUMNS = 3
-DPI = 160
-
-MARKERS = {
-    StateType.HOME: "p",
-    StateType.WAIT: "o",
-    StateType.DECISION: "D",
-    StateType.END: "s",
-    StateType.FAIL: "8",
-}
-"""Pentagon, circle, diamond, square and octagon."""
 
 Goal = tuple[int, ...]
-Point = tuple[float, float]
 
 
 def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
@@ -59,57 +47,6 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
         panel.axis("off")
     figure.supxlabel("diamond: decision state    square: end state    star: goal, with its decisions", fontsize=9)
     figure.savefig(path, dpi=DPI)
-
-
-def new_figure(width: float, height: float) -> Any:
-    """An empty figure, sizes in inches.
-
-    Raises:
-        ModuleNotFoundError: without matplotlib; names the extra to install.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def colour(number: int) -> str:
-    """The colour of a kind of state, or of another thing of `ctgraph_rl.batch.render`'s palette, as ``#rrggbb``."""
-    return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
-
-
-def mark(kind: StateType, size: float) -> dict[str, Any]:
-    """How a state is drawn, for matplotlib; sizes in points."""
-    edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
-    size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
-    return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
-
-
-def goal_mark(size: float) -> dict[str, Any]:
-    """How a goal is drawn: the star of `ctgraph_rl.batch.render`."""
-    edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
-    return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
-
-
-def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> None:
-    """Draw straight lines behind the states."""
-    from matplotlib.collections import LineCollection
-
-    look: dict[str, Any] = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
-    axes.add_collection(LineCollection(list(lines), **look))
-
-
-def stub_lines(layout: Layout, places: Mapping[int, Point], height: float) -> list[list[Point]]:
-    """Short lines from the states drawn towards branches that are not, left or right of those that are."""
-    reach = 1 / max(len(layout.leaves), 3) / 7
-    ends = [(places[node], side) for node, side in layout.stubs]
-    return [[(x, y), (x + side * reach, y - height)] for (x, y), side in ends]
-
-
-def shape_of(graph: CTGraph) -> str:
-    """A graph's three numbers in a title."""
-    return f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
 
 
 def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:

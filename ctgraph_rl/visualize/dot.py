@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.curriculum_figure import colour
 from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.states import (
     DECISION,
@@ -21,6 +20,7 @@ from ctgraph_rl.visualize.states import (
     ids_text,
     states,
 )
+from ctgraph_rl.visualize.style import colour
 
 MOST_LEAVES = 1024
 """End states up to which a file has the whole tree."""

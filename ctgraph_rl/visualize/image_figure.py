@@ -1,4 +1,4 @@
-"""A picture of what a task's states look like: images of each kind of state, and how they vary when they are read."""
+"""A figure of what a task's states look like: images of each kind of state, and how they vary when they are read."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.curriculum_figure import new_figure
+from ctgraph_rl.visualize.style import new_figure
 
 MOST_IDS = 3
 """Ids of each kind of state that are shown with their variation."""

@@ -25,7 +25,7 @@ from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.images import white_level
-from ctgraph_rl.visualize.arguments import Choice, add_arguments, choose
+from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.states import kind_of
@@ -255,19 +255,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         delay_rule = f"--delay must be seconds >= 0, got {arguments.delay}"
         require((is_real(arguments.delay, 0), delay_rule), *at_least_one(episodes=arguments.episodes))
-        choice = choose(arguments)
-        game = Game(choice.player(arguments.seed, not arguments.sampled), Console(highlight=False))
+        selection = select(arguments)
+        game = Game(selection.player(arguments.seed, not arguments.sampled), Console(highlight=False))
     except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(str(error))
     try:
-        _run(game, choice, arguments)
+        _run(game, selection, arguments)
     except KeyboardInterrupt:
         print()
     game.console.print(Text(game.score()), soft_wrap=True)
 
 
-def _run(game: Game, choice: Choice, arguments: argparse.Namespace) -> None:
-    if choice.policy is not None:
+def _run(game: Game, selection: Selection, arguments: argparse.Namespace) -> None:
+    if selection.policy is not None:
         watch(game, arguments.episodes, arguments.delay)
         return
     with keyboard(sys.stdin, game.graph.branching_factor) as keys:

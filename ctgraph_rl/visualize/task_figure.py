@@ -1,29 +1,12 @@
-"""A picture of one task: its graph with what its states show, or with what a policy does there.
-
-``ctgraph-rl draw TASK --figure FILE`` draws it, and the task's images, a DOT file or a film of an episode.
-"""
+"""A figure of one task: its graph with what its states show, or with what a policy does there."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.curriculum_figure import (
-    DPI,
-    Point,
-    colour,
-    draw_lines,
-    goal_mark,
-    mark,
-    new_figure,
-    shape_of,
-    stub_lines,
-)
 from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_PATHS, in_digits, lay_out
 from ctgraph_rl.visualize.states import (
     DECISION,
@@ -39,9 +22,7 @@ from ctgraph_rl.visualize.states import (
     ids_text,
     states,
 )
-
-if TYPE_CHECKING:
-    from ctgraph_rl.visualize.arguments import Choice
+from ctgraph_rl.visualize.style import Point, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 
 Counts = Mapping[Any, float]
 PerAction = Mapping[Any, Any]
@@ -325,65 +306,3 @@ def _short(count: float) -> str:
     if count >= 1e6:
         return f"{count / 1e6:.0f}M"
     return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:.4g}"
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command line, ``ctgraph-rl draw``."""
-    from ctgraph_rl.visualize.arguments import choose
-
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    if not (arguments.figure or arguments.dot or arguments.gif):
-        parser.error("nothing to write: name a --figure, --dot or --gif")
-    try:
-        _write(choose(arguments), arguments)
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(str(error))
-
-
-def _parser() -> argparse.ArgumentParser:
-    from ctgraph_rl.visualize.arguments import add_arguments
-
-    parser = argparse.ArgumentParser(description="Draw a task; with a policy, what it does there.")
-    add_arguments(parser)
-    what = "what a figure has: observation ids in the states, their kinds, or the images"
-    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
-    parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
-    parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
-    parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
-    parser.add_argument("--episodes", type=int, default=1000, help="that visits are counted in; default: 1000")
-    return parser
-
-
-def _write(choice: Choice, arguments: argparse.Namespace) -> None:
-    """Write all that is asked for."""
-    from ctgraph_rl.visualize.dot import to_dot
-    from ctgraph_rl.visualize.gif import save_gif
-
-    films = arguments.gif is None or choice.policy is not None
-    require(
-        (films, "a film needs somebody who acts: name a --policy or a --run"),
-        *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes),
-    )
-    if arguments.figure is not None:
-        _figure(choice, arguments).savefig(arguments.figure, dpi=arguments.dpi)
-    if arguments.dot is not None:
-        arguments.dot.write_text(to_dot(choice.task, choice.name), encoding="utf-8")
-    if arguments.gif is not None:
-        save_gif(choice.player(arguments.seed, not arguments.sampled), arguments.gif)
-
-
-def _figure(choice: Choice, arguments: argparse.Namespace) -> Any:
-    from ctgraph_rl.visualize.image_figure import image_figure
-
-    if arguments.show == "images":
-        return image_figure(choice.task, arguments.seed)
-    if choice.policy is None:
-        return task_figure(choice.task, ids=arguments.show == "ids")
-    seen = choice.visits(arguments.episodes, arguments.seed, not arguments.sampled)
-    return task_figure(choice.task, visits=seen.counts, policy=seen.actions)
-
-
-if __name__ == "__main__":
-    main()

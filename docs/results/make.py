@@ -105,7 +105,7 @@ def ceilings(configuration: str, goal: str) -> list[str]:
 def ladder(raw: Raw) -> str:
     """A line for each agent, a column for each depth: seeds that solved it; and how often chance finds the goal."""
     import curricula
-    from ctgraph_rl.describe import random_frames_to_goal
+    from ctgraph_rl.tasks.values import random_frames_to_goal
 
     of = groups(raw, "agent", "depth")
     depths = sorted({depth for _, depth in of}, key=int)

@@ -10,6 +10,7 @@ import pytest
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, metrics
 from ctgraph_rl.log.scores import optimal_values, scores
 from ctgraph_rl.tasks.configurations import ct_su_b1
+from ctgraph_rl.tasks.values import random_frames_to_goal
 
 TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
 CURRICULUM = Curriculum("two", 1, "here", (Block(TASKS[0], 200), Block(TASKS[1], 200)), Evaluation(every=100))
@@ -66,7 +67,7 @@ def test_what_is_known_in_closed_form_is_taken_from_the_tasks(log):
     assert found["normalised_performance"].terms == (0.25, 1.0)
     assert found["stage_reached"].terms == (1.0, 2.0)
     assert found["regret"].terms == (9.0, 0.0, 0.0, 5.0)
-    random_frames = metrics.expected_random_frames(2, 2, 0.0)
+    random_frames = random_frames_to_goal(TASKS[0])
     places = 100 * (11 / 2) / 10, 100 + 100 * (11 / 6) / 10
     assert found["frames_to_first_reward"].terms == pytest.approx(
         [place / random_frames for place in places], rel=1e-12
@@ -188,7 +189,7 @@ def test_frames_count_from_where_the_curriculum_says_that_a_block_starts(log):
 
     frames = scores(log, CURRICULUM)["frames_to_first_reward"].terms[1]
 
-    assert frames * metrics.expected_random_frames(2, 2, 0.0) == pytest.approx(100 + 110 / 6)
+    assert frames * random_frames_to_goal(TASKS[0]) == pytest.approx(100 + 110 / 6)
 
 
 def test_blocks_of_several_tasks_leave_the_lifelong_metrics_undefined(log):

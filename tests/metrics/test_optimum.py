@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from ctgraph_rl import CTGraph, CTGraphEnv, evaluate, metrics
-from ctgraph_rl.policies import OptimalPolicy, RandomPolicy
+from ctgraph_rl import CTGraph, evaluate, metrics
+from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.tasks.configurations import ct_su_b1
 
 NAN = math.nan
@@ -98,32 +98,3 @@ def test_a_task_that_was_not_evaluated_has_no_stage():
     metric = metrics.stage_reached(tensor([1.0, NAN]), tensor([1.0, NAN]))
 
     assert (metric.value, metric.terms) == (None, (2.0, None))
-
-
-@pytest.mark.parametrize(("b", "d", "p"), [(2, 1, 0.0), (2, 2, 0.5), (3, 2, 0.9), (2, 4, 0.25)])
-def test_expected_random_frames_solve_the_chain_of_the_random_policy(b, d, p):
-    leave, stay, decide = (1 - p) / (b + 1), p / (b + 1), 1 / (b + 1)
-    phases = [*(["wait", "decide"] * d), "wait"]
-    steps, share = [0.0], [1.0]  # from an end state on, backwards: remaining steps, and the chance of the goal
-    for phase in reversed(phases):
-        onward = leave if phase == "wait" else decide
-        staying = stay if phase == "wait" else 0.0
-        branches = 1 if phase == "wait" else b
-        steps.append((1 + branches * onward * steps[-1]) / (1 - staying))
-        share.append(onward * share[-1] / (1 - staying))
-
-    expected = metrics.expected_random_frames(b, d, p)
-
-    assert share[-1] == pytest.approx(CTGraph(b, d, p).reward_prob_random, rel=1e-12)
-    assert expected == pytest.approx((1 + steps[-1]) / share[-1], rel=1e-12)
-
-
-def test_the_random_policy_needs_the_expected_frames():
-    torch.manual_seed(0)
-    env = CTGraphEnv([ct_su_b1((1, 1))] * 512, seed=3)
-    data = env.rollout(400, RandomPolicy(env), break_when_any_done=False)
-
-    goals = (data["next", "outcome"][data["next", "done"]] == 3).sum().item()
-
-    expected = data.numel() / metrics.expected_random_frames(2, 2, 0.0)
-    assert abs(goals - expected) < 5 * expected**0.5

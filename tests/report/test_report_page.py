@@ -20,7 +20,7 @@ from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
 from ctgraph_rl.runs.load import Trained
 from ctgraph_rl.runs.read import find_runs
-from ctgraph_rl.visualize import visits
+from ctgraph_rl.visualize.visits import Visits
 
 for package in ("matplotlib", "jinja2", "scipy"):
     pytest.importorskip(package)
@@ -165,11 +165,11 @@ def test_a_run_without_weights_says_so_and_trees_are_drawn_without_a_policy(tmp_
 def test_on_the_trees_each_task_is_played_with_what_acts_in_it(monkeypatch):
     learned, played = curricula.load("ct2_interfering"), []  # ids with every observation
 
-    def play(task, policy, *_):
+    def play(task, policy, *_, **__):
         played.append((task, policy))
-        return visits.Visits({}, {})
+        return Visits({}, {})
 
-    monkeypatch.setattr(visits, "visits", play)
+    monkeypatch.setattr("ctgraph_rl.report.trees.visits", play)
     agent = SimpleNamespace(policy="the present one", policy_for=lambda number: number, initial_state=None)
     draw_trees(Trees(learned, Trained(agent, learned, 0, 0, RunLog()), ""), 0)
 

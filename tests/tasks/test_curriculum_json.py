@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import curricula
-from ctgraph_rl.batch import params
 from ctgraph_rl.core import rewards
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
@@ -19,6 +18,7 @@ from ctgraph_rl.tasks import curriculum_json as exchange
 from ctgraph_rl.tasks import images, reference, switch
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
 from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot
+from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.reference import ReferenceImages
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
@@ -258,9 +258,9 @@ def test_a_file_that_is_too_large_or_missing_is_refused_with_its_name(tmp_path, 
 def test_a_bank_holds_each_set_once_and_pads_vectors():
     rotated = replace(A, observations=replace(A.observations, read_rotation=2))
 
-    assert params.bank_bytes([A, B, replace(A, images=ReferenceImages(7))]) == (5 + 7) * 144
-    assert params.bank_bytes([A, rotated]) == (5 + 5 * 3) * 144
-    assert params.bank_bytes([one_hot(), one_hot(images=OneHot(9))]) == (5 + 9) * 9
+    assert bank_bytes([A, B, replace(A, images=ReferenceImages(7))]) == (5 + 7) * 144
+    assert bank_bytes([A, rotated]) == (5 + 5 * 3) * 144
+    assert bank_bytes([one_hot(), one_hot(images=OneHot(9))]) == (5 + 9) * 9
 
 
 TASKS = st.sampled_from(

@@ -1,6 +1,5 @@
 """Measures of similarity against hand calculation, plain enumeration, and what the environment shows."""
 
-import builtins
 import math
 from dataclasses import dataclass, replace
 from itertools import product
@@ -14,13 +13,11 @@ import curricula
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.core.rewards import Arrival, Gradient
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.tasks.curriculum import Block, Curriculum
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.reference import ReferenceImages
 from ctgraph_rl.tasks.similarity import (
     MEASURES,
-    draw_similarity,
     graph_containment,
     observation_agreement,
     shared_decisions,
@@ -306,26 +303,3 @@ def test_what_cannot_be_compared_is_refused():
         state_agreement([dense])
     with pytest.raises(ValueError, match="images of 1,000,000,000,000 bytes are too many to compare"):
         shared_images([huge])
-
-
-@pytest.mark.parametrize("num_tasks", [1, 3, 41])
-def test_the_heat_maps_are_drawn_for_few_and_many_tasks(tmp_path, num_tasks):
-    blocks = tuple(Block(surjective(goal=GOALS[i % 3], image_seed=i), 1) for i in range(num_tasks))
-
-    draw_similarity(Curriculum("c", 1, "", blocks), tmp_path / "map.png")
-
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
-    import_ = builtins.__import__
-
-    def without(name: str, *rest: object) -> object:
-        if name.startswith("matplotlib"):
-            raise ModuleNotFoundError(name)
-        return import_(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-
-    with pytest.raises(ModuleNotFoundError, match=r"figures need matplotlib: pip install 'ctgraph_rl\[plot\]'"):
-        draw_similarity(curricula.load("su_b1_4tasks"), tmp_path / "map.png")

@@ -20,8 +20,9 @@ from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.policies import NavigationPolicy, RandomPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_su_b1, make_task
 from ctgraph_rl.tasks.images import ImageFile
+from ctgraph_rl.visualize.draw import main
 from ctgraph_rl.visualize.image_figure import image_figure
-from ctgraph_rl.visualize.task_figure import draw_task, main, task_figure
+from ctgraph_rl.visualize.task_figure import draw_task, task_figure
 from ctgraph_rl.visualize.visits import visits
 
 HOME, WAIT, DECISION, END, FAIL = StateType
@@ -266,7 +267,7 @@ def test_names_on_the_command_line(tmp_path, monkeypatch):
         (["none.json", "--goal", "1.1", "--dot", "a"], "none.json must be a JSON file that can be read"),
         (["CT-FO-B1", "--goal", "1.x", "--dot", "a"], "argument --goal: invalid decisions value: '1.x'"),
         (["CT-FO-B1", "--goal", "3.1", "--dot", "a"], "goal must be 2 decisions in 1..2"),
-        (["CT-FO-B1", "--gif", "a.gif"], "a film needs somebody who acts: name a --policy or a --run"),
+        (["CT-FO-B1", "--gif", "a.gif"], "a film needs a policy: name a --policy or a --run"),
         (["CT-FO-B1", "--figure", "a.xyz"], "Format 'xyz' is not supported"),
         (["CT-FO-B1", "--figure", "no/such/a.png"], "No such file or directory"),
         (["CT-FO-B1", "--figure", "a.png", "--dpi", "0"], "dpi must be an integer >= 1, got 0"),

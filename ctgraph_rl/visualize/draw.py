@@ -1,0 +1,69 @@
+"""The command ``ctgraph-rl draw``: a task as a figure, its images, a DOT file or a film of an episode."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
+from ctgraph_rl.visualize.dot import to_dot
+from ctgraph_rl.visualize.gif import save_gif
+from ctgraph_rl.visualize.image_figure import image_figure
+from ctgraph_rl.visualize.style import DPI
+from ctgraph_rl.visualize.task_figure import task_figure
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line, ``ctgraph-rl draw``."""
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if not (arguments.figure or arguments.dot or arguments.gif):
+        parser.error("nothing to write: name a --figure, --dot or --gif")
+    try:
+        _write(select(arguments), arguments)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        parser.error(str(error))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description="Draw a task; with a policy, what it does there.")
+    add_arguments(parser)
+    what = "what a figure has: observation ids in the states, their kinds, or the images"
+    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
+    parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
+    parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
+    parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
+    parser.add_argument("--episodes", type=int, default=1000, help="that visits are counted in; default: 1000")
+    return parser
+
+
+def _write(selection: Selection, arguments: argparse.Namespace) -> None:
+    """Write all that is asked for."""
+    films = arguments.gif is None or selection.policy is not None
+    require(
+        (films, "a film needs a policy: name a --policy or a --run"),
+        *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes),
+    )
+    if arguments.figure is not None:
+        _figure(selection, arguments).savefig(arguments.figure, dpi=arguments.dpi)
+    if arguments.dot is not None:
+        arguments.dot.write_text(to_dot(selection.task, selection.name), encoding="utf-8")
+    if arguments.gif is not None:
+        save_gif(selection.player(arguments.seed, not arguments.sampled), arguments.gif)
+
+
+def _figure(selection: Selection, arguments: argparse.Namespace) -> Any:
+    if arguments.show == "images":
+        return image_figure(selection.task, arguments.seed)
+    if selection.policy is None:
+        return task_figure(selection.task, ids=arguments.show == "ids")
+    seen = selection.visits(arguments.episodes, arguments.seed, not arguments.sampled)
+    return task_figure(selection.task, visits=seen.counts, policy=seen.actions)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Heat maps of how alike the tasks of a curriculum are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.similarity import MEASURES
+from ctgraph_rl.visualize.style import DPI, new_figure
+
+MOST_NUMBERS, MOST_LABELS = 8, 40
+"""Tasks up to which a heat map shows numbers and labels."""
+
+
+def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
+    """Draw a heat map of each measure over a curriculum's tasks.
+
+    Args:
+        curriculum: its tasks, in order of first appearance.
+        path: the picture to write; its ending decides the format.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib; names the extra to install.
+        ValueError: for tasks too large for a measure.
+    """
+    figure = new_figure(12, 7.6)
+    figure.suptitle(f"{curriculum.name}: similarity of {len(curriculum.tasks)} tasks")
+    *panels, last = figure.subplots(2, 3).flat
+    for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
+        image = _draw_matrix(axes, measure(curriculum.tasks), curriculum.labels, title)
+    last.axis("off")
+    figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
+    figure.savefig(path, dpi=DPI)
+
+
+def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -> Any:
+    axes.set_facecolor("white")
+    axes.patch.set(hatch="////", edgecolor="grey")
+    image = axes.imshow(matrix.numpy(), cmap="Greys", vmin=0, vmax=1)
+    axes.set_title(title, fontsize=9)
+    if len(labels) > MOST_LABELS:
+        axes.set(xlabel="task, from 0", ylabel="task, from 0")
+        return image
+    size = max(4, 8 - len(labels) // 8)
+    axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
+    axes.set_yticks(range(len(labels)), labels, fontsize=size)
+    if len(labels) <= MOST_NUMBERS:
+        for i, j in torch.cartesian_prod(*2 * [torch.arange(len(labels))]).tolist():
+            _write_number(axes, i, j, matrix[i, j].item())
+    return image
+
+
+def _write_number(axes: Any, i: int, j: int, value: float) -> None:
+    if not math.isnan(value):
+        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if value > 0.6 else "black")

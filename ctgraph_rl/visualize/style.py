@@ -1,0 +1,77 @@
+"""The style of all figures of trees: a colour and a shape for each kind of state, marks, lines and an empty figure.
+
+A grey print and any colour vision keep the kinds apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ctgraph_rl.batch.render import GOAL, PALETTE
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.visualize.layout import Layout
+
+DPI = 160
+
+MARKERS = {
+    StateType.HOME: "p",
+    StateType.WAIT: "o",
+    StateType.DECISION: "D",
+    StateType.END: "s",
+    StateType.FAIL: "8",
+}
+"""Pentagon, circle, diamond, square and octagon."""
+
+Point = tuple[float, float]
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure, sizes in inches.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib; names the extra to install.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def colour(number: int) -> str:
+    """Return a colour of `ctgraph_rl.batch.render`'s palette, such as that of a kind of state, as ``#rrggbb``."""
+    return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
+
+
+def mark(kind: StateType, size: float) -> dict[str, Any]:
+    """Return the style of a state for matplotlib; sizes in points."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
+    size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
+    return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
+
+
+def goal_mark(size: float) -> dict[str, Any]:
+    """Return the style of a goal, the star of `ctgraph_rl.batch.render`."""
+    edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
+    return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
+
+
+def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> None:
+    """Draw straight lines behind the states."""
+    from matplotlib.collections import LineCollection
+
+    look: dict[str, Any] = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
+    axes.add_collection(LineCollection(list(lines), **look))
+
+
+def stub_lines(layout: Layout, places: Mapping[int, Point], height: float) -> list[list[Point]]:
+    """Return short lines from the states drawn towards branches left out, left or right of those drawn."""
+    reach = 1 / max(len(layout.leaves), 3) / 7
+    ends = [(places[node], side) for node, side in layout.stubs]
+    return [[(x, y), (x + side * reach, y - height)] for (x, y), side in ends]
+
+
+def shape_of(graph: CTGraph) -> str:
+    """Return a graph's three numbers for a title."""
+    return f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"

@@ -1,0 +1,35 @@
+"""The heat maps of how alike tasks are."""
+
+import builtins
+
+import pytest
+from helpers.oracles import surjective
+
+import curricula
+from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.visualize.similarity_figure import draw_similarity
+
+GOALS = [(1, 1), (1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("num_tasks", [1, 3, 41])
+def test_the_heat_maps_are_drawn_for_few_and_many_tasks(tmp_path, num_tasks):
+    blocks = tuple(Block(surjective(goal=GOALS[i % 3], image_seed=i), 1) for i in range(num_tasks))
+
+    draw_similarity(Curriculum("c", 1, "", blocks), tmp_path / "map.png")
+
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
+    import_ = builtins.__import__
+
+    def without(name: str, *rest: object) -> object:
+        if name.startswith("matplotlib"):
+            raise ModuleNotFoundError(name)
+        return import_(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+
+    with pytest.raises(ModuleNotFoundError, match=r"figures need matplotlib: pip install 'ctgraph_rl\[plot\]'"):
+        draw_similarity(curricula.load("su_b1_4tasks"), tmp_path / "map.png")
