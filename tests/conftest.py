@@ -24,6 +24,14 @@ from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
 
 
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One for each core this process may use; none for single files, which start sooner without, and for SLURM."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    folders_only = all(os.path.isdir(argument) for argument in config.args)
+    slurm = "slurm" in config.option.markexpr.replace("not slurm", "")
+    return cores if cores > 1 and folders_only and not slurm else 0
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs a C compiler where there is none."""
     if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]):
