@@ -42,6 +42,8 @@ MAX_BUFFER = 2**26
 
 
 NOISE_BANK = 4096
+SUFFIX = {"off": "", "required": ", kernel"}
+"""What the table says of the ways by the values of ``kernel``."""
 
 
 def configurations() -> dict[str, Task]:
@@ -129,13 +131,13 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
     yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
 
 
-def _fast(task: Task, num_rows: int, ways: tuple[bool, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
+def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
     rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
     steps = Steps.empty(rows, _num_steps(num_rows))
     actions = torch.randint(0, 3, steps.action.shape)
 
-    def run(rows: Rows, compiled: bool) -> int:
-        rollout(rows, actions, steps, compiled)
+    def run(rows: Rows, kernel: str) -> int:
+        rollout(rows, actions, steps, kernel)
         return steps.action.numel()
 
     def core(rows: Rows) -> int:
@@ -143,16 +145,12 @@ def _fast(task: Task, num_rows: int, ways: tuple[bool, ...]) -> Iterator[tuple[s
             rows.restart(rows.act(action)[1])
         return min(16, len(actions)) * num_rows
 
-    for compiled in ways:
-        own = Rows([task] * num_rows, compiled=compiled)
-        yield f"core, observations of the step and of the reset{_suffix(compiled)}", partial(core, own)
-        yield f"fast rollout{_suffix(compiled)}", partial(run, rows, compiled)
+    for kernel in ways:
+        own = Rows([task] * num_rows, kernel=kernel)
+        yield f"core, observations of the step and of the reset{SUFFIX[kernel]}", partial(core, own)
+        yield f"fast rollout{SUFFIX[kernel]}", partial(run, rows, kernel)
         if task.observations.read_noise:
-            yield f"fast rollout, noise bank{_suffix(compiled)}", partial(run, banked, compiled)
-
-
-def _suffix(compiled: bool) -> str:
-    return ", compiled" if compiled else ""
+            yield f"fast rollout, noise bank{SUFFIX[kernel]}", partial(run, banked, kernel)
 
 
 def _torchrl(
@@ -197,8 +195,8 @@ class _Random(TensorDictModuleBase):
         return tensordict.set("action", torch.randint(0, 3, (self.num_rows,)))
 
 
-def _gymnasium(task: Task, num_rows: int, compiled: bool) -> Iterator[tuple[str, Callable[[], int]]]:
-    envs = CTGraphVectorEnv(num_rows, task, compiled=compiled)
+def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
+    envs = CTGraphVectorEnv(num_rows, task, kernel=kernel)
     envs.reset(seed=0)
     actions = torch.randint(0, 3, (16, num_rows)).numpy()
 
@@ -207,9 +205,9 @@ def _gymnasium(task: Task, num_rows: int, compiled: bool) -> Iterator[tuple[str,
             envs.step(action)
         return actions.size
 
-    yield f"Gymnasium VectorEnv{_suffix(compiled)}", run_batch
+    yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run_batch
     if num_rows == 1:
-        yield f"Gymnasium Env{_suffix(compiled)}", _single(CTGraphGymEnv(task, compiled=compiled))
+        yield f"Gymnasium Env{SUFFIX[kernel]}", _single(CTGraphGymEnv(task, kernel=kernel))
 
 
 def _single(env: gymnasium.Env) -> Callable[[], int]:
@@ -235,25 +233,25 @@ def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
     yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
 
 
-def contenders(num_rows: list[int], names: list[str], with_compiled: bool) -> list[Contender]:
+def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Contender]:
     """Everything that is measured, in the order of the table."""
     found: list[Contender] = []
 
     def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
         found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
 
-    tasks, ways = configurations(), (False, True)[: 1 + with_compiled]
+    tasks, ways = configurations(), tuple(SUFFIX)[: 1 + with_kernel]
     for n in num_rows:
         add("", n, _memory(n))
         add("", n, _torchrl(partial(Counter, n), TRIVIAL))
         for name in names:
             task = tasks[name]
             add(name, n, _fast(task, n, ways))
-            for compiled in ways:
+            for kernel in ways:
                 for info, suffix in ((True, ""), (False, LEAN)):
-                    make = partial(CTGraphEnv, [task] * n, check_actions=False, compiled=compiled, info=info)
-                    add(name, n, _torchrl(make, suffix=suffix + _suffix(compiled)))
-                add(name, n, _gymnasium(task, n, compiled))
+                    make = partial(CTGraphEnv, [task] * n, check_actions=False, kernel=kernel, info=info)
+                    add(name, n, _torchrl(make, suffix=suffix + SUFFIX[kernel]))
+                add(name, n, _gymnasium(task, n, kernel))
     add("", 1, _authors())
     return found
 
@@ -266,7 +264,7 @@ def table(measured: list[Contender]) -> str:
         speed = statistics.median(one.speeds)
         spread = (max(one.speeds) - min(one.speeds)) / speed / 2
         yardstick = median.get((one.num_rows, "", MEMCPY))
-        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(_suffix(True)).removesuffix(LEAN)))
+        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(SUFFIX["required"]).removesuffix(LEAN)))
         cells = [
             f"{one.num_rows:,}",
             one.configuration,
@@ -294,7 +292,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
-    parser.add_argument("--skip-compiled", action="store_true", help="leave out the C kernel, which needs a compiler")
+    parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
     options = parser.parse_args(arguments)
     require(
@@ -303,7 +301,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     if options.threads:
         torch.set_num_threads(options.threads)
-    measured = contenders(options.rows, options.tasks, not options.skip_compiled)
+    measured = contenders(options.rows, options.tasks, not options.skip_kernel)
     console = Console(stderr=True)
     for one in track(measured, "filling caches", console=console):
         one.run()

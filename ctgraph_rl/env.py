@@ -55,12 +55,13 @@ class CTGraphEnv(EnvBase):
         task_ids: the id of each task, an integer >= 0. Observations then have ``task_id``, uint8 [N, num_task_ids]: the
             row's id as one-hot, zeros for a task without one.
         num_task_ids: length of ``task_id``; None: just enough.
-        compiled: run steps as a C kernel, with the same bits: see `Rows`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         info: False leaves ``step_count``, ``episode_reward``, ``outcome``, ``leaf`` and ``truncated`` out of the data,
             so that TorchRL has less to copy; all else is the same.
 
     Raises:
-        ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.
+        ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
+            cannot run.
     """
 
     batch_locked = True
@@ -78,7 +79,7 @@ class CTGraphEnv(EnvBase):
         noise_bank: int = 0,
         task_ids: Mapping[Task, int] | None = None,
         num_task_ids: int | None = None,
-        compiled: bool = False,
+        kernel: str = "auto",
         info: bool = True,
     ) -> None:
         flags = {"check_actions": check_actions, "info": info}
@@ -87,7 +88,9 @@ class CTGraphEnv(EnvBase):
         self.num_task_ids = _num_task_ids(task_ids, num_task_ids)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions, self.info = check_actions, info
-        self.rows = Rows(tasks, seed, first_row, task_pool, self.device, noise_bank, compiled)
+        self.rows = Rows(
+            tasks, seed, first_row, task_pool=task_pool, device=self.device, noise_bank=noise_bank, kernel=kernel
+        )
         ids = {} if task_ids is None else task_ids
         numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device)
         self.register_buffer("_id_of_task", numbers, persistent=False)

@@ -51,7 +51,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         config: see `make_task`.
         task_pool: the tasks that `set_task` may be given. Default: the task alone.
         render_mode: ``rgb_array``, ``ansi`` or None.
-        compiled: run steps as a C kernel, with the same bits: see `Rows`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         changes: see `make_task`.
 
     Raises:
@@ -67,13 +67,13 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         config: Json | None = None,
         task_pool: Iterable[Task] | None = None,
         render_mode: str | None = None,
-        compiled: bool = False,
+        kernel: str = "auto",
         **changes: Any,
     ) -> None:
         with _one_thread():
             task = make_task(task, config, **changes)
             self.task_pool = _pool([task], task_pool)
-            self.rows = Rows([task], task_pool=self.task_pool, compiled=compiled)
+            self.rows = Rows([task], task_pool=self.task_pool, kernel=kernel)
         self.render_mode = _known_mode(render_mode)
         self.observation_space, self.action_space = _spaces(self.rows)
         self._number = self._next_number = self.task_pool.index(task)
@@ -150,7 +150,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         autoreset_mode: when a row whose episode is over starts the next one: ``NextStep``, in the next step, which
             ignores its action; ``SameStep``, at once, with what was last in ``final_obs`` and ``final_info``;
             ``Disabled``, with ``reset(options={"reset_mask": mask})``.
-        compiled: run steps as a C kernel, with the same bits: see `Rows`.
+        kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         changes: see `make_task`.
 
     Raises:
@@ -168,7 +168,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         task_pool: Iterable[Task] | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        compiled: bool = False,
+        kernel: str = "auto",
         **changes: Any,
     ) -> None:
         require((is_int(num_envs, 1), f"num_envs must be an integer >= 1, got {num_envs!r}"))
@@ -179,7 +179,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         tasks = made if len(made) == num_envs else made * num_envs
         self.num_envs = num_envs
         self.task_pool = _pool(tasks, task_pool)
-        self.rows = Rows(tasks, task_pool=self.task_pool, compiled=compiled)
+        self.rows = Rows(tasks, task_pool=self.task_pool, kernel=kernel)
         self.render_mode = _known_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
@@ -225,7 +225,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
             ValueError: for other actions, before the first reset, and for rows that are done without autoreset.
         """
         action, over = self._checked(actions), self._is_over
-        if over.any() or self.rows.compiled:
+        if over.any() or self.rows.uses_kernel:
             self._change_tasks(over)
             shown = self.rows.step_or_reset(action, torch.from_numpy(over))
         else:

@@ -37,8 +37,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]):
         return
     for item in items:
-        compiled = getattr(item, "callspec", None) and item.callspec.params.get("compiled")
-        if compiled or "test_native.py" in item.nodeid or "test_kernel.py" in item.nodeid or "compiled" in item.nodeid:
+        required = hasattr(item, "callspec") and item.callspec.params.get("kernel") == "required"
+        if required or "test_native.py" in item.nodeid or "test_kernel.py" in item.nodeid or "compiled" in item.nodeid:
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 

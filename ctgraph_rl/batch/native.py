@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.dynamics import STATE_DTYPES, ObservationParams, RewardParams, RowState, Shown, Uses
-from ctgraph_rl.core.kernel import is_available, library, num_threads
+from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.core.tree import TreeParams
 
@@ -22,24 +22,33 @@ REWARDS = (Needle, Gradient, ReferenceLinear)
 """The rewards that the kernel knows, in its order; a user's own are Python and need the tensor code."""
 
 
-def require_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> None:
+KERNELS = ("auto", "off", "required")
+"""The values of ``kernel``, see `Rows`."""
+
+
+def kernel_rule(kernel: object) -> tuple[bool, str]:
+    """Return the rule for values of ``kernel``."""
+    return kernel in KERNELS, f"kernel must be one of {', '.join(KERNELS)}, got {kernel!r}"
+
+
+def knows(reward_fns: Iterable[RewardFn], device: torch.device) -> bool:
+    """Return whether the kernel knows these rewards and runs on this device."""
+    return device.type == "cpu" and not _unknown(reward_fns)
+
+
+def require_kernel(reward_fns: Iterable[RewardFn], device: torch.device) -> None:
     """Refuse what the kernel cannot run, and a machine that cannot compile it.
 
     Raises:
         ValueError: saying which.
     """
     other = _unknown(reward_fns)
-    names = ", ".join(reward.__name__ for reward in REWARDS)
+    names, fix = ", ".join(reward.__name__ for reward in REWARDS), 'use kernel="auto" or kernel="off"'
     require(
-        (not other, f"compiled=True knows the rewards {names}, got {other[:3]}; use compiled=False"),
-        (torch.device(device or "cpu").type == "cpu", f"compiled=True runs on a CPU, got {device}; use compiled=False"),
+        (not other, f'kernel="required" knows the rewards {names}, got {other[:3]}; {fix}'),
+        (device.type == "cpu", f'kernel="required" runs on a CPU, got {device}; {fix}'),
     )
     library()
-
-
-def is_native(reward_fns: Iterable[RewardFn], device: torch.device | str | None) -> bool:
-    """Whether the kernel can be made here, and knows these rewards."""
-    return torch.device(device or "cpu").type == "cpu" and not _unknown(reward_fns) and is_available()
 
 
 def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
@@ -135,7 +144,7 @@ class Native:
 
     def _prepare(self, rows: Rows) -> None:
         """All of a call that stays the same between two changes of tasks."""
-        require_native(rows.uses.reward_fns, rows.device)
+        require_kernel(rows.uses.reward_fns, rows.device)
         (tree, x, g), index = rows.tables
         params, uses, n = rows.params, rows.uses, rows.num_rows
         streams = len(params.seed) in (1, n) and params.row.shape == (n,)

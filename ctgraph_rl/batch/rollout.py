@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from functools import cache, partial
-from types import FunctionType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ctgraph_rl.batch.native import kernel_rule, require_kernel
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.checks import at_least_one, require
-from ctgraph_rl.core import dynamics, reading
-from ctgraph_rl.core.dynamics import RowParams, RowState, Seen, Uses, Words
+from ctgraph_rl.core import dynamics
+from ctgraph_rl.core.dynamics import RowState
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
@@ -49,7 +48,7 @@ class Steps(NamedTuple):
 
 
 @torch.no_grad()
-def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = False) -> Steps:
+def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, kernel: str = "auto") -> Steps:
     """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
 
     The steps are those that `CTGraphEnv` and the Gymnasium environments take with the same seeds and actions, bit for
@@ -59,16 +58,15 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
         rows: the batch. It is left where the last step led.
         policy: what acts, or the actions, int64 [T, N].
         steps: the buffers, from `Steps.empty`; filled in place.
-        compiled: the same bits, several times faster. On a CPU a C kernel takes the steps, as in ``Rows(...,
-            compiled=True)``, all in one call where actions are given; elsewhere ``torch.compile`` compiles the step and
-            the noise, for seconds for each batch size and kind of task.
+        kernel: ``"auto"`` takes the rows' own engine, ``"off"`` the tensor engine and ``"required"`` the C kernel: see
+            `Rows`. Given actions are one call of the kernel.
 
     Returns:
         ``steps``.
 
     Raises:
-        ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what cannot be compiled;
-            the rows stay where they were.
+        ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what a required kernel
+            cannot run; the rows stay where they were.
     """
     _check_buffers(rows, steps)
     require(
@@ -78,11 +76,16 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool = 
     require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
     if isinstance(policy, Tensor):
         _check_actions(rows, policy, steps.action.shape)
-    if rows.device.type == "cpu" and (compiled or rows.compiled):
-        rows.state = _native(rows, policy, steps)
-    else:
-        rows.state = _tensors(rows, policy, steps, compiled)
+    rows.state = _native(rows, policy, steps) if _uses_kernel(rows, kernel) else _tensors(rows, policy, steps)
     return steps
+
+
+def _uses_kernel(rows: Rows, kernel: str) -> bool:
+    """Return whether the kernel takes the steps; refuse that it cannot where it must."""
+    require(kernel_rule(kernel))
+    if kernel == "required":
+        require_kernel(rows.uses.reward_fns, rows.device)
+    return kernel == "required" or (kernel == "auto" and rows.uses_kernel)
 
 
 def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
@@ -108,12 +111,9 @@ def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
     return state
 
 
-def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool) -> RowState:
-    """Fill buffers by the tensor code; the states that the last step led to."""
+def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
+    """Fill buffers by the tensor engine; the states that the last step led to."""
     params, uses, start = rows.params, rows.uses, rows.state
-    advance, noisy = (
-        _compiled(uses, rows.num_rows, str(rows.device)) if compiled else (step_and_reset, reading.add_noise)
-    )
     state = dynamics.begin(start, rows.is_done, params, uses)
     words = dynamics.words_of(state.tick, params, uses)
     steps.observation[0] = dynamics.observe(state, words, params, uses)
@@ -121,13 +121,17 @@ def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps, compiled: bool) 
     plain = not (uses.pixel_noise or uses.reward_cue or params.x.taps)
     for t in range(len(steps.action)):
         action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
-        state, words, reward, done, outcome, seen = advance(state, action, words, params, uses)
-        steps.action[t], steps.reward[t], steps.done[t], steps.outcome[t] = action, reward, done, outcome
-        steps.is_init[t + 1] = done
+        state = dynamics.advance(state, action, words, params, uses, absorbing=False)
+        done = dynamics.is_done(state, params.tree)
+        steps.action[t], steps.reward[t], steps.done[t], steps.is_init[t + 1] = action, state.reward, done, done
+        steps.outcome[t] = dynamics.arrivals(state, done, params)[0]
+        state = dynamics.begin(state, done, params, uses)
+        words = dynamics.words_of(state.tick, params, uses)
+        seen = dynamics.look(state, words, params, uses)
         if plain:
             torch.index_select(params.bank, 0, seen.rows, out=steps.observation[t + 1])
         else:
-            steps.observation[t + 1] = dynamics.read(seen, state, params, uses, noisy)
+            steps.observation[t + 1] = dynamics.read(seen, state, params, uses)
     return state
 
 
@@ -139,42 +143,6 @@ def _chosen(rows: Rows, policy: Policy, steps: Steps, t: int, start: RowState) -
     require((same, "a policy must leave the rows as they are during a rollout: change them between two rollouts"))
     _check_actions(rows, action, steps.action.shape[1:])
     return action
-
-
-def step_and_reset(
-    state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses
-) -> tuple[RowState, Words, Tensor, Tensor, Tensor, Seen]:
-    """One step of every row, and the reset of those that it finishes; a pure function.
-
-    Args:
-        state: the rows' states, none of them finished.
-        action: int64 [N].
-        words: the draws of the present tick.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-
-    Returns:
-        The states after the resets and the draws of their tick; the step's reward, done and outcome; and what is seen
-        after the resets.
-    """
-    state = dynamics.advance(state, action, words, params, uses, absorbing=False)
-    done, reward = dynamics.is_done(state, params.tree), state.reward
-    outcome = dynamics.arrivals(state, done, params)[0]
-    state = dynamics.begin(state, done, params, uses)
-    words = dynamics.words_of(state.tick, params, uses)
-    return state, words, reward, done, outcome, dynamics.look(state, words, params, uses)
-
-
-@cache
-def _compiled(uses: Uses, num_rows: int, device: str) -> tuple[Callable, Callable]:
-    """The step and the noise as functions that ``torch.compile`` compiles, for one kind of batch.
-
-    Each kind compiles code objects of its own, as the number of compilations of one is limited. The option is for the
-    tests, which run this on CPUs: with inductor's own vectors the noise comes out wrong there, see `reading`.
-    """
-    compiler = partial(torch.compile, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1})
-    parts = (step_and_reset, reading.noisy)
-    return tuple(compiler(FunctionType(part.__code__.replace(), part.__globals__)) for part in parts)  # type: ignore[return-value]
 
 
 def _check_buffers(rows: Rows, steps: Steps) -> None:

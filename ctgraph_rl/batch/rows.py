@@ -10,12 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from ctgraph_rl.batch.draw_ahead import Stock
-from ctgraph_rl.batch.native import Native, require_native
+from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_params, of_rows, shared_bank
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.core import dynamics, philox, reading
 from ctgraph_rl.core.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Words
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.core.kernel import is_available, is_traced
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
@@ -38,11 +39,14 @@ class Rows(nn.Module):
         noise_bank: 0 draws the noise of every pixel of every observation. A number M >= 1 takes each observation's
             noise from M that were drawn in advance, which is faster; two observations then have the same noise with
             probability 1 / M, where the first way hardly ever repeats noise.
-        compiled: run steps as a C kernel, with the same bits; see `native`. It needs a CPU, a C compiler, and tasks
-            whose rewards are this package's own.
+        kernel: whether the C kernel takes the steps. It has the bits of the tensor engine and needs a CPU, a C compiler
+            and a pool whose rewards are this package's own. ``"auto"`` uses it where it can run and steps are not
+            traced by ``torch.compile`` or another transform, else the tensor engine; ``"off"`` never uses it;
+            ``"required"`` refuses what it cannot run. `uses_kernel` tells which engine is in use.
 
     Raises:
-        ValueError: for no tasks, values out of range, observations of different shapes, and what cannot be compiled.
+        ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
+            cannot run.
     """
 
     seed: Tensor
@@ -73,7 +77,7 @@ class Rows(nn.Module):
         task_pool: Iterable[Task] | None = None,
         device: torch.device | str | None = "cpu",
         noise_bank: int = 0,
-        compiled: bool = False,
+        kernel: str = "auto",
     ) -> None:
         tasks = require_all(Task, "tasks", tasks)
         pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
@@ -82,21 +86,20 @@ class Rows(nn.Module):
             seed_rule(seed),
             (is_int(first_row, 0, 2**32 - self.num_rows), f"rows must be numbered in [0, 2**32), got {first_row=}"),
             (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
-            (isinstance(compiled, bool), f"compiled must be true or false, got {compiled!r}"),
+            kernel_rule(kernel),
         )
-        if compiled:
-            require_native((task.reward_fn for task in pool), device)
         super().__init__()
-        self.compiled, self.native = compiled, Native()
+        self.kernel, self.native = kernel, Native()
         self.pool = pool
         self._number = {task: number for number, task in enumerate(pool)}
         self.max_branching = max(task.graph.branching_factor for task in pool)
+        self.register_buffer("seed", torch.tensor([seed], device=device))
+        self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
+        self._choose_engine()
         bank = shared_bank(pool, self.num_rows)
         no_images = bank.images.new_empty(0, *bank.shape)
         self._bank, self.image_shape = bank._replace(images=no_images), bank.shape
         self.white = max(int(white_level(task.images)) for task in pool)
-        self.register_buffer("seed", torch.tensor([seed], device=device))
-        self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self.register_buffer("bank", bank.images.to(device), persistent=False)
         has_noise = noise_bank > 0 and max(bank.noise_levels) > 0
         noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else no_images
@@ -117,6 +120,18 @@ class Rows(nn.Module):
     def device(self) -> torch.device:
         """Where the tensors live."""
         return self.row.device
+
+    def _choose_engine(self) -> None:
+        """Find out whether the kernel can run these rewards on this device; refuse that it cannot where it must."""
+        reward_fns = [task.reward_fn for task in self.pool]
+        if self.kernel == "required":
+            require_kernel(reward_fns, self.device)
+        self._kernel_fits = self.kernel == "auto" and type(self.row) is Tensor and knows(reward_fns, self.device)
+
+    @property
+    def uses_kernel(self) -> bool:
+        """Whether the C kernel takes the steps, else the tensor engine does."""
+        return self.kernel == "required" or (self._kernel_fits and not is_traced() and is_available())
 
     @property
     def state(self) -> RowState:
@@ -301,14 +316,14 @@ class Rows(nn.Module):
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
-        if self.compiled:
+        if self.uses_kernel:
             return self._keep(*self.native.show(self, mask=mask), None)
         words = self._draw(self.tick + mask)
         return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        if self.compiled:
+        if self.uses_kernel:
             return self._keep(*self.native.show(self, action), None)
         words = self._draw_next()
         return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
@@ -318,7 +333,7 @@ class Rows(nn.Module):
 
         `result` tells more.
         """
-        if self.compiled:
+        if self.uses_kernel:
             shown = self.step(action)
             return shown.observation, shown.done
         now, then = self._draw_next()
@@ -329,7 +344,7 @@ class Rows(nn.Module):
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         self._start_episodes(mask)
-        if self.compiled:
+        if self.uses_kernel:
             return self._keep(*self.native.show(self, action, mask), None)
         words = self._draw_next()
         return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
@@ -344,7 +359,7 @@ class Rows(nn.Module):
         ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
         """
         self._start_episodes(mask)
-        if self.compiled:
+        if self.uses_kernel:
             mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
             return self._keep(*self.native.show(self, None, mask, shown), None).observation
         words = self._draw(self.tick + (1 if mask is None else mask))
@@ -452,6 +467,7 @@ class Rows(nn.Module):
         for name in ("_choices", "_in_use", "_goals", "_tables"):
             setattr(self, name, moved(getattr(self, name)))
         self._take_params()
+        self._choose_engine()
         return self
 
     def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:

@@ -7,7 +7,6 @@ Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -209,16 +208,13 @@ def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
     return Seen(rows, angle, noise)
 
 
-def read(seen: Seen, state: RowState, params: RowParams, uses: Uses, noisy: Callable = add_noise) -> Tensor:
-    """The images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape].
-
-    ``noisy`` stands for `reading.add_noise`.
-    """
+def read(seen: Seen, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """The images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
     x, images = params.x, params.bank.index_select(0, seen.rows)
     if uses.noise_bank:
         images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
     elif uses.pixel_noise:
-        images = noisy(images, seen.noise, x.read_noise)
+        images = add_noise(images, seen.noise, x.read_noise)
     if x.taps is not None:
         images = turn(images, seen.angle, x.taps)
     if uses.reward_cue:

@@ -33,17 +33,18 @@ def num_threads(num_rows: int, most: int) -> int:
 
 
 def takes(*tensors: Tensor) -> bool:
-    """Whether the functions below can have these tensors: plain int64 or uint8 ones on the CPU, and a library is there.
+    """Return whether the functions below can have these tensors: plain int64 or uint8 ones on the CPU, untraced."""
+    fits = all(type(each) is Tensor and each.is_cpu and each.dtype in _DTYPES for each in tensors)
+    return fits and not is_traced() and is_available()
 
-    Where something looks on, as ``torch.compile``, ``torch.vmap`` and other transforms do, it must see tensor code.
-    """
+
+def is_traced() -> bool:
+    """Return whether ``torch.compile``, ``torch.vmap`` or another transform looks on: it must see tensor code."""
     return (
-        not torch.compiler.is_compiling()
-        and not torch.jit.is_tracing()
-        and torch._C._functorch.peek_interpreter_stack() is None
-        and torch._C._len_torch_dispatch_stack() == 0
-        and all(type(each) is Tensor and each.is_cpu and each.dtype in _DTYPES for each in tensors)
-        and is_available()
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or torch._C._len_torch_dispatch_stack() > 0
     )
 
 
@@ -103,7 +104,8 @@ def library() -> ctypes.CDLL:
     try:
         return _made()
     except (OSError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"compiled=True cannot make or load its kernel: {error}; use compiled=False") from error
+        message = f'kernel="required" cannot make or load the kernel: {error}; use kernel="auto"'
+        raise ValueError(message) from error
 
 
 def _made() -> ctypes.CDLL:
@@ -124,8 +126,9 @@ def _key(source: Path, compiler: list[str]) -> str:
     try:
         version = subprocess.run([*compiler, "--version"], capture_output=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError) as error:
-        fix = "install one (gcc or clang), name it in the environment variable CC, or use compiled=False"
-        raise ValueError(f"compiled=True needs a C compiler, {shlex.join(compiler)!r} does not run; {fix}") from error
+        fix = 'install one (gcc or clang), name it in the environment variable CC, or use kernel="auto"'
+        name = shlex.join(compiler)
+        raise ValueError(f'kernel="required" needs a C compiler, {name!r} does not run; {fix}') from error
     parts = (source.read_bytes(), repr((compiler, _FLAGS)).encode(), version, _cpu().encode())
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:32]
 
@@ -146,7 +149,7 @@ def _cache_folder() -> Path:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         fix = "name a folder of yours in the environment variable XDG_CACHE_HOME"
-        message = f"compiled=True keeps its kernel in {folder}, which cannot be made ({error}); {fix}"
+        message = f"the compiled kernel is kept in {folder}, which cannot be made ({error}); {fix}"
         raise ValueError(message) from error
     _require_own(folder)
     return folder
@@ -168,6 +171,7 @@ def _compile(source: Path, compiler: list[str], path: Path) -> None:
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode == 0:
                 break
-        require((done.returncode == 0, f"compiled=True: {shlex.join(command)} failed: {done.stderr[-2000:]}"))
+        failed = f'{shlex.join(command)} failed: {done.stderr[-2000:]}; use kernel="auto"'
+        require((done.returncode == 0, f'kernel="required": {failed}'))
         made.chmod(0o700)
         made.replace(path)

@@ -54,7 +54,7 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 
 # Inductor of torch 2.13 writes beyond its buffers when it fuses the noise with what comes before it. As an operator of
-# its own it stays whole; `fast` compiles it alone, in a way that is right.
+# its own it stays whole.
 _opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ctgraph_rl.batch.native import is_native
 from ctgraph_rl.checks import at_least_one, is_int, require
 from ctgraph_rl.core.dynamics import NO_LEAF
 from ctgraph_rl.env import CTGraphEnv
@@ -36,12 +35,10 @@ def make_env(
 ) -> CTGraphEnv:
     """An environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
 
-    Held-out tasks have no id, which shows as zeros. The environment is a C kernel where there can be one, with the same
-    bits.
+    Held-out tasks have no id, which shows as zeros.
     """
     how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
     place: dict[str, Any] = {"task_pool": pool, "device": device}
-    place["compiled"] = is_native((task.reward_fn for task in pool), device)
     if how.task_id != "one_hot":
         return CTGraphEnv(tasks, seed, **place)
     length = how.length(len(curriculum.tasks))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -20,6 +21,9 @@ NOISY = replace(confounding(p=0.5, read_rotation=5), reward_std=0.3, goal_change
 TASKS = [*SWITCHED[:4], confounding(p=0.5), NOISY]
 PLAIN = [surjective(2, 3), surjective(3, 1)]
 """Nothing to draw: p is 0, one image an id."""
+
+tensor_rows = partial(Rows, kernel="off")
+every_engine = pytest.mark.parametrize("kernel", ["off", "required"])
 
 
 def bare(rows: Rows, name: str, *args: Tensor) -> dynamics.Shown | Tensor:
@@ -38,7 +42,7 @@ def play(rows: Rows, twin: Rows, made: list) -> None:
 
 @pytest.mark.parametrize("tasks", [TASKS, VECTORS, PLAIN], ids=["images", "vectors", "plain"])
 def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps_with_resets(tasks):
-    rows, twin = (Rows(tasks, seed=3, first_row=2) for _ in range(2))
+    rows, twin = (tensor_rows(tasks, seed=3, first_row=2) for _ in range(2))
 
     made = calls(270, len(tasks))
 
@@ -49,14 +53,14 @@ def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps
 @pytest.mark.parametrize("room", [0, 5, 6, 11, 12, 18, 6 * 256 + 5, 6 * 500])
 def test_a_stock_of_any_size_gives_the_same_draws(monkeypatch, room):
     monkeypatch.setattr("ctgraph_rl.batch.rows.MAX_STOCK", room)
-    rows, twin = (Rows(TASKS, seed=4) for _ in range(2))
+    rows, twin = (tensor_rows(TASKS, seed=4) for _ in range(2))
 
     play(rows, twin, calls(30, 6, seed=room))
 
 
 @pytest.mark.parametrize("num_rows", [MAX_STOCK // 3 + 1, MAX_STOCK // 2, MAX_STOCK // 2 + 1, MAX_STOCK, MAX_STOCK + 1])
 def test_batches_around_the_size_without_a_stock_have_the_draws_of_the_bare_core(num_rows):
-    rows, twin = (Rows([one_hot(p=0.5)] * num_rows, seed=5) for _ in range(2))
+    rows, twin = (tensor_rows([one_hot(p=0.5)] * num_rows, seed=5) for _ in range(2))
 
     play(rows, twin, calls(6, num_rows, seed=3))
 
@@ -78,7 +82,7 @@ CHANGES = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_after_a_change_in_the_middle_the_draws_are_those_of_the_bare_core(name):
     pool = [*TASKS, *PLAIN]
-    rows, fresh, other = (Rows(TASKS, seed=seed, task_pool=pool) for seed in (3, 3, 8))
+    rows, fresh, other = (tensor_rows(TASKS, seed=seed, task_pool=pool) for seed in (3, 3, 8))
     saved = {}
     for number, (call, args) in enumerate(calls(30, 6)):
         getattr(rows, call)(*args)
@@ -99,7 +103,7 @@ def test_after_a_change_in_the_middle_the_draws_are_those_of_the_bare_core(name)
 
 def test_new_tasks_have_draws_for_all_that_they_use():
     rows, twin = (
-        Rows([surjective()] * 3, seed=1, task_pool=[surjective(), confounding(p=0.5), NOISY]) for _ in range(2)
+        tensor_rows([surjective()] * 3, seed=1, task_pool=[surjective(), confounding(p=0.5), NOISY]) for _ in range(2)
     )
 
     for task in (surjective(), confounding(p=0.5), NOISY, surjective(), NOISY):
@@ -110,7 +114,7 @@ def test_new_tasks_have_draws_for_all_that_they_use():
 
 def test_a_checkpoint_of_another_batch_is_continued_as_there():
     for assign in (False, True):
-        rows, other = Rows(TASKS, seed=1), Rows(TASKS, seed=2, first_row=5)
+        rows, other = tensor_rows(TASKS, seed=1), tensor_rows(TASKS, seed=2, first_row=5)
         for batch, steps in ((rows, 30), (other, 50)):
             for name, args in calls(steps, 6):
                 getattr(batch, name)(*args)
@@ -125,7 +129,7 @@ def test_a_checkpoint_of_another_batch_is_continued_as_there():
     "clone", [copy.deepcopy, lambda rows: pickle.loads(pickle.dumps(rows))], ids=["copy", "pickle"]
 )
 def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
-    rows, twin = (Rows(TASKS, seed=3) for _ in range(2))
+    rows, twin = (tensor_rows(TASKS, seed=3) for _ in range(2))
     play(rows, twin, calls(40, 6))
 
     cloned, alike = clone(rows), copy.deepcopy(twin)
@@ -135,7 +139,7 @@ def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
 
 
 def test_a_step_that_was_refused_changes_nothing():
-    rows, twin = (Rows(TASKS, seed=3) for _ in range(2))
+    rows, twin = (tensor_rows(TASKS, seed=3) for _ in range(2))
     made = calls(30, 6)
 
     for call in made:
@@ -145,16 +149,17 @@ def test_a_step_that_was_refused_changes_nothing():
 
 
 def test_rows_can_be_moved_in_the_middle_of_an_episode():
-    rows = Rows(TASKS)
-    play(rows, Rows(TASKS), calls(20, 6))
+    rows = tensor_rows(TASKS)
+    play(rows, tensor_rows(TASKS), calls(20, 6))
 
     shown = rows.to("meta").step(torch.zeros(6, dtype=torch.int64, device="meta"))
 
     assert shown.observation.device.type == "meta"
 
 
-def test_a_step_or_reset_is_a_step_of_some_rows_and_a_reset_of_the_others():
-    rows, stepped, begun = (Rows(TASKS, seed=6) for _ in range(3))
+@every_engine
+def test_a_step_or_reset_is_a_step_of_some_rows_and_a_reset_of_the_others(kernel):
+    rows, stepped, begun = (Rows(TASKS, seed=6, kernel=kernel) for _ in range(3))
     for batch in (rows, stepped, begun):
         batch.reset()
 
@@ -166,9 +171,10 @@ def test_a_step_or_reset_is_a_step_of_some_rows_and_a_reset_of_the_others():
         stepped.state = begun.state = rows.state
 
 
+@every_engine
 @pytest.mark.parametrize("tasks", [TASKS, SWITCHED, VECTORS], ids=["draws", "images", "vectors"])
-def test_an_act_of_running_rows_is_a_step_that_tells_less(tasks):
-    rows, twin = (Rows(tasks, seed=7) for _ in range(2))
+def test_an_act_of_running_rows_is_a_step_that_tells_less(tasks, kernel):
+    rows, twin = (Rows(tasks, seed=7, kernel=kernel) for _ in range(2))
     assert torch.equal(rows.restart(), twin.reset().observation)
 
     for action in scripts(60, len(tasks), 3):
@@ -186,18 +192,20 @@ def test_an_act_of_running_rows_is_a_step_that_tells_less(tasks):
 # The same bits
 
 
-def test_rows_with_all_switches_do_not_depend_on_how_a_batch_is_split():
+@every_engine
+def test_rows_with_all_switches_do_not_depend_on_how_a_batch_is_split(kernel):
     actions = scripts(60, len(SWITCHED), 4)
 
-    whole = seen(Rows(SWITCHED, seed=2), actions)
-    parts = [seen(Rows([task], seed=2, first_row=i), actions[:, i : i + 1]) for i, task in enumerate(SWITCHED)]
+    whole = seen(Rows(SWITCHED, seed=2, kernel=kernel), actions)
+    rows = [Rows([task], seed=2, first_row=i, kernel=kernel) for i, task in enumerate(SWITCHED)]
+    parts = [seen(row, actions[:, i : i + 1]) for i, row in enumerate(rows)]
 
     for i, part in enumerate(parts):
         assert all(torch.equal(x[:, i : i + 1], y) for x, y in zip(whole, part, strict=True))
 
 
 def test_all_switches_compile_into_one_graph_and_map_with_vmap():
-    rows = Rows(SWITCHED, seed=1)
+    rows = tensor_rows(SWITCHED, seed=1)
     rows.reset()
     params, uses = rows.params, rows.uses
     compiled = torch.compile(dynamics.step, fullgraph=True, backend="eager")

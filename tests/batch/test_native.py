@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,10 +16,13 @@ from helpers.task_families import FAMILIES, MIXED, SWITCHED, VECTORS, calls
 from hypothesis import given
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.envs import StepCounter, TransformedEnv
 
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, rollout
 from ctgraph_rl.batch import native
+from ctgraph_rl.batch.native import Native
 from ctgraph_rl.core import kernel as library
 from ctgraph_rl.core.rewards import Arrival
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
@@ -43,6 +47,7 @@ KINDS = FAMILIES | {
     "deep": [DEEP, confounding(3, 20, 0.5)],
     "unpaid": [replace(fully_observable(), goal_reward=-1.0, fail_reward=-0.0)],
 }
+ENGINES = "off", "required"
 every_kind = pytest.mark.parametrize("tasks", KINDS.values(), ids=KINDS)
 
 
@@ -74,12 +79,12 @@ def bits(value: Tensor) -> np.ndarray:
 @pytest.mark.parametrize("num_rows", [1, 5, 64, 1000])
 def test_a_compiled_rollout_gives_the_bits_of_the_tensor_code(tasks, num_rows):
     tasks = batch(tasks, num_rows)
-    rows, twin = (Rows(tasks, seed=2**62 + 5, first_row=2**31) for _ in range(2))
+    rows, twin = (Rows(tasks, seed=2**62 + 5, first_row=2**31, kernel="off") for _ in range(2))
     actions = likely(tasks, 40)
 
     for part in actions.split(25):
         eager = rollout(rows, part, Steps.empty(rows, len(part)))
-        compiled = rollout(twin, part, Steps.empty(twin, len(part)), compiled=True)
+        compiled = rollout(twin, part, Steps.empty(twin, len(part)), kernel="required")
 
         assert same(eager, compiled)
         assert same(rows.state, twin.state)
@@ -89,9 +94,9 @@ def test_threads_and_large_batches_change_no_bit():
     tasks = batch(MIXED, 16384)
     actions, made = likely(tasks, 5), []
 
-    for threads, compiled in ((1, False), (1, True), (2, True), (3, True)):
+    for threads, kernel in ((1, "off"), (1, "required"), (2, "required"), (3, "required")):
         torch.set_num_threads(threads)
-        rows = Rows(tasks, seed=1, compiled=compiled)
+        rows = Rows(tasks, seed=1, kernel=kernel)
         made.append((*rollout(rows, actions, Steps.empty(rows, 5)), *rows.state))
     torch.set_num_threads(1)
 
@@ -101,7 +106,7 @@ def test_threads_and_large_batches_change_no_bit():
 @every_kind
 def test_every_call_of_compiled_rows_gives_the_bits_of_the_tensor_code(tasks):
     tasks = batch(tasks, 6)
-    rows, twin = (Rows(tasks, seed=3, first_row=2, compiled=compiled) for compiled in (False, True))
+    rows, twin = (Rows(tasks, seed=3, first_row=2, kernel=kernel) for kernel in ENGINES)
 
     for number, (name, args) in enumerate(calls(120, len(tasks))):
         expected, found = getattr(rows, name)(*args), getattr(twin, name)(*args)
@@ -114,7 +119,9 @@ def test_every_call_of_compiled_rows_gives_the_bits_of_the_tensor_code(tasks):
 @every_kind
 def test_the_compiled_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks):
     tasks = batch(tasks, 6)
-    eager, alone, inner = (CTGraphEnv(tasks, seed=3, noise_bank=5, compiled=flag) for flag in (False, True, True))
+    eager, alone, inner = (
+        CTGraphEnv(tasks, seed=3, noise_bank=5, kernel=kernel) for kernel in ("off", "required", "required")
+    )
     wrapped = TransformedEnv(inner, StepCounter(step_count_key="steps"))
     actions = likely(tasks, 60)
 
@@ -128,11 +135,11 @@ def test_the_compiled_environment_gives_the_same_data_alone_and_when_it_is_wrapp
 @examples(40)
 @given(batches(), seeds)
 def test_any_tasks_compiled_give_the_bits_of_the_tensor_code(tasks, seed):
-    rows, twin = (Rows(tasks, seed=seed) for _ in range(2))
+    rows, twin = (Rows(tasks, seed=seed, kernel="off") for _ in range(2))
     actions = likely(tasks, 30, seed)
 
     assert same(
-        rollout(rows, actions, Steps.empty(rows, 30)), rollout(twin, actions, Steps.empty(twin, 30), compiled=True)
+        rollout(rows, actions, Steps.empty(rows, 30)), rollout(twin, actions, Steps.empty(twin, 30), kernel="required")
     )
     assert same(rows.state, twin.state)
 
@@ -140,7 +147,7 @@ def test_any_tasks_compiled_give_the_bits_of_the_tensor_code(tasks, seed):
 @pytest.mark.parametrize("switch", [ByEpisode(2), AtRandom(0.4), AtRandom(0.5, together=True)])
 def test_rows_that_change_their_tasks_give_the_same_data_compiled(switch):
     pool = [surjective(goal=(1, 2)), *MIXED]
-    eager, compiled = (CTGraphEnv([pool[0]] * 20, task_pool=pool, compiled=flag) for flag in (False, True))
+    eager, compiled = (CTGraphEnv([pool[0]] * 20, task_pool=pool, kernel=kernel) for kernel in ENGINES)
     for env in (eager, compiled):
         env.switch_tasks(pool, switch)
     actions = scripts(50, 20)
@@ -151,7 +158,7 @@ def test_rows_that_change_their_tasks_give_the_same_data_compiled(switch):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_the_gymnasium_batch_gives_the_same_data_compiled(mode):
-    eager, compiled = (CTGraphVectorEnv(8, batch(MIXED, 8), autoreset_mode=mode, compiled=c) for c in (False, True))
+    eager, compiled = (CTGraphVectorEnv(8, batch(MIXED, 8), autoreset_mode=mode, kernel=k) for k in ENGINES)
     actions = scripts(40, 8, 4).numpy()
     assert np.array_equal(eager.reset(seed=5)[0], compiled.reset(seed=5)[0])
 
@@ -166,7 +173,7 @@ def test_the_gymnasium_batch_gives_the_same_data_compiled(mode):
 
 
 def test_the_gymnasium_environment_gives_the_same_data_compiled():
-    eager, compiled = (CTGraphGymEnv(confounding(p=0.3), compiled=flag) for flag in (False, True))
+    eager, compiled = (CTGraphGymEnv(confounding(p=0.3), kernel=kernel) for kernel in ENGINES)
 
     for action in scripts(30, 1).flatten().tolist():
         if eager._is_over:
@@ -177,18 +184,18 @@ def test_the_gymnasium_environment_gives_the_same_data_compiled():
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda rows: pickle.loads(pickle.dumps(rows))])
 def test_a_copy_of_compiled_rows_goes_on_as_its_original(clone):
-    rows = Rows(batch(MIXED, 6), compiled=True)
+    rows = Rows(batch(MIXED, 6), kernel="required")
     rollout(rows, likely(batch(MIXED, 6), 7), Steps.empty(rows, 7))
     twin = clone(rows)
 
     found = [rollout(one, scripts(9, 6), Steps.empty(one, 9)) for one in (rows, twin)]
 
-    assert same(*found) and twin.compiled
+    assert same(*found) and twin.uses_kernel
 
 
 def test_new_goals_tasks_streams_and_checkpoints_reach_the_kernel():
     tasks = [surjective(goal=(1, 2)), replace(confounding(p=0.5), reward_std=0.5)]
-    rows, twin = (Rows(tasks * 3, compiled=flag) for flag in (False, True))
+    rows, twin = (Rows(tasks * 3, kernel=kernel) for kernel in ENGINES)
     streams = torch.arange(6) + 2**40, torch.arange(6)
     changes = [
         lambda one: one.set_goals(torch.tensor([1, 2, 3] * 2)),
@@ -216,22 +223,71 @@ class Half:
         return (arrival.leaf == arrival.goal_leaf).float() / 2
 
 
-def test_what_cannot_be_compiled_is_refused_with_the_fix():
-    own = replace(surjective(), reward_fn=Half())
+OWN = replace(surjective(), reward_fn=Half())
 
-    with pytest.raises(ValueError, match=r"knows the rewards Needle.*got \[Half\(\)\]; use compiled=False"):
-        Rows([own], compiled=True)
+
+def test_what_a_required_kernel_cannot_run_is_refused_with_the_fix():
+    rows = Rows([OWN])
+
+    with pytest.raises(ValueError, match=r'rewards Needle.*got \[Half\(\)\]; use kernel="auto" or kernel="off"'):
+        Rows([OWN], kernel="required")
     with pytest.raises(ValueError, match="knows the rewards"):
-        rows = Rows([own])
-        rollout(rows, scripts(2, 1), Steps.empty(rows, 2), compiled=True)
-    with pytest.raises(ValueError, match="runs on a CPU, got meta; use compiled=False"):
-        Rows([surjective()], device="meta", compiled=True)
-    with pytest.raises(ValueError, match="compiled must be true or false, got 'yes'"):
-        Rows([surjective()], compiled="yes")
+        rollout(rows, scripts(2, 1), Steps.empty(rows, 2), kernel="required")
+    with pytest.raises(ValueError, match='runs on a CPU, got meta; use kernel="auto"'):
+        Rows([surjective()], device="meta", kernel="required")
+    with pytest.raises(ValueError, match='runs on a CPU, got meta; use kernel="auto"'):
+        Rows([surjective()], kernel="required").to("meta")
+    for make in (partial(Rows, [surjective()]), partial(CTGraphEnv, [surjective()]), partial(CTGraphVectorEnv, 2)):
+        with pytest.raises(ValueError, match="kernel must be one of auto, off, required, got True"):
+            make(kernel=True)
+    with pytest.raises(ValueError, match="kernel must be one of auto, off, required, got 'on'"):
+        rollout(rows, scripts(2, 1), Steps.empty(rows, 2), kernel="on")
+
+
+def test_by_default_the_kernel_runs_where_it_can_and_the_tensor_engine_elsewhere():
+    found = [Rows([surjective()]), CTGraphEnv([surjective()]).rows, CTGraphGymEnv().rows, CTGraphVectorEnv(2).rows]
+
+    assert all(rows.uses_kernel for rows in found)
+    assert not Rows([surjective()], kernel="off").uses_kernel
+    assert not Rows([surjective()], task_pool=[surjective(), OWN]).uses_kernel
+    assert not Rows([surjective()]).to("meta").uses_kernel
+
+
+def test_what_is_traced_takes_the_tensor_engine():
+    rows, seen = Rows([surjective()] * 2), []
+    rows.reset()
+
+    def look(action: Tensor) -> Tensor:
+        seen.append(rows.uses_kernel)
+        return action + 1
+
+    torch.vmap(look)(torch.zeros(3, 2))
+    make_fx(look)(torch.zeros(2))
+    torch.jit.trace(look, torch.zeros(2), check_trace=False)
+    compiled = torch.compile(lambda action: action + rows.uses_kernel, backend="eager", fullgraph=True)
+    with FakeTensorMode():
+        look(torch.zeros(2))
+
+    assert seen == [False] * 4 and compiled(torch.zeros(2)).tolist() == [0, 0] and rows.uses_kernel
+    assert not rows._apply(FakeTensorMode().from_tensor).uses_kernel
+
+
+@pytest.mark.parametrize("kernel", ["auto", "off", "required"])
+def test_a_rollout_takes_the_engine_of_its_rows_or_the_one_that_it_is_given(monkeypatch, kernel):
+    taken, run = [], Native.run
+    monkeypatch.setattr(Native, "run", lambda *args, **kwargs: taken.append(1) or run(*args, **kwargs))
+    rows, uses = Rows([surjective()] * 2, kernel=kernel), []
+
+    for wanted in ("auto", "off", "required"):
+        taken.clear()
+        rollout(rows, scripts(2, 2), Steps.empty(rows, 2), kernel=wanted)
+        uses.append(bool(taken))
+
+    assert uses == [kernel != "off", False, True]
 
 
 def test_arrays_that_do_not_fit_are_refused_before_anything_is_written():
-    rows = Rows([surjective()] * 4, compiled=True)
+    rows = Rows([surjective()] * 4, kernel="required")
     steps = Steps.empty(rows, 2)
     wide = torch.zeros(3, 4, 1, 12, 13, dtype=torch.uint8)
     rows.reset()
@@ -247,7 +303,7 @@ def test_arrays_that_do_not_fit_are_refused_before_anything_is_written():
 
 @pytest.mark.parametrize(("field", "value"), [("node", 2**40), ("node", -(2**40)), ("state_type", 5)])
 def test_a_state_outside_the_tables_is_refused(field, value):
-    rows = Rows([fully_observable()] * 3, compiled=True)
+    rows = Rows([fully_observable()] * 3, kernel="required")
     rows.reset()
     kind = {"state_type": torch.full_like(rows.state_type, 1)}
     rows.state = rows.state._replace(**(kind | {field: torch.full_like(getattr(rows, field), value)}))
@@ -257,7 +313,7 @@ def test_a_state_outside_the_tables_is_refused(field, value):
 
 
 def test_data_are_not_changed_by_later_steps():
-    env = CTGraphEnv([confounding()] * 5, compiled=True)
+    env = CTGraphEnv([confounding()] * 5, kernel="required")
     before = env.reset().clone()
     data = before.clone()
     step, _ = env.step_and_maybe_reset(data.set("action", torch.zeros(5, dtype=torch.int64)))
@@ -272,15 +328,15 @@ def test_data_are_not_changed_by_later_steps():
 @pytest.mark.parametrize("missing", [None, "a compiler", "the rewards"])
 def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(monkeypatch, missing):
     if missing == "a compiler":
-        monkeypatch.setattr(native, "is_available", lambda: False)
+        monkeypatch.setattr("ctgraph_rl.batch.rows.is_available", lambda: False)
     if missing == "the rewards":
         monkeypatch.setattr(native, "REWARDS", ())
     curriculum = Curriculum("one", 1, "-", (Block(confounding(2, 2, 0.5), 480),))
-    plain = CTGraphEnv(curriculum.tasks * 8, 3)
+    plain = CTGraphEnv(curriculum.tasks * 8, 3, kernel="off")
 
     env = make_env(curriculum, curriculum.tasks * 8, 3)
 
-    assert env.rows.compiled == (missing is None)
+    assert env.rows.uses_kernel == (missing is None)
     assert all((one == other).all() for one, other in zip(*map(random_batches, (env, plain)), strict=True))
 
 

@@ -9,9 +9,9 @@ from helpers.task_families import FAMILIES, MIXED
 from torchrl.envs import StepCounter, TransformedEnv
 
 from ctgraph_rl import CTGraphEnv, Rows, Steps, Task, rollout
-from ctgraph_rl.batch import rollout as fast
 from ctgraph_rl.core import philox
 
+every_engine = pytest.mark.parametrize("kernel", ["off", "required"])
 every_family = pytest.mark.parametrize("tasks", FAMILIES.values(), ids=FAMILIES)
 NUM_ROWS, NUM_STEPS = 8, 60
 
@@ -35,9 +35,10 @@ def assert_same(steps: Steps, data) -> None:
         assert torch.equal(ours, data["next", field].transpose(0, 1).view(ours.shape))
 
 
+@every_engine
 @every_family
-def test_the_fast_path_gives_the_data_of_the_standard_path(tasks):
-    env, rows = CTGraphEnv(rows_of(tasks), seed=3, first_row=2), Rows(rows_of(tasks), seed=3, first_row=2)
+def test_the_fast_path_gives_the_data_of_the_standard_path(tasks, kernel):
+    env, rows = (kind(rows_of(tasks), seed=3, first_row=2, kernel=kernel) for kind in (CTGraphEnv, Rows))
     actions = actions_of(tasks)
 
     data = record(env, actions)
@@ -46,31 +47,17 @@ def test_the_fast_path_gives_the_data_of_the_standard_path(tasks):
     assert_same(steps, data)
 
 
+@every_engine
 @every_family
-def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks):
-    alone = CTGraphEnv(rows_of(tasks), seed=3)
-    wrapped = TransformedEnv(CTGraphEnv(rows_of(tasks), seed=3), StepCounter(step_count_key="steps"))
+def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks, kernel):
+    alone, inner = (CTGraphEnv(rows_of(tasks), seed=3, kernel=kernel) for _ in range(2))
+    wrapped = TransformedEnv(inner, StepCounter(step_count_key="steps"))
     actions = actions_of(tasks)
 
     data, other = record(alone, actions), record(wrapped, actions)
 
     assert (other.select(*data.keys(True, True)) == data).all()
     assert all(torch.equal(*pair) for pair in zip(alone.rows.state, wrapped.base_env.rows.state, strict=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("num_rows", [1, 8, 37])
-@pytest.mark.parametrize("tasks", [FAMILIES["noise"], FAMILIES["mixed"]])
-def test_what_compiles_the_fast_path_elsewhere_gives_the_same_bits(tasks, num_rows, monkeypatch):
-    rows, twin = (Rows((tasks * num_rows)[:num_rows]) for _ in range(2))
-    actions = scripts(NUM_STEPS, num_rows)
-    monkeypatch.setattr(fast, "_native", lambda rows, policy, steps: fast._tensors(rows, policy, steps, True))
-
-    eager = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
-    compiled = rollout(twin, actions, Steps.empty(rows, NUM_STEPS), compiled=True)
-
-    assert all(torch.equal(*pair) for pair in zip(eager, compiled, strict=True))
-    assert all(torch.equal(*pair) for pair in zip(rows.state, twin.state, strict=True))
 
 
 @pytest.mark.slow
@@ -101,8 +88,9 @@ def test_the_compiled_environment_gives_the_same_bits(tasks):
     assert (data == other).all()
 
 
-def test_a_rollout_goes_on_where_the_last_one_ended():
-    rows, twin = Rows(rows_of(MIXED)), Rows(rows_of(MIXED))
+@every_engine
+def test_a_rollout_goes_on_where_the_last_one_ended(kernel):
+    rows, twin = (Rows(rows_of(MIXED), kernel=kernel) for _ in range(2))
     actions = actions_of(MIXED)
     whole = rollout(rows, actions, Steps.empty(rows, NUM_STEPS))
 
@@ -115,15 +103,15 @@ def test_a_rollout_goes_on_where_the_last_one_ended():
         assert torch.equal(getattr(parts[-1], field)[-1], getattr(whole, field)[-1])
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_a_policy_gets_what_it_shall_act_on_and_where_episodes_begin(compiled):
+@every_engine
+def test_a_policy_gets_what_it_shall_act_on_and_where_episodes_begin(kernel):
     rows, seen = Rows([surjective(goal=(1, 2))] * 2), []
 
     def policy(observation: torch.Tensor, is_init: torch.Tensor) -> torch.Tensor:
         seen.append((observation.clone(), is_init.tolist()))
         return torch.tensor([[0, 0, 1, 0, 2, 0][(len(seen) - 1) % 6], 1])
 
-    steps = rollout(rows, policy, Steps.empty(rows, 7), compiled)
+    steps = rollout(rows, policy, Steps.empty(rows, 7), kernel)
 
     assert torch.equal(torch.stack([observation for observation, _ in seen]), steps.observation[:-1])
     assert [is_init for _, is_init in seen] == steps.is_init[:-1].tolist()

@@ -42,17 +42,18 @@ def test_without_a_compiler_all_else_works(own_cache, monkeypatch):
 
     tasks = [surjective(), confounding(2, 2, 0.5, read_noise=9)]
     observed = Rows(tasks).reset().observation
+    assert not Rows(tasks).uses_kernel
     with pytest.raises(ValueError, match="needs a C compiler, 'no-such-compiler' does not run; install one"):
-        Rows([surjective()], compiled=True)
+        Rows([surjective()], kernel="required")
     monkeypatch.undo()
     library.is_available.cache_clear()
-    assert library.is_available() and torch.equal(Rows(tasks).reset().observation, observed)
+    assert Rows(tasks).uses_kernel and torch.equal(Rows(tasks).reset().observation, observed)
 
 
 def test_a_compiler_that_fails_is_named_with_what_it_said(own_cache, monkeypatch):
     monkeypatch.setattr(library, "_FLAGS", ("-no-such-flag",))
 
-    with pytest.raises(ValueError, match=r"compiled=True: cc -no-such-flag .* failed: .*no-such-flag"):
+    with pytest.raises(ValueError, match=r'kernel="required": cc -no-such-flag .* failed: .*no-such-flag'):
         library.library()
     assert not list(own_cache.iterdir())
 
@@ -133,7 +134,9 @@ def test_whatever_keeps_the_library_from_loading_the_tensor_code_runs(own_cache,
     counter, key = (torch.arange(3),) * 4, (torch.tensor(1),) * 2
 
     assert all(map(torch.equal, philox.philox(counter, key), philox.by_tensors(counter, key)))
-    with pytest.raises(ValueError, match=f"compiled=True cannot make or load its kernel: {break_}; use compiled=False"):
+    with pytest.raises(
+        ValueError, match=f'kernel="required" cannot make or load the kernel: {break_}; use kernel="auto"'
+    ):
         library.library()
 
 

@@ -24,7 +24,7 @@ def test_the_example_of_the_fast_path_learns_the_task(capsys):
 
 
 def test_the_benchmark_prints_a_row_for_every_way(capsys):
-    benchmark.main(["--rows", "2", "--tasks", "SU", "--rounds", "1", "--seconds", "0.001", "--skip-compiled"])
+    benchmark.main(["--rows", "2", "--tasks", "SU", "--rounds", "1", "--seconds", "0.001", "--skip-kernel"])
 
     lines = capsys.readouterr().out.splitlines()
     ways = [line.split("|")[3].strip() for line in lines if line.startswith("| 2 ")]

@@ -18,16 +18,16 @@ INFO = {"step_count", "episode_reward", "outcome", "leaf", "truncated"}
 
 Prepare = Callable[[CTGraphEnv], dict[str, Any]]
 every_env = pytest.mark.parametrize(
-    "options", [{}, {"compiled": True}, {"info": False}, {"compiled": True, "info": False}], ids=str
+    "options", [{"kernel": kernel, "info": info} for kernel in ("off", "auto") for info in (True, False)], ids=str
 )
 
 
-def make(**options: bool) -> CTGraphEnv:
+def make(**options: Any) -> CTGraphEnv:
     return CTGraphEnv(TASKS, seed=3, check_actions=False, **options)
 
 
 def both(
-    *args: Any, options: dict[str, bool] | None = None, prepare: Prepare = lambda env: {}, **kwargs: Any
+    *args: Any, options: dict[str, Any] | None = None, prepare: Prepare = lambda env: {}, **kwargs: Any
 ) -> tuple[TensorDictBase, TensorDictBase]:
     """What the stock method and this class's give from equal states with equal random actions."""
 
@@ -175,9 +175,9 @@ def test_after_a_rollout_that_fails_the_stock_method_stacks_its_own_steps():
     assert EnvBase.rollout(env, 3, waits)["observation"].shape == (8, 3, 1, 12, 12)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_without_info_the_data_are_the_same_but_for_five_keys(compiled):
-    full, lean = (CTGraphEnv(TASKS, seed=3, compiled=compiled, info=info) for info in (True, False))
+@pytest.mark.parametrize("kernel", ["off", "required"])
+def test_without_info_the_data_are_the_same_but_for_five_keys(kernel):
+    full, lean = (CTGraphEnv(TASKS, seed=3, kernel=kernel, info=info) for info in (True, False))
     actions = scripts(40, len(TASKS))
 
     data, found = record(full, actions), record(lean, actions)
