@@ -26,42 +26,42 @@ if TYPE_CHECKING:
     from ctgraph_rl.runs.load import Trained as Trained
     from ctgraph_rl.runs.load import load as load
     from ctgraph_rl.runs.recorder import Recorder as Recorder
-    from ctgraph_rl.tasks.curriculum import Block as Block
     from ctgraph_rl.tasks.curriculum import Curriculum as Curriculum
-    from ctgraph_rl.tasks.curriculum import Evaluation as Evaluation
-    from ctgraph_rl.tasks.curriculum import Protocol as Protocol
     from ctgraph_rl.tasks.images import GroupedImages as GroupedImages
     from ctgraph_rl.tasks.images import ImageFile as ImageFile
     from ctgraph_rl.tasks.images import OneHot as OneHot
     from ctgraph_rl.tasks.images import PaperImages as PaperImages
+    from ctgraph_rl.tasks.images import ReferenceImages as ReferenceImages
+    from ctgraph_rl.tasks.images import ReferenceOneHot as ReferenceOneHot
     from ctgraph_rl.tasks.images import count_repeats as count_repeats
     from ctgraph_rl.tasks.images import distances as distances
     from ctgraph_rl.tasks.observations import Observations as Observations
-    from ctgraph_rl.tasks.reference import ReferenceImages as ReferenceImages
-    from ctgraph_rl.tasks.reference import ReferenceOneHot as ReferenceOneHot
+    from ctgraph_rl.tasks.protocol import Block as Block
+    from ctgraph_rl.tasks.protocol import Evaluation as Evaluation
+    from ctgraph_rl.tasks.protocol import Protocol as Protocol
     from ctgraph_rl.tasks.task import Task as Task
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Agent": "agent",
-    "Block": "tasks.curriculum",
+    "Block": "tasks.protocol",
     "CTGraph": "core.graph",
     "CTGraphEnv": "env",
     "Curriculum": "tasks.curriculum",
-    "Evaluation": "tasks.curriculum",
+    "Evaluation": "tasks.protocol",
     "GroupedImages": "tasks.images",
     "ImageFile": "tasks.images",
     "Gradient": "core.rewards",
     "Needle": "core.rewards",
     "Recorder": "runs.recorder",
-    "ReferenceImages": "tasks.reference",
+    "ReferenceImages": "tasks.images",
     "ReferenceLinear": "core.rewards",
-    "ReferenceOneHot": "tasks.reference",
+    "ReferenceOneHot": "tasks.images",
     "Observations": "tasks.observations",
     "OneHot": "tasks.images",
     "PaperImages": "tasks.images",
-    "Protocol": "tasks.curriculum",
+    "Protocol": "tasks.protocol",
     "Rows": "batch.rows",
     "RunLog": "log.run_log",
     "StateType": "core.graph",

@@ -17,8 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import bank_bytes
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.tasks.values import random_frames_to_goal
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs

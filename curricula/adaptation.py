@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import all_goals, cycle, given_goals, random_goals, sequence
 from curricula.published import environment, full_mdp, goal_of

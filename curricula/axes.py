@@ -19,9 +19,10 @@ from typing import Any
 
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
 from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 

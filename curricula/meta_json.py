@@ -21,7 +21,8 @@ from reprlib import repr as short
 from typing import Any
 
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import MOST_TASKS, Tasks, sequence

@@ -18,7 +18,8 @@ from collections.abc import Sequence
 from itertools import chain
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Evaluation
 from curricula.published import MASK_EVALUATION, chosen, labelled, one_wait_image, pool_ids, words
 
 MASKSC = "github.com/DMIU-ShELL/MaskSC (2026)"

@@ -13,7 +13,8 @@ from functools import partial
 from typing import NamedTuple
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Evaluation
 from curricula.published import chosen, full_mdp, labelled
 
 SOURCE = "Nath et al. 2023, CoLLAs; github.com/DMIU-ShELL/L2D2-C"

@@ -22,7 +22,8 @@ from ctgraph_rl.describe import (
     to_latex,
     to_markdown,
 )
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs, goals_by_graph
 

@@ -12,14 +12,11 @@ from torch import Tensor
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.dynamics import STATE_DTYPES, ObservationParams, RewardParams, RowState, Shown, Uses
 from ctgraph_rl.core.kernel import library, num_threads
-from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear, RewardFn
+from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
 from ctgraph_rl.core.tree import TreeParams
 
 if TYPE_CHECKING:
     from ctgraph_rl.batch.rows import Rows
-
-REWARDS = (Needle, Gradient, ReferenceLinear)
-"""The rewards that the kernel knows, in its order; a user's own are Python and need the tensor code."""
 
 
 KERNELS = ("auto", "off", "required")
@@ -43,7 +40,7 @@ def require_kernel(reward_fns: Iterable[RewardFn], device: torch.device) -> None
         ValueError: saying which.
     """
     other = _unknown(reward_fns)
-    names, fix = ", ".join(reward.__name__ for reward in REWARDS), 'use kernel="auto" or kernel="off"'
+    names, fix = ", ".join(reward.__name__ for reward in KERNEL_REWARDS), 'use kernel="auto" or kernel="off"'
     require(
         (not other, f'kernel="required" knows the rewards {names}, got {other[:3]}; {fix}'),
         (device.type == "cpu", f'kernel="required" runs on a CPU, got {device}; {fix}'),
@@ -52,7 +49,7 @@ def require_kernel(reward_fns: Iterable[RewardFn], device: torch.device) -> None
 
 
 def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
-    return [fn for fn in reward_fns if type(fn) not in REWARDS]
+    return [fn for fn in reward_fns if type(fn) not in KERNEL_REWARDS]
 
 
 class Native:
@@ -182,7 +179,7 @@ def _packed(tree: TreeParams, x: ObservationParams, g: RewardParams, uses: Uses)
     """The different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
     count = len(tree.first_leaf)
     extra = torch.zeros(count) if tree.extra_end_step is None else tree.extra_end_step
-    reward_fn = torch.tensor([REWARDS.index(type(fn)) for fn in uses.reward_fns])[g.reward_fn]
+    reward_fn = torch.tensor([KERNEL_REWARDS.index(type(fn)) for fn in uses.reward_fns])[g.reward_fn]
     legacy = torch.ones_like(x.num_ids) if x.legacy is None else x.legacy.num_ids
     plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra]
     plain += [x.num_views, x.num_angles, x.read_noise, x.reward_cue, x.cue_wraps, x.cue_element, x.noise_start]

@@ -82,3 +82,10 @@ class ReferenceLinear:
         depth = arrival.depth
         lost = (place * arrival.differences()).sum(-1)  # the last decision weighs 1, the first one d
         return (1 - lost.double() / (depth * (depth + 1) / 2)).float()
+
+
+KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)
+"""The rewards that ``kernel.c`` computes, in its order; any other one, a user's own too, needs the tensor engine."""
+
+REWARD_FNS = (*KERNEL_REWARDS,)
+"""Every reward of this package; JSON names them by their classes."""

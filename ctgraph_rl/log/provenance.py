@@ -5,20 +5,19 @@ from __future__ import annotations
 import platform
 from dataclasses import replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from ctgraph_rl.tasks.curriculum import Curriculum
+import tensordict
+import torch
+import torchrl
+
+from ctgraph_rl import __version__
+from ctgraph_rl.log.run_log import SCHEMA
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 def versions() -> dict[str, str]:
     """Versions of this package and of what computes its numbers."""
-    import tensordict
-    import torch
-    import torchrl
-
-    from ctgraph_rl import __version__
-
     return {
         "ctgraph_rl": __version__,
         "torch": torch.__version__,
@@ -39,8 +38,6 @@ def named(curriculum: Curriculum) -> Curriculum:
 
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
     """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
-    from ctgraph_rl.log.run_log import SCHEMA
-
     return {
         "schema": SCHEMA,
         "curriculum": named(curriculum).name,
@@ -56,7 +53,5 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
 
 def machine() -> dict[str, Any]:
     """What besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
-    import torch
-
     kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
     return {"machine": kind, "num_threads": torch.get_num_threads()}

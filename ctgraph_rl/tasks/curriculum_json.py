@@ -17,18 +17,21 @@ from difflib import get_close_matches
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ctgraph_rl import __version__
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
-from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot, PaperImages
+from ctgraph_rl.core.rewards import REWARD_FNS
+from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
-from ctgraph_rl.tasks.reference import ReferenceImages, ReferenceOneHot
-from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+from ctgraph_rl.tasks.switch import SWITCHES
 from ctgraph_rl.tasks.task import Task
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
 SCHEMA = 1
 """Raised when the form of the JSON changes."""
@@ -42,16 +45,12 @@ MAX_NESTING = 16
 MAX_BANK_BYTES = 2**36
 """Most that the images of one task may need: 64 GiB."""
 
-IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
-REWARD_FNS = (Needle, Gradient, ReferenceLinear)
-SWITCHES = (ByEpisode, AtRandom, Drift)
-
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:
-    """A curriculum as JSON; see `Curriculum.to_json`."""
+    """Return a curriculum as JSON; see `Curriculum.to_json`."""
     require((path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"))
     places = {task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))}
     content = {
@@ -73,8 +72,10 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     return content
 
 
-def read_curriculum(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Curriculum:
-    """The curriculum of a JSON file or of its content; see `Curriculum.from_json`."""
+def read_curriculum(
+    path_or_dict: str | PathLike[str] | Mapping[str, Any], make: Callable[..., Curriculum]
+) -> Curriculum:
+    """Return the curriculum of a JSON file or of its content, which ``make`` makes; see `Curriculum.from_json`."""
     source, content = _load(path_or_dict)
     with _within(source):
         _check_form({key: value for key, value in content.items() if key != _DERIVED})
@@ -83,7 +84,7 @@ def read_curriculum(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Cu
         require((not is_int(schema, SCHEMA + 1), newer))
         _check_keys(content, _KEYS, optional=(_DERIVED,))
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
-        curriculum = _curriculum(content)
+        curriculum = make(**_parts(content))
         stated, found = content["fingerprint"], curriculum.fingerprint
         fix = f"if it was changed on purpose, write {found!r} there, and a new version and name"
         require((stated == found, f"fingerprint is {stated!r}, but the content has {found!r}; {fix}"))
@@ -111,8 +112,6 @@ def _names(kind: type) -> list[str]:
 
 
 def _about(curriculum: Curriculum) -> dict[str, Any]:
-    from ctgraph_rl import __version__
-
     numbers = ("num_states", "num_end_states", "reward_prob_random", "expected_episode_length")
     return {
         "written_by": f"ctgraph_rl {__version__}",
@@ -206,7 +205,8 @@ def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()
     )
 
 
-def _curriculum(content: Mapping[str, Any]) -> Curriculum:
+def _parts(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a curriculum."""
     require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
     tasks = _each("tasks", content["tasks"], _task)
     positions = partial(_tasks_at, tasks)
@@ -216,7 +216,8 @@ def _curriculum(content: Mapping[str, Any]) -> Curriculum:
         evaluation = _built(Evaluation, content["evaluation"], {"held_out": positions})
     with _within("protocol"):
         protocol = _built(Protocol, content["protocol"], {})
-    return Curriculum(content["name"], content["version"], content["source"], tuple(blocks), evaluation, protocol)
+    about = {name: content[name] for name in ("name", "version", "source")}
+    return {**about, "blocks": tuple(blocks), "evaluation": evaluation, "protocol": protocol}
 
 
 def _task(content: Any) -> Task:

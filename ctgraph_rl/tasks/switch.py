@@ -108,6 +108,10 @@ class Drift:
         return (clock // self.episodes + is_next).clamp_max(num_tasks - 1)
 
 
+SWITCHES = (ByEpisode, AtRandom, Drift)
+"""Every switch of this package; JSON names them by their classes."""
+
+
 def switch_rule(switch: object) -> tuple[bool, str]:
     """The rule for switches, a user's own among them."""
     holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)

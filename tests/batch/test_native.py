@@ -330,7 +330,7 @@ def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(m
     if missing == "a compiler":
         monkeypatch.setattr("ctgraph_rl.batch.rows.is_available", lambda: False)
     if missing == "the rewards":
-        monkeypatch.setattr(native, "REWARDS", ())
+        monkeypatch.setattr(native, "KERNEL_REWARDS", ())
     curriculum = Curriculum("one", 1, "-", (Block(confounding(2, 2, 0.5), 480),))
     plain = CTGraphEnv(curriculum.tasks * 8, 3, kernel="off")
 

@@ -12,7 +12,7 @@ import pytest
 import curricula
 from ctgraph_rl import Block, CTGraph, Evaluation, OneHot, PaperImages, ReferenceImages
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_su_b1
-from ctgraph_rl.tasks.curriculum import Protocol
+from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 from curricula import axes
 from curricula.axes import (

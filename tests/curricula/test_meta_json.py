@@ -11,7 +11,7 @@ import pytest
 
 import curricula
 from ctgraph_rl import CTGraph, Task
-from ctgraph_rl.tasks.curriculum import Evaluation, Protocol
+from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula.meta_json import MOST_BYTES, Pool
 from curricula.published import environment, one_wait_image
 

@@ -7,8 +7,8 @@ from helpers.paths import CHECKOUT
 
 import curricula
 from ctgraph_rl import CTGraph, Observations, Task
-from ctgraph_rl.tasks.curriculum import Evaluation, Protocol
-from ctgraph_rl.tasks.reference import ReferenceImages, ReferenceOneHot
+from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
+from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula.published import MISSING, full_mdp, labelled, one_wait_image, pool_ids, words
 
 EVERY_5120 = Evaluation(num_episodes=10, greedy=True, every=5120)

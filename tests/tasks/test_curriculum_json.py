@@ -3,6 +3,9 @@
 import copy
 import json
 from dataclasses import dataclass, is_dataclass, replace
+from importlib import import_module
+from pkgutil import iter_modules
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,12 +17,11 @@ import curricula
 from ctgraph_rl.core import rewards
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Gradient, Needle, ReferenceLinear
-from ctgraph_rl.tasks import curriculum_json as exchange
-from ctgraph_rl.tasks import images, reference, switch
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Evaluation, Protocol
-from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot
+from ctgraph_rl.tasks import curriculum_json, images, switch
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot, ReferenceImages
 from ctgraph_rl.tasks.memory import bank_bytes
-from ctgraph_rl.tasks.reference import ReferenceImages
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 A, B, C = (surjective(goal=goal) for goal in ((1, 1), (1, 2), (2, 1)))
@@ -118,13 +120,16 @@ def test_what_follows_from_the_rest_is_not_read(content):
 
 
 def test_all_our_image_sets_rewards_and_switches_can_be_exchanged():
-    def classes(module: object) -> set[type]:
-        local = [item for item in vars(module).values() if isinstance(item, type)]
-        return {item for item in local if is_dataclass(item) and item.__module__ == module.__name__}
+    def classes(*modules: ModuleType) -> set[type]:
+        local = [item for module in modules for item in vars(module).values() if isinstance(item, type)]
+        names = [module.__name__ for module in modules]
+        return {item for item in local if is_dataclass(item) and item.__module__ in names}
 
-    assert set(exchange.IMAGE_SETS) == classes(images) | classes(reference)
-    assert set(exchange.REWARD_FNS) == classes(rewards)
-    assert set(exchange.SWITCHES) == classes(switch)
+    of_images = [import_module(f"{images.__name__}.{found.name}") for found in iter_modules(images.__path__)]
+
+    assert set(images.IMAGE_SETS) == classes(*of_images) and len(of_images) >= 6
+    assert set(rewards.REWARD_FNS) == classes(rewards)
+    assert set(switch.SWITCHES) == classes(switch)
 
 
 def test_a_user_s_images_come_back_with_their_hash(tmp_path):
@@ -243,9 +248,9 @@ def test_a_file_that_is_too_large_or_missing_is_refused_with_its_name(tmp_path, 
     full().to_json(path)
     size = path.stat().st_size
 
-    monkeypatch.setattr(exchange, "MAX_BYTES", size)
+    monkeypatch.setattr(curriculum_json, "MAX_BYTES", size)
     assert Curriculum.from_json(path) == full()
-    monkeypatch.setattr(exchange, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(curriculum_json, "MAX_BYTES", size - 1)
     with pytest.raises(ValueError, match=rf"long\.json has more than {size - 1:,} bytes, the limit"):
         Curriculum.from_json(path)
     for missing in (tmp_path / "none.json", tmp_path, "\0"):

@@ -12,9 +12,11 @@ import torch
 
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rotation import rotate
-from ctgraph_rl.tasks.curriculum import Block, Curriculum
-from ctgraph_rl.tasks.images import UNRELATED, GroupedImages, ImageFile, OneHot, PaperImages, distances
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import GroupedImages, ImageFile, OneHot, PaperImages, distances
+from ctgraph_rl.tasks.images.generated import UNRELATED
 from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
 
 FIVE_IDS = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))

@@ -13,9 +13,8 @@ import curricula
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.core.rewards import Arrival, Gradient
 from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.images import OneHot, PaperImages, ReferenceImages
 from ctgraph_rl.tasks.observations import Observations
-from ctgraph_rl.tasks.reference import ReferenceImages
 from ctgraph_rl.tasks.similarity import (
     MEASURES,
     graph_containment,

@@ -6,7 +6,8 @@ import pytest
 from helpers.oracles import surjective
 
 import curricula
-from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 GOALS = [(1, 1), (1, 2), (2, 2)]

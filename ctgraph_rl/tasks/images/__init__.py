@@ -1,0 +1,33 @@
+"""O: the images behind the observation ids. One frozen dataclass for each kind of image set.
+
+A user's own kind is a frozen dataclass with what `ImageSet` names, and yaml reaches it through ``_target_``. The
+modules here import the core alone; tasks, batches and figures use them.
+"""
+
+from __future__ import annotations
+
+from ctgraph_rl.tasks.images.generated import GroupedImages, PaperImages
+from ctgraph_rl.tasks.images.image_file import ImageFile
+from ctgraph_rl.tasks.images.image_set import ImageSet, has_cue_element, white_level
+from ctgraph_rl.tasks.images.measures import Distances, count_repeats, distances
+from ctgraph_rl.tasks.images.one_hot import OneHot
+from ctgraph_rl.tasks.images.reference_images import ReferenceImages, ReferenceOneHot
+
+IMAGE_SETS = (PaperImages, GroupedImages, OneHot, ImageFile, ReferenceImages, ReferenceOneHot)
+"""Every image set of this package; JSON names them by their classes."""
+
+__all__ = [
+    "IMAGE_SETS",
+    "Distances",
+    "GroupedImages",
+    "ImageFile",
+    "ImageSet",
+    "OneHot",
+    "PaperImages",
+    "ReferenceImages",
+    "ReferenceOneHot",
+    "count_repeats",
+    "distances",
+    "has_cue_element",
+    "white_level",
+]

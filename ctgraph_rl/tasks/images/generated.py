@@ -1,0 +1,224 @@
+"""Image sets generated from a seed: the paper's, and groups of images of a chosen similarity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require
+from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
+from ctgraph_rl.core.rotation import rotate
+from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
+from ctgraph_rl.tasks.images.measures import first_of_each
+
+BLUEPRINT_SIZE = 4
+BLUEPRINT_LEVELS = (0, 127, WHITE)
+BLUEPRINT_ANGLES = (0, 30, 60)
+
+UNRELATED = (WHITE + 2) / (3 * (WHITE + 1))
+"""256/765: the expected distance of two images whose cells are independent and uniform over 0..254."""
+
+_GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperImages` uses block 0
+
+
+@dataclass(frozen=True)
+class PaperImages(SquareImages):
+    """The paper's image sets: random blueprints, upscaled and rotated, no image twice.
+
+    Image k is the k-th different one in the sequence of a seed, so a longer set begins with the shorter one.
+    A blueprint has 4x4 cells of {0, 1, 2}, shown as 0, 127 and 254; it is scaled up and rotated by 0, 30 or 60 degrees.
+
+    Args:
+        num_images: number of images.
+        seed: the image seed, in [0, 2**63).
+        size: r, side of an image in pixels; a multiple of 4.
+    """
+
+    num_images: int
+    seed: int = 1
+    size: int = 12
+
+    def __post_init__(self) -> None:
+        most = len(BLUEPRINT_LEVELS) ** (BLUEPRINT_SIZE**2)
+        require(
+            (is_int(self.num_images, 1, most), f"num_images must be in 1..{most} (3**16), got {self.num_images!r}"),
+            _seed_rule(self.seed),
+            _size_rule(self.size, BLUEPRINT_SIZE),
+        )
+
+    @property
+    def images(self) -> Tensor:
+        """uint8 [num_images, r, r], before rotation and noise on read."""
+        return _paper_images(self)
+
+
+@dataclass(frozen=True)
+class GroupedImages(SquareImages):
+    """Random images with a chosen similarity within groups, such as the decision images, and between groups.
+
+    Ids follow the groups: ``groups=(1, 1, 4, 8)`` makes id 0 the first group, id 1 the second, ids 2..5 the third. The
+    distance of two images is their mean absolute pixel difference as a share of 254. An image has c x c cells, each
+    uniform over 0..254. A group's blueprint is a common blueprint with a share s_g of its cells drawn anew, an image is
+    its group's blueprint with a share s_i drawn anew. Cells that are not shared differ by D = 256/765 on average, hence
+
+        within = D (1 - (1 - s_i)^2),    between = D (1 - (1 - s_i)^2 (1 - s_g)^2)
+
+    are the expected distances of two images of one group and of two groups, and the shares follow from them. What came
+    out for a seed is told by `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
+    up or down, so at least one is drawn anew when within >= D (1 - (1 - 1 / c^2)^2), the least value allowed.
+
+    No image occurs twice: one drawn before is left out. Longer groups begin with the shorter ones.
+
+    Args:
+        groups: number of images of each group.
+        within: expected distance of two images of one group.
+        between: expected distance of two images of different groups; within <= between <= D.
+        seed: the image seed, in [0, 2**63).
+        size: r, side of an image in pixels; a multiple of ``cells``.
+        cells: c, cells along a side.
+
+    Raises:
+        ValueError: for distances out of reach and more images than the cells keep apart.
+    """
+
+    groups: tuple[int, ...]
+    within: float
+    between: float
+    seed: int = 1
+    size: int = 12
+    cells: int = BLUEPRINT_SIZE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "groups", as_tuple(self.groups))
+        groups = self.groups
+        groups_ok = isinstance(groups, tuple) and bool(groups) and all(is_int(size, 1) for size in groups)
+        cells = self.cells if is_int(self.cells, 1) else 1
+        most = WHITE * cells**2 // 2  # half the images that differ from a blueprint in one cell
+        wanted = len(groups) * max(groups) if groups_ok else 0
+        require(
+            (groups_ok, f"groups must be the numbers of images of each group, >= 1, got {groups!r}"),
+            *at_least_one(cells=self.cells),
+            _seed_rule(self.seed),
+            _size_rule(self.size, cells),
+            (wanted <= most, f"groups need {wanted} images, more than {most}; use more cells"),
+            *self._distance_rules(),
+        )
+        object.__setattr__(self, "within", float(self.within))
+        object.__setattr__(self, "between", float(self.between))
+
+    def _distance_rules(self) -> list[tuple[bool, str]]:
+        """What distances can be reached; any up to that of unrelated images as long as the cells are in question."""
+        lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
+        within_ok = is_real(self.within, lowest, UNRELATED)
+        reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"
+        if is_real(self.within, 1e-9, lowest):
+            reach += f" for cells={self.cells} (use cells={_cells_for(self.within)} or more)"
+        between_ok = is_real(self.between, self.within if within_ok else lowest, UNRELATED)
+        return [
+            (within_ok, f"within must be in {reach}, got {self.within!r}"),
+            (between_ok, f"between must be in [within, {UNRELATED:.5f}], got {self.between!r}"),
+        ]
+
+    @property
+    def num_images(self) -> int:
+        """Images of all groups."""
+        return sum(self.groups)
+
+    @property
+    def group_of(self) -> tuple[int, ...]:
+        """The group of each id, numbered from 0: what `distances` asks for."""
+        return tuple(group for group, size in enumerate(self.groups) for _ in range(size))
+
+    @property
+    def images(self) -> Tensor:
+        """uint8 [num_images, r, r], before rotation and noise on read."""
+        return _grouped_images(self)
+
+
+@lru_cache(maxsize=16)
+def _paper_images(image_set: PaperImages) -> Tensor:
+    """The first different images of the seed's sequence of candidates."""
+    candidates, images = image_set.num_images, torch.empty(0)
+    while len(images) < image_set.num_images:
+        rendered = _render(_blueprints(image_set.seed, candidates), image_set.size)
+        images = rendered[first_of_each(rendered)]
+        candidates *= 2
+    return images[: image_set.num_images].clone()
+
+
+def _blueprints(seed: int, count: int) -> Tensor:
+    """int64 [count, 17]: 16 cells of a blueprint in {0, 1, 2} and one of three angles, by counter."""
+    words = draw(torch.tensor(seed), torch.tensor(0), torch.arange(count), STREAM_IMAGES)
+    powers = 3 ** torch.arange(BLUEPRINT_SIZE**2 + 1)
+    return ((words[0] << 31) | (words[1] >> 1)).unsqueeze(-1) // powers % 3
+
+
+def _render(blueprints: Tensor, size: int) -> Tensor:
+    """Blueprints as uint8 [count, size, size] images."""
+    levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8)[blueprints[:, :-1]]
+    images = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), size)
+    for which, angle in enumerate(BLUEPRINT_ANGLES):
+        chosen = blueprints[:, -1] == which
+        images[chosen] = rotate(images[chosen], angle)
+    return images
+
+
+@lru_cache(maxsize=16)
+def _grouped_images(image_set: GroupedImages) -> Tensor:
+    """Each group's first candidates that repeat none of any group, where candidate k of all groups precedes k + 1."""
+    groups, cells = image_set.groups, image_set.cells
+    candidates, chosen = max(groups), [torch.empty(0)]
+    while any(len(positions) < size for positions, size in zip(chosen, groups, strict=False)):
+        images = _candidates(image_set, candidates).flatten(0, 1)
+        first = first_of_each(images)
+        chosen = [first[first % len(groups) == group] for group in range(len(groups))]
+        candidates *= 2
+    positions = torch.cat([positions[:size] for positions, size in zip(chosen, groups, strict=True)])
+    return resize(images[positions].to(torch.uint8).view(-1, cells, cells), image_set.size)
+
+
+def _candidates(image_set: GroupedImages, count: int) -> Tensor:
+    """int64 [count, G, c * c]: levels of the first candidates of each group."""
+    seed, cells = image_set.seed, image_set.cells
+    kept_by_image = 1 - image_set.within / UNRELATED  # (1 - s_i)^2
+    kept_by_both = 1 - image_set.between / UNRELATED
+    group_share = 1 - math.sqrt(kept_by_both / kept_by_image) if kept_by_image else 0.0
+    group = torch.arange(1, len(image_set.groups) + 1)
+    common = _redraw(
+        torch.zeros(cells**2, dtype=torch.int64), 1.0, _words(seed, torch.tensor(0), torch.tensor(0), cells)
+    )
+    blueprints = _redraw(common, group_share, _words(seed, group, torch.tensor(0), cells))
+    words = _words(seed, group, torch.arange(1, count + 1).unsqueeze(-1), cells)
+    return _redraw(blueprints, 1 - math.sqrt(kept_by_image), words)
+
+
+def _words(seed: int, row: Tensor, tick: Tensor, cells: int) -> Tensor:
+    """At least 2 c * c + 1 random words per element, in a last dimension."""
+    blocks = _GROUPED_BLOCK + torch.arange((2 * cells**2 + 1 + 3) // 4)
+    words = draw(torch.tensor(seed), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_IMAGES, blocks)
+    return torch.stack(words, -1).flatten(-2)
+
+
+def _redraw(levels: Tensor, share: float, words: Tensor) -> Tensor:
+    """Levels [..., n] with a share of them drawn anew, each with this probability: share * n, rounded at random."""
+    n = levels.shape[-1]
+    count = (words[..., 2 * n : 2 * n + 1] + int(share * n * 2**32)) >> 32
+    rank = words[..., :n].argsort(dim=-1, stable=True).argsort(dim=-1)
+    return torch.where(rank < count, randint(words[..., n : 2 * n], WHITE + 1), levels)
+
+
+def _cells_for(distance: float) -> int:
+    """Cells along a side from which on a distance within groups is in reach."""
+    return math.ceil((1 - math.sqrt(1 - distance / UNRELATED)) ** -0.5)
+
+
+def _seed_rule(seed: object) -> tuple[bool, str]:
+    return is_int(seed, 0, 2**63 - 1), f"image seed must be in [0, 2**63), got {seed!r}"
+
+
+def _size_rule(size: int, cells: int) -> tuple[bool, str]:
+    return is_int(size, cells) and size % cells == 0, f"size must be a positive multiple of {cells}, got {size!r}"

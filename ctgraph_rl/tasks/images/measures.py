@@ -1,0 +1,70 @@
+"""How far apart the images of a set are, and how many repeat others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.tasks.images.image_set import WHITE
+
+
+class Distances(NamedTuple):
+    """Mean absolute pixel differences as a share of 254; nan where there is no pair to compare."""
+
+    within: float  # mean over all pairs of different images of one group
+    between: float  # mean over all pairs of images of different groups
+    matrix: Tensor  # float64 [G, G]: the mean over pairs for every two groups, and within each on the diagonal
+
+
+def distances(images: Tensor, groups: Sequence[int]) -> Distances:
+    """Measure how far apart images are within and between groups.
+
+    The sum of |x - y| over the pairs of two groups is, per pixel, the sum over levels of A (m - B) + B (n - A), where A
+    and B count each group's images up to the level and n and m count all: integers, and linear in the images.
+
+    Args:
+        images: uint8 [n, r, r].
+        groups: the group of each image, numbered from 0 without a gap.
+    """
+    numbers = sorted(set(groups))
+    require(
+        (images.dtype == torch.uint8 and images.ndim == 3, f"images must be uint8 [n, r, r], got {images.dtype}"),
+        (len(groups) == len(images), f"groups must have one entry for each of {len(images)} images, got {len(groups)}"),
+        (numbers == list(range(len(numbers))), f"groups must be numbered from 0 without a gap, got {numbers}"),
+    )
+    group_of = torch.tensor(groups, device=images.device)
+    up_to = torch.stack([_counts_up_to_level(images[group_of == group]) for group in numbers]).to(torch.float64)
+    sizes = torch.bincount(group_of).to(torch.float64)
+    mixed = up_to.sum(1).unsqueeze(1) * sizes
+    sums = (mixed + mixed.T - 2 * up_to @ up_to.T) / (images[0].numel() * WHITE)
+    pairs = sizes.unsqueeze(1) * sizes - sizes.diag()  # of different images, in both orders
+    same = torch.eye(len(numbers), dtype=torch.bool, device=images.device)
+    within, between = ((sums[where].sum() / pairs[where].sum()).item() for where in (same, ~same))
+    return Distances(within, between, sums / pairs)
+
+
+def _counts_up_to_level(images: Tensor) -> Tensor:
+    """int64 [pixels * 256]: how many images have at most a level at a pixel."""
+    pixels = images.flatten(1).to(torch.int64)
+    count = pixels.shape[1]
+    place = pixels + 256 * torch.arange(count, device=images.device)
+    return torch.bincount(place.flatten(), minlength=256 * count).view(count, 256).cumsum(1).flatten()
+
+
+def count_repeats(images: Tensor) -> int:
+    """Count how many of uint8 [n, r, r] images equal an earlier one."""
+    fits = images.dtype == torch.uint8 and images.ndim == 3 and len(images) > 0
+    require((fits, f"images must be uint8 [n, r, r] with n >= 1, got {images.dtype} {list(images.shape)}"))
+    return len(images) - len(first_of_each(images))
+
+
+def first_of_each(images: Tensor) -> Tensor:
+    """Return the positions of the images that do not repeat an earlier one, in order."""
+    _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
+    positions = torch.arange(len(images))
+    first = torch.full((int(group.max()) + 1,), len(images)).scatter_reduce(0, group, positions, reduce="amin")
+    return first.sort().values

@@ -1,0 +1,164 @@
+"""The image sets of the authors' implementation, pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
+from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
+
+MAX_SEED = 2**32 - 1
+"""Seeds of the authors' implementation are those of ``numpy.random.RandomState``."""
+
+_ANGLES = 359
+"""Image sets are rotated by 0..358 degrees."""
+
+_PIXELS_PER_CELL = 3
+
+
+@dataclass(frozen=True)
+class ReferenceImages(SquareImages):
+    """The image sets of the authors' implementation: 12 x 12 random blueprints at any angle, repeats kept.
+
+    An image is 4 x 4 cells of {0, 1, 2}, each 3 x 3 pixels of that many halves of the brightest level, 254 - noise. It
+    is rotated by 0..358 degrees (bilinear, black outside) and truncated to whole levels. The sets equal recorded ones
+    pixel by pixel. Longer sets begin with the shorter ones; `count_repeats` tells how many images equal an earlier one.
+
+    Args:
+        num_images: number of images.
+        seed: the image seed, in [0, 2**32).
+        noise: ``noise_on_read`` of the configuration file, in [0, 254]. Here it lowers the brightest level; the noise
+            on read itself is ``read_noise`` of `Observations`, without the digits after the point.
+    """
+
+    num_images: int
+    seed: int = 1
+    noise: float = 0.0
+
+    size = BLUEPRINT_SIZE * _PIXELS_PER_CELL
+
+    def __post_init__(self) -> None:
+        require(
+            _num_images_rule(self.num_images),
+            (is_int(self.seed, 0, MAX_SEED), f"image seed must be in [0, 2**32), got {self.seed!r}"),
+            (is_real(self.noise, 0, WHITE), f"noise must be a number in [0, {WHITE}], got {self.noise!r}"),
+        )
+        object.__setattr__(self, "noise", float(self.noise))
+
+    @property
+    def white(self) -> float:
+        """The brightness of the goal's reward cue; the brightest level is this without the digits after the point."""
+        return WHITE - self.noise
+
+    @property
+    def images(self) -> Tensor:
+        """uint8 [num_images, 12, 12], before noise and rotation on read."""
+        return _reference_images(self)
+
+    def bank(self, read_rotation: int) -> Tensor:
+        """See `ImageSet`; rotated on read as the authors' implementation does it, pixel by pixel."""
+        upright = self.images.numpy().astype(np.float64)
+        views = [_rotate(upright, angle).astype(np.uint8) for angle in range(read_rotation + 1)]
+        return torch.from_numpy(np.stack(views, axis=1)).flatten(0, 1).unsqueeze(1)
+
+
+@dataclass(frozen=True)
+class ReferenceOneHot:
+    """The 1D observations of the authors' implementation: 254 at the id's place, and a last element for the reward cue.
+
+    The vector has K + 1 elements here, where the authors' implementation has an array of shape (K + 1, 1).
+
+    Args:
+        num_images: K, the number of ids.
+    """
+
+    num_images: int
+
+    num_variants = 1
+    white = WHITE
+    cue_element = True
+
+    def __post_init__(self) -> None:
+        require(_num_images_rule(self.num_images))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(K + 1,)."""
+        return (self.num_images + 1,)
+
+    def bank(self, read_rotation: int) -> Tensor:
+        """uint8 [K, K + 1]: 254 times the identity, and a column of zeros; a vector has no rotation."""
+        return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8)
+
+
+def _num_images_rule(value: object) -> tuple[bool, str]:
+    return is_int(value, 1), f"num_images must be an integer >= 1, got {value!r}"
+
+
+@lru_cache(maxsize=16)
+def _reference_images(image_set: ReferenceImages) -> Tensor:
+    """The images of a set, uint8 [num_images, r, r]."""
+    blueprints, angles = _blueprints(image_set.seed, image_set.num_images)
+    cells = blueprints * ((WHITE - image_set.noise) / 2)
+    upright = cells.repeat(_PIXELS_PER_CELL, axis=1).repeat(_PIXELS_PER_CELL, axis=2)
+    images = np.empty(upright.shape, dtype=np.uint8)
+    for angle in np.unique(angles):
+        chosen = angles == angle
+        images[chosen] = _rotate(upright[chosen], int(angle)).astype(np.uint8)
+    return torch.from_numpy(images)
+
+
+def _blueprints(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cells in {0, 1, 2}, int64 [count, 4, 4], and whole degrees, int64 [count], from NumPy's frozen generator."""
+    generator = np.random.RandomState(seed)
+    cells = np.empty((count, BLUEPRINT_SIZE, BLUEPRINT_SIZE), dtype=np.int64)
+    angles = np.empty(count, dtype=np.int64)
+    for i in range(count):
+        cells[i] = generator.randint(0, 3, BLUEPRINT_SIZE**2, dtype=np.int64).reshape(cells[i].shape)
+        angles[i] = generator.randint(0, _ANGLES, dtype=np.int64)
+    return cells, angles
+
+
+def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
+    """Rotate as scikit-image does, counter-clockwise about the centre, bilinear, black outside; float64 [n, r, r].
+
+    Truncation to whole levels shows the last bit of a sum, so this has the order of operations that recorded sets have,
+    where `images.rotate` has rounded weights.
+    """
+    y, x = _sources(images.shape[-1], degrees)
+    border = images.shape[-1] // 2  # no pixel comes from farther outside
+    padded = np.pad(images, ((0, 0), (border, border), (border, border)))
+    above, left = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
+    down, right = y - above, x - left
+    rows, columns = above + border, left + border
+    upper, lower = (
+        (1 - right) * padded[:, row, columns] + right * padded[:, row, columns + 1] for row in (rows, rows + 1)
+    )
+    rotated = (1 - down) * upper + down * lower
+    # scikit-image stays within an image's levels, and black only counts as one where a pixel is fully outside
+    lowest = np.where(rotated.min((1, 2)) > 0, images.min((1, 2)), 0)
+    return np.clip(rotated, lowest[:, None, None], images.max((1, 2))[:, None, None])
+
+
+@lru_cache(maxsize=_ANGLES)
+def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns in the image that the pixels of the rotated one come from, float64 [r, r] each."""
+    angle, centre = math.radians(degrees), (size - 1) / 2
+    cos, sin = math.cos(angle), math.sin(angle)
+    y, x = np.mgrid[:size, :size].astype(np.float64)
+    first_x = _fused(sin, centre, -cos * centre) + centre
+    first_y = _fused(-cos, centre, -sin * centre) + centre
+    return sin * x + cos * y + first_y, cos * x - sin * y + first_x
+
+
+def _fused(a: float, b: float, c: float) -> float:
+    """a b + c, rounded once, as the matrix products that recorded sets come from."""
+    return float(Fraction(a) * Fraction(b) + Fraction(c))
