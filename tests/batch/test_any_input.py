@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.any_tasks import INF, KINDS, NAN, batches, counts_of, examples, flips, seeds, tasks
 from helpers.oracles import (
     END,
     FAIL,
@@ -27,6 +26,7 @@ from helpers.oracles import (
     surjective,
     tree_step,
 )
+from helpers.task_families import INF, KINDS, NAN, batches, counts_of, examples, flips, seeds, tasks
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDictBase

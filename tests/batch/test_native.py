@@ -10,9 +10,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from helpers.any_tasks import batches, examples, seeds
 from helpers.oracles import confounding, fully_observable, record, scripts, surjective
-from helpers.task_families import FAMILIES, MIXED, SWITCHED, VECTORS, calls
+from helpers.task_families import FAMILIES, MIXED, SWITCHED, VECTORS, batches, calls, examples, seeds
 from hypothesis import given
 from tensordict import TensorDictBase
 from torch import Tensor

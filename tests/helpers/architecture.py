@@ -1,0 +1,353 @@
+"""What modules import and call, read once from their source text, and the rules of the house over that.
+
+A rule takes modules and returns its findings, one text for each place that breaks it, sorted and without line numbers.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+from helpers.paths import CHECKOUT
+
+PACKAGES = ("ctgraph_rl", "curricula", "baselines", "hydra_plugins")
+BY_NAME = ("import_module", "find_spec", "__import__")
+"""Functions that import, or look for, a module by its name."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """A name that a statement imports."""
+
+    module: str
+    """Where the name is: the module itself, or the one that it is a name of."""
+
+    name: str | None = None
+    """The name in that module; None for a whole module."""
+
+    in_function: bool = False
+    typing: bool = False
+    """Whether it is for type checkers only."""
+
+    reasoned: bool = False
+    """Whether its line has a comment."""
+
+    @property
+    def full(self) -> str:
+        return self.module if self.name is None else f"{self.module}.{self.name}"
+
+    @property
+    def is_ours(self) -> bool:
+        return self.module.partition(".")[0] in PACKAGES
+
+
+@dataclass(frozen=True)
+class Module:
+    """What the rules need to know of a module."""
+
+    name: str
+    is_folder: bool
+    num_lines: int
+    docstring: str
+    imports: tuple[Import, ...] = ()
+    calls: tuple[tuple[str, int], ...] = ()
+    """Functions and with how many positional arguments they are called."""
+
+    by_name: tuple[str | None, ...] = ()
+    """The beginnings of the names of modules that it imports by name; None where the source does not say."""
+
+    private: tuple[str, ...] = ()
+    """Private names of other modules of ours that it uses."""
+
+    @property
+    def folder(self) -> str:
+        return self.name if self.is_folder else self.name.rpartition(".")[0]
+
+
+@dataclass
+class _Reader(ast.NodeVisitor):
+    """Collects facts of one module in one walk over its tree."""
+
+    lines: Sequence[str]
+    is_module: Callable[[str], bool]
+    imports: list[Import] = field(default_factory=list)
+    calls: list[tuple[str, int]] = field(default_factory=list)
+    by_name: list[str | None] = field(default_factory=list)
+    private: list[str] = field(default_factory=list)
+    modules: dict[str, str] = field(default_factory=dict)
+    depth: int = 0
+    typing: bool = False
+
+    def visit_If(self, node: ast.If) -> None:
+        before, self.typing = self.typing, self.typing or "TYPE_CHECKING" in ast.unparse(node.test)
+        for child in node.body:
+            self.visit(child)
+        self.typing = before
+        for child in (node.test, *node.orelse):
+            self.visit(child)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> None:
+        self.depth += 1
+        self.generic_visit(node)
+        self.depth -= 1
+
+    visit_AsyncFunctionDef = visit_FunctionDef
+
+    def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            self._add(node, alias.name, None, alias.asname or alias.name)
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        assert node.level == 0 and node.module, f"relative import: {ast.unparse(node)}"
+        for alias in node.names:
+            full = f"{node.module}.{alias.name}"
+            if self.is_module(full):
+                self._add(node, full, None, alias.asname or alias.name)
+            else:
+                self._add(node, node.module, alias.name)
+
+    def _add(self, node: ast.stmt, module: str, name: str | None, bound: str = "") -> None:
+        reasoned = any("#" in line for line in self.lines[node.lineno - 1 : node.end_lineno])
+        found = Import(module, name, self.depth > 0, self.typing, reasoned)
+        self.imports.append(found)
+        if found.is_ours and name is None:
+            self.modules[bound] = module
+        elif found.is_ours and name is not None and is_private(name):
+            self.private.append(f"{module}.{name}")
+
+    def visit_Attribute(self, node: ast.Attribute) -> None:
+        module = self.modules.get(ast.unparse(node.value))
+        if module is not None and is_private(node.attr):
+            self.private.append(f"{module}.{node.attr}")
+        self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        called = ast.unparse(node.func)
+        self.calls.append((called, len(node.args)))
+        if called.rpartition(".")[2] in BY_NAME:
+            self.by_name.append(_beginning(node.args[0]) if node.args else None)
+        self.generic_visit(node)
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.endswith("__")
+
+
+def _beginning(argument: ast.expr) -> str | None:
+    """The constant text that an argument begins with."""
+    if isinstance(argument, ast.JoinedStr) and argument.values:
+        argument = argument.values[0]
+    return argument.value if isinstance(argument, ast.Constant) and isinstance(argument.value, str) else None
+
+
+def read(sources: Mapping[str, str]) -> list[Module]:
+    """The modules of source texts, by their names; that of a folder's ``__init__`` ends with ``.__init__``.
+
+    What a folder imports for type checkers only is what it exports lazily: who imports it from there, imports it from
+    where it is.
+    """
+    names = {name.removesuffix(".__init__") for name in sources}
+    modules = [_module(name, text, names.__contains__) for name, text in sources.items()]
+    homes = {
+        (module.name, one.name): one.module
+        for module in modules
+        if module.is_folder
+        for one in module.imports
+        if one.typing and one.name
+    }
+    return [
+        replace(
+            module,
+            imports=tuple(replace(one, module=homes.get((one.module, one.name), one.module)) for one in module.imports),
+        )
+        for module in modules
+    ]
+
+
+def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
+    tree, lines = ast.parse(text), text.splitlines()
+    reader = _Reader(lines, is_module)
+    reader.visit(tree)
+    return Module(
+        name.removesuffix(".__init__"),
+        name.endswith(".__init__"),
+        len(lines),
+        ast.get_docstring(tree) or "",
+        imports=tuple(reader.imports),
+        calls=tuple(reader.calls),
+        by_name=tuple(reader.by_name),
+        private=tuple(reader.private),
+    )
+
+
+def sources_of(*folders: str) -> dict[str, str]:
+    """Source texts of the checkout by the names of their modules."""
+    paths = sorted(path for folder in folders for path in (CHECKOUT / folder).rglob("*.py"))
+    return {".".join(path.relative_to(CHECKOUT).with_suffix("").parts): path.read_text("utf-8") for path in paths}
+
+
+@cache
+def modules_of_packages() -> list[Module]:
+    """The modules of our packages."""
+    return read(sources_of(*PACKAGES))
+
+
+@cache
+def modules_of_tests() -> list[Module]:
+    """The modules of the tests."""
+    return read(sources_of("tests"))
+
+
+# The rules
+
+
+def arrows(modules: Iterable[Module], typing: bool) -> dict[str, set[str]]:
+    """The modules of ours that each module imports, with or without those for type checkers only.
+
+    What the root of a package exports is not its own: its imports are left out.
+    """
+    inner = [module for module in modules if "." in module.name]
+    return {
+        module.name: {one.module for one in module.imports if one.is_ours and (typing or not one.typing)}
+        - {module.name}
+        for module in inner
+    }
+
+
+def wing(module: str) -> str:
+    """The folder or single module of ``ctgraph_rl`` that a module belongs to; of other packages, the package."""
+    package, *parts = module.split(".")
+    return parts[0] if package == "ctgraph_rl" and parts else package
+
+
+def upward(modules: Iterable[Module], floors: Sequence[Sequence[str]], top: Mapping[str, str]) -> list[str]:
+    """Imports that do not go down.
+
+    Args:
+        modules: of which imports are read.
+        floors: wings, lower ones first; those of one floor do not import each other.
+        top: modules that stand above all floors, and why.
+    """
+    floor = {name: number for number, names in enumerate(floors) for name in names}
+
+    def place(module: str) -> float:
+        return len(floors) if module in top else floor.get(wing(module), -1.0)
+
+    unplaced = {f"{module.name} is on no floor" for module in modules if place(module.name) < 0}
+    return sorted(
+        unplaced
+        | {
+            f"{source} -> {target}"
+            for source, targets in arrows(modules, typing=True).items()
+            for target in targets
+            if place(target) >= place(source) and (wing(source) != wing(target) or target in top)
+        }
+    )
+
+
+def circles(graph: Mapping[str, set[str]]) -> list[tuple[str, ...]]:
+    """Groups of modules that reach each other."""
+    reached = {start: _reached(graph, start) for start in graph}
+    groups = {
+        tuple(sorted({start, *(other for other in reached[start] if start in reached.get(other, ()))}))
+        for start in graph
+        if start in reached[start]
+    }
+    return sorted(groups)
+
+
+def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
+    found: set[str] = set()
+    waiting = list(graph[start])
+    while waiting:
+        here = waiting.pop()
+        if here not in found:
+            found.add(here)
+            waiting += graph.get(here, ())
+    return found
+
+
+def circles_at_run_time(modules: Iterable[Module]) -> list[str]:
+    return [" <-> ".join(group) for group in circles(arrows(modules, typing=False))]
+
+
+def circles_between_wings(modules: Iterable[Module]) -> list[str]:
+    """Circles, those of imports for type checkers included, that reach beyond a wing."""
+    groups = circles(arrows(modules, typing=True))
+    return [" <-> ".join(group) for group in groups if len({wing(name) for name in group}) > 1]
+
+
+def _is_of(name: str, packages: Iterable[str]) -> bool:
+    return any(f"{name}.".startswith(f"{package}.") for package in packages)
+
+
+def users_of(modules: Iterable[Module], *packages: str) -> list[str]:
+    """Modules that import one of these packages, for type checkers only or not."""
+    return sorted({module.name for module in modules for one in module.imports if _is_of(one.full, packages)})
+
+
+def forbidden(modules: Iterable[Module], never: Mapping[str, Sequence[str]]) -> list[str]:
+    """Imports of packages that modules of a package must never import when they run."""
+    return sorted(
+        {
+            f"{module.name} -> {one.full}"
+            for module in modules
+            for package, others in never.items()
+            for one in module.imports
+            if _is_of(module.name, [package]) and _is_of(one.full, others) and not one.typing
+        }
+    )
+
+
+def imported_by_name(modules: Iterable[Module], doors: Iterable[str]) -> list[str]:
+    """Modules besides some doors that import one of our packages by its name, or what the source does not say."""
+    found = ((module.name, name) for module in modules if module.name not in doors for name in module.by_name)
+    return sorted({f"{where}: {name or '?'}" for where, name in found if name is None or Import(name).is_ours})
+
+
+def full_folders(modules: Iterable[Module], most: int, catalogues: Iterable[str]) -> list[str]:
+    """Folders besides catalogues of more modules than allowed; their ``__init__`` does not count."""
+    folders = [module.folder for module in modules if not module.is_folder]
+    return sorted(
+        f"{folder}: {folders.count(folder)} modules"
+        for folder in set(folders) - set(catalogues)
+        if folders.count(folder) > most
+    )
+
+
+def long_files(modules: Iterable[Module], most: int, exceptions: Iterable[str]) -> list[str]:
+    return sorted(module.name for module in modules if module.num_lines > most and module.name not in exceptions)
+
+
+def long_calls(modules: Iterable[Module], most: int, exceptions: Iterable[str] = ()) -> list[str]:
+    """Calls with more positional arguments than allowed, but for some functions."""
+    found = ((module.name, called, number) for module in modules for called, number in module.calls)
+    return sorted({f"{name}: {called}" for name, called, number in found if number > most and called not in exceptions})
+
+
+def private_names(modules: Iterable[Module]) -> list[str]:
+    return sorted({f"{module.name}: {name}" for module in modules for name in module.private})
+
+
+def imports_in_functions(modules: Iterable[Module]) -> list[tuple[str, Import]]:
+    """Our own imports inside functions, with the modules that have them."""
+    return [(module.name, one) for module in modules for one in module.imports if one.is_ours and one.in_function]
+
+
+def unexplained_folders(modules: Iterable[Module]) -> list[str]:
+    """Folders whose docstring has not two or three sentences."""
+    return sorted(
+        module.name
+        for module in modules
+        if module.is_folder and not 2 <= len(re.findall(r"[.!?](?=\s|$)", module.docstring)) <= 3
+    )
+
+
+def tests_that_import_tests(modules: Iterable[Module]) -> list[str]:
+    pattern = re.compile(r"(^|\.)(test_\w+|conftest)($|\.)")
+    return sorted(
+        {f"{module.name}: {one.module}" for module in modules for one in module.imports if pattern.search(one.full)}
+    )
