@@ -94,7 +94,7 @@ class CTGraphEnv(EnvBase):
         ids = {} if task_ids is None else task_ids
         numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device)
         self.register_buffer("_id_of_task", numbers, persistent=False)
-        self._task_id: tuple[Tensor | None, Tensor | None] = (None, None)
+        self._task_id = torch.empty(0), torch.empty(0)
         self._steps: list[TensorDictBase] | None = None
         self._make_specs()
 
@@ -141,17 +141,6 @@ class CTGraphEnv(EnvBase):
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
         """Let rows change between tasks from episode to episode: see `Rows.switch_tasks`."""
         self.rows.switch_tasks(tasks, switch, at_episode_end)
-
-    def _with_task_id(self, data: TensorDictBase) -> TensorDictBase:
-        """The data with the rows' task ids, if this environment shows them."""
-        if not self.num_task_ids:
-            return data
-        of, shown = self._task_id
-        if of is not self.rows.task:
-            ids = self._id_of_task.index_select(0, self.rows.task)
-            shown = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
-            self._task_id = self.rows.task, shown
-        return data.set("task_id", shown.clone())  # type: ignore[union-attr]
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal: see `Rows.set_goals`. The outcome is told by the goal at the end of an episode."""
@@ -218,7 +207,8 @@ class CTGraphEnv(EnvBase):
         else:
             shown = self.rows.reset(mask)
         is_init = self.rows.step_count == 0
-        return self._data(shown, is_init if mask is None else is_init & mask)
+        is_init = is_init if mask is None else is_init & mask
+        return self._tensordict(self._data(shown, done=shown.done.unsqueeze(-1), is_init=is_init.unsqueeze(-1)))
 
     def _given_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
         """The state to go back to in the rows of a mask; refuses what no state of the rows' trees can be."""
@@ -243,12 +233,7 @@ class CTGraphEnv(EnvBase):
         return RowState(*(torch.where(mask, new, old) for old, new in zip(present, state, strict=True)))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get("action", None)
-        if self.check_actions:
-            self.rows.check_actions(action)
-        shown = self.rows.step(action)
-        data = self._data(shown, torch.zeros_like(shown.done))
-        return data.set("reward", self.rows.reward.unsqueeze(-1).clone())
+        return self._tensordict(self.step_data(tensordict.get("action", None)))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """The standard method without its question whether any row is done and without its merge of two TensorDicts.
@@ -260,16 +245,8 @@ class CTGraphEnv(EnvBase):
         if self._post_step_mdp_hooks is not None:
             tensordict, tensordict_ = self._post_step_mdp_hooks(tensordict, tensordict_)
         done = tensordict.get(("next", "done"))
-        observation = self.rows.restart(done.squeeze(-1), tensordict.get(("next", "observation")))
-        running = torch.zeros_like(done)
-        self._with_task_id(tensordict_).set("observation", observation)
-        tensordict_.set("is_init", done.clone())
-        tensordict_.set("done", running)
-        tensordict_.set("terminated", running.clone())
-        if self.info:
-            leaf = torch.full_like(tensordict.get(("next", "leaf")), dynamics.NO_LEAF)
-            for key, value in self._info(running.to(torch.uint8), leaf).items():
-                tensordict_.set(key, value)
+        for key, value in _own(self.restart_data(done.clone(), tensordict.get(("next", "observation")))).items():
+            tensordict_.set(key, value)
         return tensordict, tensordict_
 
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
@@ -304,31 +281,61 @@ class CTGraphEnv(EnvBase):
         self._steps.extend(steps)
         return [step.empty() for step in steps[:1]]
 
-    def _data(self, shown: Shown, is_init: Tensor) -> TensorDictBase:
-        """Observation, book-keeping and done flags; nothing shares memory with the state."""
-        done = shown.done.unsqueeze(-1)
-        data = TensorDict(
-            {
-                "observation": shown.observation,
-                "is_init": is_init.unsqueeze(-1),
-                "done": done,
-                "terminated": done.clone(),
-            }
-            | (self._info(shown.outcome.unsqueeze(-1), shown.leaf.unsqueeze(-1)) if self.info else {}),
-            batch_size=self.batch_size,
-            device=self.device,
-        )
-        return self._with_task_id(data)
+    def step_data(self, action: Tensor | None) -> dict[str, Tensor]:
+        """Step all rows with actions, int64 [N]; return the data after the step by key, ``reward`` among them.
 
-    def _info(self, outcome: Tensor, leaf: Tensor) -> dict[str, Tensor]:
-        """What ``info=False`` leaves out, each [N, 1]."""
-        return {
-            "step_count": self.rows.step_count.unsqueeze(-1).clone(),
-            "episode_reward": self.rows.episode_reward.unsqueeze(-1).clone(),
-            "outcome": outcome,
-            "leaf": leaf,
-            "truncated": torch.zeros_like(outcome, dtype=torch.bool),
-        }
+        This and `restart_data` are a step for loops that keep tensors. Values may share memory with each other and with
+        the rows' state: do not write into them.
+
+        Raises:
+            ValueError: for actions that ``check_actions`` refuses.
+        """
+        if self.check_actions:
+            self.rows.check_actions(action)
+        shown = self.rows.step(action)  # type: ignore[arg-type]
+        done = shown.done.unsqueeze(-1)
+        data = self._data(shown, done=done, is_init=torch.zeros_like(done))
+        data["reward"] = self.rows.reward.unsqueeze(-1)
+        return data
+
+    def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
+        """Start an episode in the rows that are done; return the data that the next step starts from by key.
+
+        Args:
+            done: bool [N, 1], after the last step.
+            observation: uint8 [N, *shape], after the last step.
+        """
+        running = torch.zeros_like(done)
+        leaf = torch.full_like(self.rows.row, dynamics.NO_LEAF)
+        shown = Shown(self.rows.restart(done.squeeze(-1), observation), running.to(torch.uint8), leaf, running)
+        return self._data(shown, done=running, is_init=done)
+
+    def _data(self, shown: Shown, done: Tensor, is_init: Tensor) -> dict[str, Tensor]:
+        """Return what rows show and their counts by key, all but rewards; ``done`` and ``is_init`` are bool [N, 1]."""
+        data = {"observation": shown.observation, "is_init": is_init, "done": done, "terminated": done}
+        if self.info:
+            data |= {
+                "step_count": self.rows.step_count.unsqueeze(-1),
+                "episode_reward": self.rows.episode_reward.unsqueeze(-1),
+                "outcome": shown.outcome.view(-1, 1),
+                "leaf": shown.leaf.view(-1, 1),
+                "truncated": torch.zeros_like(done),
+            }
+        if self.num_task_ids:
+            data["task_id"] = self._shown_ids()
+        return data
+
+    def _shown_ids(self) -> Tensor:
+        """Return the rows' task ids as one-hot, uint8 [N, num_task_ids]; zeros for tasks without one."""
+        task, shown = self._task_id
+        if task is not self.rows.task:
+            ids = self._id_of_task.index_select(0, self.rows.task)
+            shown = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
+            self._task_id = self.rows.task, shown
+        return shown
+
+    def _tensordict(self, data: dict[str, Tensor]) -> TensorDict:
+        return TensorDict(_own(data), batch_size=self.batch_size, device=self.device)
 
     def render(self, size: int = 192) -> Tensor:
         """A picture of every row: the observation, and the tree with position and goal.
@@ -347,6 +354,15 @@ class CTGraphEnv(EnvBase):
         """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))
         self.rows.set_seed(seed)  # type: ignore[arg-type]
+
+
+_SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id")
+"""Data of rows whose memory is also that of other data or of the rows."""
+
+
+def _own(data: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return data that may be written into: their memory is their own."""
+    return {key: value.clone() if key in _SHARED else value for key, value in data.items()}
 
 
 def _num_task_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None) -> int:

@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.checks import at_least_one, is_int, require
-from ctgraph_rl.core.dynamics import NO_LEAF
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -133,50 +132,11 @@ def take_step(env: EnvBase, data: TensorDictBase) -> tuple[Step, TensorDictBase]
         taken, following = env.step_and_maybe_reset(data)
         return dict(taken.items(True, True)), following
     step = dict(data.items(True, True))
-    if env.check_actions:
-        env.rows.check_actions(step.get("action"))
-    after = _after(env, step["action"], step.get("task_id"))
-    step.update({("next", key): value for key, value in after.items()})
-    return step, _following(env, step, after["done"])
-
-
-def _after(env: CTGraphEnv, action: Tensor, task_id: Tensor | None) -> dict[str, Tensor]:
-    """What comes after the actions; every value is a column."""
-    rows = env.rows
-    shown = rows.step(action)
-    done = shown.done.unsqueeze(-1)
-    none = torch.zeros_like(done)
-    after = {
-        "observation": shown.observation,
-        "is_init": none,
-        "step_count": rows.step_count.unsqueeze(-1),
-        "episode_reward": rows.episode_reward.unsqueeze(-1),
-        "outcome": shown.outcome.unsqueeze(-1),
-        "leaf": shown.leaf.unsqueeze(-1),
-        "done": done,
-        "terminated": done,
-        "truncated": none,
-        "reward": rows.reward.unsqueeze(-1),
-    }
-    return after if task_id is None else {**after, "task_id": task_id}  # which changes with the next episode
-
-
-def _following(env: CTGraphEnv, step: Step, done: Tensor) -> TensorDictBase:
-    """What the next step starts from: finished rows start an episode; what else a policy wrote is kept."""
-    data = {key: value for key, value in step.items() if key[0] != "next" and key != "reward"}
-    data["observation"] = env.rows.restart(done.squeeze(-1))
-    none = torch.zeros_like(done)
-    data |= {
-        "is_init": done,
-        "step_count": env.rows.step_count.unsqueeze(-1),
-        "episode_reward": env.rows.episode_reward.unsqueeze(-1),
-        "outcome": none.to(torch.uint8),
-        "leaf": torch.full_like(step["next", "leaf"], NO_LEAF),
-        "done": none,
-        "terminated": none,
-        "truncated": none,
-    }
-    return env._with_task_id(TensorDict(data, env.batch_size, device=env.device))
+    after = env.step_data(step.get("action"))
+    step |= {("next", key): value for key, value in after.items()}
+    kept = {key: value for key, value in step.items() if key[0] != "next" and key != "reward"}
+    following = kept | env.restart_data(after["done"], after["observation"])
+    return step, TensorDict(following, env.batch_size, device=env.device)
 
 
 def in_time_order(steps: Sequence[Step], env: EnvBase) -> TensorDict:

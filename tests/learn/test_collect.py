@@ -1,0 +1,79 @@
+"""Collecting: every batch has the keys of the environment, and the values of its own steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from helpers.oracles import confounding, surjective
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.learn.collect import collect, take_step
+
+TASKS = [surjective(goal=(2, 1)), confounding(p=0.3)]
+IDS = {TASKS[0]: 0, TASKS[1]: 2}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "no info": {"info": False},
+    "task ids": {"task_ids": IDS},
+    "task ids, no info": {"task_ids": IDS, "info": False},
+}
+
+
+class Remembering:
+    """Acts at random and counts in a recurrent state."""
+
+    def __init__(self, env: CTGraphEnv) -> None:
+        self.generator = torch.Generator().manual_seed(0)
+        self.env = env
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        return TensorDict({"count": torch.zeros(num_envs, 1)}, [num_envs])
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        data["action"] = torch.randint(0, 3, self.env.batch_size, generator=self.generator)
+        return data.set(("next", "count"), data["count"] + 1)
+
+
+@pytest.mark.parametrize("kernel", ["off", "required"])
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_every_batch_has_the_keys_of_the_environment_also_after_a_change_of_tasks(options, kernel):
+    env = CTGraphEnv(TASKS * 4, kernel=kernel, **options)
+    policy = Remembering(env)
+
+    def change(frames: int) -> None:
+        if frames == 9 * env.numel():
+            env.set_tasks(TASKS[::-1] * 4, at_episode_end=True)
+
+    found = list(collect(env, policy, 18 * 8, 6, policy.initial_state, change))
+
+    shown, action = set(env.observation_spec.keys()) | set(env.done_keys), {"action", "count"}
+    keys = shown | action | {("next", key) for key in (*shown, "count", "reward")}
+    assert [set(batch.keys(True, True)) - {"next"} for batch in found] == [keys] * 3
+    assert found[0]["next", "done"].any() and set(env.rows.task.tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize("kernel", ["off", "required"])
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_a_step_of_the_collecting_loop_is_that_of_torchrl(options, kernel):
+    env, twin = (CTGraphEnv(TASKS * 4, seed=2, kernel=kernel, **options) for _ in range(2))
+    data, expected = env.reset(), twin.reset()
+    policy = Remembering(env)
+
+    for number in range(30):
+        if number == 10:
+            for one in (env, twin):
+                one.set_tasks(TASKS[::-1] * 4, at_episode_end=True)
+        written = policy(TensorDict(count=torch.zeros(8, 1), batch_size=[8]))
+        step, data = take_step(env, data.update(written))
+        taken, expected = twin.step_and_maybe_reset(expected.update(written))
+        assert same(step, dict(taken.items(True, True)))
+        del expected["count"]
+        assert same(dict(data.exclude("action", "count").items()), dict(expected.exclude("action").items()))
+
+
+def same(found: dict[Any, Tensor], expected: dict[Any, Tensor]) -> bool:
+    return found.keys() == expected.keys() and all(torch.equal(found[key], expected[key]) for key in expected)
