@@ -2,156 +2,112 @@
 
 Every metric gives a `Metric`: its value, definition, formula and source, or the reason why it is undefined. A missing
 evaluation, a division by zero or a curriculum that a definition does not speak of is said and never imputed.
+
+A metric is a function with ``@defined`` in any module of this folder; it is an attribute here and computed wherever
+there are the inputs that its arguments name. Modules import each other alone; logs, recorders and reports use them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import Any
 
 from torch import Tensor
 
-from ctgraph_rl.metrics.curves import (
-    Curves,
-    check_experts,
-    continual_world_forgetting,
-    continual_world_forward_transfer,
-    continual_world_performance,
-    forward_transfer_from_experts,
-    instant_cumulative_return,
-    mean_area,
-    relative_forgetting,
-    stage_areas,
-    tasks_learned,
-    total_performance_over_time,
-    trapezoid_area,
-)
-from ctgraph_rl.metrics.lifetime import (
-    Regime,
-    backward_transfer_contrast,
-    backward_transfer_ratio,
-    forward_transfer_contrast,
-    forward_transfer_ratio,
-    maintenance_of_evaluation,
-    maintenance_of_training,
-    mean_evaluation_performance,
-    mean_training_performance,
-    performance_recovery,
-    prepare,
-    relative_performance,
-    sample_efficiency,
-)
-from ctgraph_rl.metrics.matrix import (
-    Trained,
-    accuracy_over_time,
-    average_performance,
-    backward_transfer,
-    backward_transfer_over_time,
-    forgetting,
-    forward_transfer,
-    isolated_forgetting,
-    positive_backward_transfer,
-    remembering,
-    zero_shot_performance,
-    zero_shot_transfer,
-)
-from ctgraph_rl.metrics.optimum import (
-    STAGES,
-    frames_to_first_reward,
-    normalised_performance,
-    regret,
-    search_efficiency,
-    stage_reached,
-)
-from ctgraph_rl.metrics.record import MASTERED, Definition, Metric, undefined
+from ctgraph_rl.metrics.curves import Curves
+from ctgraph_rl.metrics.lifetime import Regime, prepare
+from ctgraph_rl.metrics.matrix import Trained, average_performance, backward_transfer, forgetting, forward_transfer
+from ctgraph_rl.metrics.optimum import STAGES
+from ctgraph_rl.metrics.record import MASTERED, METRICS, Definition, Entry, Metric, Undefined, undefined
+from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, trapezoid_area
 
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
 """The metrics that every run shows."""
 
-OF_MATRIX = (
-    *SUMMARY,
-    accuracy_over_time,
-    backward_transfer_over_time,
-    remembering,
-    positive_backward_transfer,
-    zero_shot_performance,
-    isolated_forgetting,
-    zero_shot_transfer,
-)
-"""All metrics of the performance matrix alone."""
+ORDER = ("matrix", "curves", "optimum", "lifetime", "transfer")
+"""Modules in the order in which their metrics are listed; those of others follow."""
 
-OF_CURVES = (
-    continual_world_performance,
-    continual_world_forgetting,
-    instant_cumulative_return,
-    total_performance_over_time,
-    relative_forgetting,
-    tasks_learned,
-)
-"""Metrics of evaluation curves that need no expert."""
+for _found in iter_modules(__path__):
+    import_module(f"{__name__}.{_found.name}")
 
-OF_REGIMES = (
-    mean_training_performance,
-    mean_evaluation_performance,
-    performance_recovery,
-    maintenance_of_evaluation,
-    maintenance_of_training,
-    forward_transfer_ratio,
-    forward_transfer_contrast,
-    backward_transfer_ratio,
-    backward_transfer_contrast,
-)
-"""Lifelong metrics that need no expert."""
 
-AGAINST_EXPERTS = (relative_performance, sample_efficiency)
-"""Lifelong metrics that compare training with experts'."""
+def _place(entry: Entry) -> int:
+    module = entry.metric.__module__.rpartition(".")[2]
+    return ORDER.index(module) if module in ORDER else len(ORDER)
+
+
+_LISTED = {entry.metric.__name__: entry for entry in sorted(METRICS.values(), key=_place)}
+
+
+def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
+    """Compute every metric whose inputs are given, by name.
+
+    Args:
+        given: inputs by the names that `ctgraph_rl.metrics.inputs.INPUTS` has; an `Undefined` in place of one that
+            there is not, with the reason.
+    """
+    return {name: entry.of(given) for name, entry in _LISTED.items() if given.keys() >= {*entry.required}}
 
 
 def summary(performance: Tensor, trained: Trained) -> dict[str, Metric]:
-    """The metrics that every run shows, by name; what a definition does not cover is undefined with the reason.
+    """Compute the metrics that every run shows; what a definition does not cover is undefined with the reason.
 
     Args:
         performance: float64 [blocks + 1, tasks].
         trained: for each block, the tasks that it trained, counted from 0.
 
     Returns:
-        Metrics in the order average performance, forward transfer, backward transfer, forgetting.
+        Metrics by name in the order average performance, forward transfer, backward transfer, forgetting.
     """
     return {metric.__name__: metric(performance, trained) for metric in SUMMARY}
 
 
 def of_matrix(performance: Tensor, trained: Trained) -> dict[str, Metric]:
-    """All metrics of the performance matrix, by name, those of `summary` first; arguments as there."""
-    return {metric.__name__: metric(performance, trained) for metric in OF_MATRIX}
+    """Compute all metrics of the performance matrix alone, those of `summary` first; arguments as there."""
+    return of_inputs({"performance": performance, "trained": trained})
 
 
 def of_curves(curves: Curves) -> dict[str, Metric]:
-    """Metrics of evaluation curves that need no expert, by name."""
-    return {metric.__name__: metric(curves) for metric in OF_CURVES}
+    """Compute all metrics of evaluation curves that need no expert."""
+    return of_inputs({"curves": curves})
 
 
 def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]] | None = None) -> dict[str, Metric]:
-    """Lifelong metrics of regimes, by name; `prepare` them first to get the numbers of l2metrics' defaults.
+    """Compute the lifelong metrics of regimes; `prepare` them first to get the numbers of l2metrics' defaults.
 
     Args:
         regimes: a run.
         experts: for each task, the training curves of its experts.
     """
-    alone = {metric.__name__: metric(regimes) for metric in OF_REGIMES}
-    return alone | {metric.__name__: metric(regimes, experts or {}) for metric in AGAINST_EXPERTS}
+    return of_inputs({"regimes": regimes, "experts": experts or {}})
 
 
 def definitions() -> dict[str, Definition]:
-    """Every definition, by the name of its function, in the order of the ids."""
-    found = {name: globals()[name].definition for name in __all__ if hasattr(globals()[name], "definition")}
+    """Return every definition by the name of its function, in the order of the ids."""
+    found = {name: entry.definition for name, entry in METRICS.items()}
     return dict(sorted(found.items(), key=lambda item: item[1].id))
+
+
+AGAINST_EXPERTS = tuple(entry.metric for entry in _LISTED.values() if "experts" in entry.required)
+"""Lifelong metrics that compare training with experts'."""
+
+
+def __getattr__(name: str) -> Callable[..., Metric]:
+    if name not in METRICS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return METRICS[name].metric
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *METRICS])
 
 
 __all__ = [
     "AGAINST_EXPERTS",
     "MASTERED",
-    "OF_CURVES",
-    "OF_MATRIX",
-    "OF_REGIMES",
+    "METRICS",
     "STAGES",
     "SUMMARY",
     "Curves",
@@ -159,50 +115,17 @@ __all__ = [
     "Metric",
     "Regime",
     "Trained",
-    "accuracy_over_time",
-    "average_performance",
-    "backward_transfer",
-    "backward_transfer_contrast",
-    "backward_transfer_over_time",
-    "backward_transfer_ratio",
+    "Undefined",
     "check_experts",
-    "continual_world_forgetting",
-    "continual_world_forward_transfer",
-    "continual_world_performance",
     "definitions",
-    "forgetting",
-    "forward_transfer",
-    "forward_transfer_contrast",
-    "forward_transfer_from_experts",
-    "forward_transfer_ratio",
-    "frames_to_first_reward",
-    "instant_cumulative_return",
-    "isolated_forgetting",
-    "maintenance_of_evaluation",
-    "maintenance_of_training",
     "mean_area",
-    "mean_evaluation_performance",
-    "mean_training_performance",
-    "normalised_performance",
     "of_curves",
+    "of_inputs",
     "of_matrix",
     "of_regimes",
-    "performance_recovery",
-    "positive_backward_transfer",
     "prepare",
-    "regret",
-    "relative_forgetting",
-    "relative_performance",
-    "remembering",
-    "sample_efficiency",
-    "search_efficiency",
     "stage_areas",
-    "stage_reached",
     "summary",
-    "tasks_learned",
-    "total_performance_over_time",
     "trapezoid_area",
     "undefined",
-    "zero_shot_performance",
-    "zero_shot_transfer",
 ]

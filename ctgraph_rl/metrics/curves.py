@@ -1,13 +1,7 @@
-"""Metrics of evaluation curves: performance on every task, again and again while the curriculum is learned.
-
-Areas under a curve are means of its evaluations or trapezoids, as a definition says; both need evaluations at equal
-distances. An expert is an agent that learned one task alone, with the frames and evaluations that the task has in the
-curriculum; its curve is an argument.
-"""
+"""Metrics of evaluation curves: performance on every task, again and again while the curriculum is learned."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -19,10 +13,6 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, ratio
 CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
 LABS = "Ben-Iwhiwhu et al. 2022, Lifelong RL with modulating masks (arXiv 2212.11110)"
 LABS_CODE = "evaluation code of the CT-graph labs"
-
-NO_HEADROOM = "an evaluation is missing or the expert leaves nothing to gain"
-SMALLEST_HEADROOM = 1e-3
-"""1 - area of an expert below which the labs' code gives no forward transfer."""
 
 
 @dataclass(frozen=True)
@@ -97,41 +87,6 @@ class Curves:
         return self.performance[rows[-last:], task].mean()
 
 
-def mean_area(curve: Tensor) -> Tensor:
-    """Area under a curve over its length, as the plain mean of its evaluations (Continual World's code).
-
-    Args:
-        curve: evaluations along the first dimension, such as of a stage.
-    """
-    return curve.mean(0)
-
-
-def trapezoid_area(curve: Tensor) -> Tensor:
-    """Area under a curve over its length by trapezoids, divided by the number of intervals (the CT-graph labs' code).
-
-    NaN for fewer than two evaluations.
-    """
-    return (curve[1:] + curve[:-1]).mean(0) / 2
-
-
-def stage_areas(curves: Curves, trapezoids: bool = False) -> Tensor:
-    """Each task's area under its curve over its own block, [tasks]; NaN where a definition has none.
-
-    Args:
-        curves: the evaluations of a run.
-        trapezoids: `trapezoid_area` instead of `mean_area`.
-    """
-    area = trapezoid_area if trapezoids else mean_area
-    return torch.stack([_area_or_nan(curves, task, area) for task in range(curves.performance.shape[1])])
-
-
-def _area_or_nan(curves: Curves, task: int, area: Callable[[Tensor], Tensor]) -> Tensor:
-    try:
-        return area(curves.own_stage(task))
-    except Undefined:
-        return curves.performance.new_tensor(torch.nan)
-
-
 @defined("wolczyk2021/performance", "1/T sum_j p_j(end)", CONTINUAL_WORLD)
 def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
     """P: mean performance on all tasks at the end.
@@ -158,38 +113,6 @@ def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
     tasks = range(curves.performance.shape[1])
     own = torch.stack([curves.at_end_of(curves.own_block(task), task, last) for task in tasks])
     return own - torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
-
-
-@defined("wolczyk2021/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)", CONTINUAL_WORLD, missing=NO_HEADROOM)
-def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Tensor:
-    """FT: what a task's own block gains by what came before, as a share of what was left to gain; at most 1.
-
-    AUC of `stage_areas`, for performance whose best is 1, such as success rates. The source first averages areas over
-    seeds: a ratio of means, not a mean of ratios. An expert with an area of 1 makes it undefined; the source's code
-    divides by zero there.
-
-    Args:
-        areas: float64 [tasks], or [seeds, tasks] to be averaged over seeds.
-        expert_areas: the same of the experts, whose seeds may be others.
-    """
-    own, expert = (_over_seeds(each) for each in (areas, expert_areas))
-    return ratio(own - expert, 1 - expert)
-
-
-@defined(
-    "ct-graph-labs/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j), AUC by trapezoids", LABS_CODE, missing=NO_HEADROOM
-)
-def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor:
-    """FT of the labs that made the CT-graph: as Continual World's, with areas by trapezoids and per seed.
-
-    Undefined where 1 - AUCb < 0.001, as there; their 1e-8 in the denominator is left out.
-
-    Args:
-        areas: float64 [tasks] of ``stage_areas(curves, trapezoids=True)``.
-        expert_areas: the same of the experts.
-    """
-    headroom = 1 - expert_areas
-    return ratio(areas - expert_areas, torch.where(headroom < SMALLEST_HEADROOM, 0.0, headroom))
 
 
 @defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1])
@@ -224,7 +147,13 @@ def relative_forgetting(curves: Curves) -> Tensor:
     return ratio(best - curves.performance[-1], best.clamp(min=0))
 
 
-@defined("ctgraph_rl/tasks-learned", "number of j with p_j(end of j's block) >= threshold_j", HERE, aggregate=torch.sum)
+@defined(
+    "ctgraph_rl/tasks-learned",
+    "number of j with p_j(end of j's block) >= threshold_j",
+    HERE,
+    aggregate=torch.sum,
+    inputs={"threshold": "mastered_returns"},
+)
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """How many tasks are mastered right after the last block that trains them, forgotten later or not.
 
@@ -241,19 +170,3 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
     needed = torch.as_tensor(threshold, dtype=ends.dtype).expand(ends.shape[1])[sorted(last)]
     unknown = reached.isnan() | needed.isnan()
     return torch.where(unknown, torch.nan, (reached >= needed).double())
-
-
-def _over_seeds(areas: Tensor) -> Tensor:
-    return areas.mean(0) if areas.ndim == 2 else areas
-
-
-def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:
-    """Refuse expert curves that were not evaluated as often as the tasks in the block that trains them first.
-
-    Raises:
-        ValueError: names the task and both numbers.
-    """
-    for task, expert in enumerate(experts):
-        count = len(curves.of_block(next(i for i, block in enumerate(curves.trained, 1) if task in block)))
-        if len(expert) != count:
-            raise ValueError(f"the expert of task {task + 1} needs {count} evaluations as its block, got {len(expert)}")

@@ -34,18 +34,6 @@ def average_performance(performance: Tensor, trained: Trained | None = None) -> 
     return performance[-1]
 
 
-@defined("lopez-paz2017/bwt", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])", LOPEZ_PAZ)
-def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
-    """BWT = 1/(T-1) sum_{j<T} (R[T, j] - R[j, j]).
-
-    The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
-    Undefined for a single task, and unless each task is trained once, alone, in order.
-    """
-    _several_in_order(performance, trained)
-    own = performance[1:].diagonal()
-    return (performance[-1] - own)[:-1]
-
-
 @defined("lopez-paz2017/fwt", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])", LOPEZ_PAZ)
 def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """FWT = 1/(T-1) sum_{j>1} (R[j-1, j] - R[0, j]).
@@ -57,6 +45,18 @@ def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Ten
     _has_initial_evaluation(performance[:, 1:])
     before_own = performance[:-1].diagonal()
     return (before_own - performance[0])[1:]
+
+
+@defined("lopez-paz2017/bwt", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])", LOPEZ_PAZ)
+def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
+    """BWT = 1/(T-1) sum_{j<T} (R[T, j] - R[j, j]).
+
+    The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
+    Undefined for a single task, and unless each task is trained once, alone, in order.
+    """
+    _several_in_order(performance, trained)
+    own = performance[1:].diagonal()
+    return (performance[-1] - own)[:-1]
 
 
 @defined("chaudhry2018/f", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])", CHAUDHRY)

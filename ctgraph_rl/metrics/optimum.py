@@ -40,8 +40,25 @@ def normalised_performance(performance: Tensor, best: Tensor, zero: Tensor | flo
     return ratio(performance[-1] - zero, best - zero)
 
 
+@defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE)
+def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MASTERED) -> Tensor:
+    """How far the agent got on each task, by `STAGES`; the terms are the tasks' stages.
+
+    Args:
+        end_rates: share of a task's evaluation episodes that got to an end state, the goal's or another, [tasks].
+        success_rates: share that got to the goal.
+        mastered: share that counts as having reached a stage.
+    """
+    stages = (end_rates >= mastered).double() + (success_rates >= mastered).double()
+    return torch.where(end_rates.isnan() | success_rates.isnan(), torch.nan, stages)
+
+
 @defined(
-    "ctgraph_rl/regret", "sum over training intervals k of episodes_k * (best_k - return_k)", HERE, aggregate=torch.sum
+    "ctgraph_rl/regret",
+    "sum over training intervals k of episodes_k * (best_k - return_k)",
+    HERE,
+    aggregate=torch.sum,
+    inputs={"best": "interval_best"},
 )
 def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     """Return that was lost while learning, against the optimal policy in every finished episode.
@@ -61,6 +78,7 @@ def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     "1/T sum_j frames_j to the first reward / (E[frames of a random episode] / P_R)",
     PAPER,
     missing="a goal was never reached",
+    inputs={"frames": "first_frames", "episodes": "first_episodes", "success_rates": "first_success_rates"},
 )
 def frames_to_first_reward(
     frames: Sequence[Tensor],
@@ -86,6 +104,11 @@ def frames_to_first_reward(
     "1/T sum_j E[kappa_j] / episodes_j to the first reward",
     PAPER,
     missing="a goal was never reached",
+    inputs={
+        "episodes": "first_episodes",
+        "success_rates": "first_success_rates",
+        "expected_episodes": "search_episodes",
+    },
 )
 def search_efficiency(
     episodes: Sequence[Tensor], success_rates: Sequence[Tensor], expected_episodes: Sequence[float]
@@ -103,19 +126,6 @@ def search_efficiency(
     played = [each.cumsum(0) for each in episodes]
     first = _at_first_success(played, episodes, success_rates)
     return torch.tensor(expected_episodes, dtype=torch.float64) / first
-
-
-@defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE)
-def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MASTERED) -> Tensor:
-    """How far the agent got on each task, by `STAGES`; the terms are the tasks' stages.
-
-    Args:
-        end_rates: share of a task's evaluation episodes that got to an end state, the goal's or another, [tasks].
-        success_rates: share that got to the goal.
-        mastered: share that counts as having reached a stage.
-    """
-    stages = (end_rates >= mastered).double() + (success_rates >= mastered).double()
-    return torch.where(end_rates.isnan() | success_rates.isnan(), torch.nan, stages)
 
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
-from typing import ParamSpec
+from inspect import Parameter, signature
+from typing import Any, NamedTuple, ParamSpec
 
 import torch
 from torch import Tensor
+
+from ctgraph_rl.metrics.inputs import INPUTS
 
 HERE = "ctgraph_rl"
 """Source of what is defined here."""
@@ -60,6 +63,27 @@ class Metric:
     terms: tuple[float | None, ...] = ()
 
 
+class Entry(NamedTuple):
+    """A metric with what it is computed from."""
+
+    metric: Callable[..., Metric]
+    definition: Definition
+    inputs: dict[str, str]
+    """For each argument that is given an input, the name of that in `INPUTS`."""
+    required: tuple[str, ...]
+    """The inputs without which there is no metric."""
+
+    def of(self, given: Mapping[str, Any]) -> Metric:
+        """Compute the metric of inputs by name; undefined where one of them is `Undefined`, for its reason."""
+        arguments = {argument: given[name] for argument, name in self.inputs.items() if name in given}
+        reasons = [str(value) for value in arguments.values() if isinstance(value, Undefined)]
+        return undefined(self.metric, reasons[0]) if reasons else self.metric(**arguments)
+
+
+METRICS: dict[str, Entry] = {}
+"""Every metric by the name of its function."""
+
+
 class Undefined(Exception):
     """Raised by a function of terms where its definition says nothing; the message is the reason."""
 
@@ -72,8 +96,12 @@ def defined(
     partial: bool = False,
     missing: str = "an evaluation is missing",
     aggregate: Callable[[Tensor], Tensor] = torch.mean,
+    inputs: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
-    """Makes a metric of a function that returns the terms of its formula, NaN for a term without a value.
+    """Make a metric of a function that returns the terms of its formula, NaN for a term without a value.
+
+    The metric is listed in `METRICS` and computed wherever there are its inputs: those of `INPUTS` that its arguments
+    are named after. An argument with a default is left at it where its input is missing, or where it is none.
 
     Args:
         definition: id of the definition.
@@ -82,6 +110,10 @@ def defined(
         partial: see `Definition`.
         missing: why a term may be without a value.
         aggregate: makes the value of the terms; the mean of all but a few.
+        inputs: the inputs of arguments with other names.
+
+    Raises:
+        ValueError: for an argument without default that is no input, and a name or an id that another metric has.
     """
     meaning = Definition(definition, formula, source, partial)
 
@@ -94,13 +126,28 @@ def defined(
                 return undefined(metric, str(reason))
 
         metric.definition = meaning  # type: ignore[attr-defined]
+        _register(metric, meaning, inputs or {})
         return metric
 
     return decorate
 
 
+def _register(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str]) -> None:
+    """List a metric with the inputs of its arguments."""
+    name, arguments = metric.__name__, signature(metric).parameters
+    sources = {argument: renamed.get(argument, argument) for argument in arguments}
+    required = [argument for argument, each in arguments.items() if each.default is Parameter.empty]
+    unknown = [*(renamed.keys() - arguments.keys()), *(each for each in required if sources[each] not in INPUTS)]
+    if unknown:
+        raise ValueError(f"metric {name}: no input for {', '.join(unknown)}. Inputs: {', '.join(INPUTS)}")
+    if name in METRICS or meaning.id in (entry.definition.id for entry in METRICS.values()):
+        raise ValueError(f"metric {name} ({meaning.id}): another metric has its name or its id; choose others")
+    inputs = {argument: source for argument, source in sources.items() if source in INPUTS}
+    METRICS[name] = Entry(metric, meaning, inputs, tuple(sources[argument] for argument in required))
+
+
 def undefined(metric: Callable[..., Metric], reason: str) -> Metric:
-    """A metric without a value, for a reason that its arguments cannot show."""
+    """Return a metric without a value, for a reason that its arguments cannot show."""
     meaning: Definition = metric.definition  # type: ignore[attr-defined]
     return Metric(None, meaning.id, meaning.formula, meaning.source, reason)
 

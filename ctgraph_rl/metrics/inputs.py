@@ -1,0 +1,29 @@
+"""What a run gives to metrics. A metric says by the names of its arguments which of these it takes."""
+
+from __future__ import annotations
+
+INPUTS = {
+    "performance": "the performance matrix, float64 [blocks + 1, tasks]",
+    "trained": "for each block, the tasks that it trained, counted from 0",
+    "curves": "`Curves`, the evaluations in time order",
+    "mastered_returns": "for each task, the mean return from which on it is mastered, float64 [tasks]",
+    "best": "each task's optimal mean return, float64 [tasks]; NaN where it is not known",
+    "zero": "each task's return of a failure, float64 [tasks]",
+    "end_rates": "share of each task's last evaluation episodes that reached an end state, float64 [tasks]",
+    "success_rates": "share of them that reached the goal, float64 [tasks]",
+    "episodes": "finished episodes of each training interval, float64 [intervals]",
+    "returns": "their mean return, float64 [intervals]; NaN without episodes",
+    "interval_best": "optimal mean return of each interval's task, float64 [intervals]; NaN where tasks differ in it",
+    "first_frames": "for each task, frames since the start of its first block at the end of each of its intervals",
+    "first_episodes": "for each task, finished episodes of these intervals",
+    "first_success_rates": "for each task, share of them that reached the goal",
+    "random_frames": "for each task, mean frames of the random policy until it first reaches the goal",
+    "search_episodes": "for each task, E[kappa], the mean episodes of a search without repetition",
+    "regimes": "stays on one task, each a `Regime`, on the scale 1..101",
+    "experts": "for each task, the training curves of its experts, on that scale",
+    "areas": "each task's area under its curve over its own block, float64 [tasks]",
+    "expert_areas": "the same of each task's expert",
+    "trapezoid_areas": "as ``areas``, by trapezoids",
+    "expert_trapezoid_areas": "as ``expert_areas``, by trapezoids",
+}
+"""Every input by its name. `ctgraph_rl.log.scores` gives them, or the reason why a run has none."""
