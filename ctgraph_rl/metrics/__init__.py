@@ -1,10 +1,8 @@
-"""Lifelong-learning metrics: pure functions of the performance matrix, of evaluation curves and of training curves.
+"""Lifelong-learning metrics: pure functions of a run's performance matrix, evaluation curves and training curves.
 
-Every metric gives a `Metric`: its value, definition, formula and source, or the reason why it is undefined. A missing
-evaluation, a division by zero or a curriculum that a definition does not speak of is said and never imputed.
-
-A metric is a function with ``@defined`` in any module of this folder; it is an attribute here and computed wherever
-there are the inputs that its arguments name. Modules import each other alone; logs, recorders and reports use them.
+A metric is a function with ``@defined`` in any module of this folder: it is an attribute here, computed wherever the
+inputs that its arguments name are there, and gives its value with its meaning or the reason why it has none, where
+nothing is imputed. The modules import each other alone; logs, recorders and reports use them.
 """
 
 from __future__ import annotations
@@ -86,7 +84,7 @@ def of_regimes(regimes: Sequence[Regime], experts: Mapping[str, Sequence[Tensor]
 
 def definitions() -> dict[str, Definition]:
     """Return every definition by the name of its function, in the order of the ids."""
-    found = {name: entry.definition for name, entry in METRICS.items()}
+    found = {name: entry.meaning for name, entry in METRICS.items()}
     return dict(sorted(found.items(), key=lambda item: item[1].id))
 
 

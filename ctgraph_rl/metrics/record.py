@@ -67,7 +67,7 @@ class Entry(NamedTuple):
     """A metric with what it is computed from."""
 
     metric: Callable[..., Metric]
-    definition: Definition
+    meaning: Definition
     inputs: dict[str, str]
     """For each argument that is given an input, the name of that in `INPUTS`."""
     required: tuple[str, ...]
@@ -140,7 +140,7 @@ def _register(metric: Callable[..., Metric], meaning: Definition, renamed: Mappi
     unknown = [*(renamed.keys() - arguments.keys()), *(each for each in required if sources[each] not in INPUTS)]
     if unknown:
         raise ValueError(f"metric {name}: no input for {', '.join(unknown)}. Inputs: {', '.join(INPUTS)}")
-    if name in METRICS or meaning.id in (entry.definition.id for entry in METRICS.values()):
+    if name in METRICS or meaning.id in (entry.meaning.id for entry in METRICS.values()):
         raise ValueError(f"metric {name} ({meaning.id}): another metric has its name or its id; choose others")
     inputs = {argument: source for argument, source in sources.items() if source in INPUTS}
     METRICS[name] = Entry(metric, meaning, inputs, tuple(sources[argument] for argument in required))

@@ -1,7 +1,7 @@
-"""O: the images behind the observation ids. One frozen dataclass for each kind of image set.
+"""O, the images behind the observation ids: one frozen dataclass for each kind of image set.
 
-A user's own kind is a frozen dataclass with what `ImageSet` names, and yaml reaches it through ``_target_``. The
-modules here import the core alone; tasks, batches and figures use them.
+A user's own kind has what `ImageSet` names, and yaml reaches it through ``_target_``. The modules import the core;
+tasks, batches and figures use them.
 """
 
 from __future__ import annotations
