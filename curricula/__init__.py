@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _MODULES = ("adaptation", "masks", "nested", "paper", "sharing")
 """Each has a table ``NAMED`` of its curricula by name."""
 
-_HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "axes"}
+_HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "order"}
 
 __all__ = ["MISSING", "from_axes", "from_meta_json", "load", "names", "sequence", "summary"]
 

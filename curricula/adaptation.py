@@ -8,7 +8,8 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import all_goals, cycle, given_goals, random_goals, sequence
+from curricula.axes import all_goals, given_goals, random_goals
+from curricula.order import cycle, sequence
 from curricula.published import environment, full_mdp, goal_of
 
 SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"
@@ -30,7 +31,7 @@ def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
     """
     goals = [goal_of(path) for path in ("11", "10", "01", "00")]
     tasks = given_goals(full_mdp("00", 1, fail_reward=-0.1), goals)
-    return sequence("swoks_2x4", cycle(tasks, 2), num_frames, 1, SWOKS, UNANNOUNCED)
+    return sequence("swoks_2x4", cycle(tasks, 2), num_frames, version=1, source=SWOKS, protocol=UNANNOUNCED)
 
 
 def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 256, seed: int = 0) -> Curriculum:
@@ -51,7 +52,7 @@ def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 2
     config = environment(depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=unique)
     tasks = random_goals(Task.from_json(config, (1,) * depth), 2, seed)
     frames = 50 * _longest_episode(depth) * num_rows if num_frames is None else num_frames
-    return sequence("penn_a_swap", tasks, frames, 1, PENN_A, UNANNOUNCED)
+    return sequence("penn_a_swap", tasks, frames, version=1, source=PENN_A, protocol=UNANNOUNCED)
 
 
 META_BATCHES = {2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}

@@ -1,37 +1,36 @@
-"""The axes along which tasks differ, and ways to put tasks in order.
+"""The axes along which tasks differ; the ways to put tasks in order of `curricula.order` are here, too.
 
 An axis takes a task, or several, and returns the variations of each, those of the first task first. So axes combine by
 applying one to what another returns: ``all_goals(image_seeds(task, (1, 2)))`` is every goal with the images of seed 1,
 then every goal with those of seed 2. `product` writes the same as a list. `sequence` makes a `Curriculum` of tasks.
-
-Whatever is random comes from a seed through ``random.Random(seed).random()``, the one method whose numbers Python
-guarantees not to change between versions; no global generator is read or disturbed.
 """
 
 from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from math import prod
 from typing import Any
 
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.core.graph import CTGraph, StateType
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
 from ctgraph_rl.tasks.observations import Observations
-from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
-from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
-
-Tasks = tuple[Task, ...]
-OneOrMore = Task | Iterable[Task]
-Axis = Callable[[Tasks], Tasks]
-
-MOST_TASKS = 100_000
-"""More tasks than this are refused before they are built."""
+from curricula.draws import below, different, generator
+from curricula.order import MOST_TASKS, OneOrMore, Tasks, each
+from curricula.order import as_tasks as as_tasks
+from curricula.order import concatenate as concatenate
+from curricula.order import cycle as cycle
+from curricula.order import interleave as interleave
+from curricula.order import product as product
+from curricula.order import repeat as repeat
+from curricula.order import reverse as reverse
+from curricula.order import sequence as sequence
+from curricula.order import shuffle as shuffle
+from curricula.order import split as split
 
 OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
 MOVABLE = ("home", "fail", "wait", "decision", "end")
@@ -55,7 +54,7 @@ def given_goals(tasks: OneOrMore, goals: Iterable[Sequence[int]]) -> Tasks:
     listed = as_tuple(goals)
     if not isinstance(listed, tuple) or not listed:
         raise ValueError(f"goals must be a list of goals such as [[1, 2], [2, 1]], got {goals!r}")
-    return _each(tasks, lambda task: [replace(task, goal=goal) for goal in listed])
+    return each(tasks, lambda task: [replace(task, goal=goal) for goal in listed])
 
 
 def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
@@ -73,7 +72,7 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
         ends = itertools.product(range(1, b + 1), repeat=d - num_decisions)
         return (replace(task, goal=task.goal[:num_decisions] + end) for end in ends)
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
@@ -86,11 +85,11 @@ def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
     """
 
     def vary(task: Task) -> list[Task]:
-        graph, generator = task.graph, _generator(seed)
+        graph, source = task.graph, generator(seed)
         _check_draws("num_goals", num_goals, graph.num_end_states)
-        return _different(num_goals, lambda: replace(task, goal=_random_goal(graph, generator)))
+        return different(num_goals, lambda: replace(task, goal=_random_goal(graph, source)))
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 # input distribution
@@ -104,13 +103,13 @@ def image_seeds(tasks: OneOrMore, seeds: Iterable[int]) -> Tasks:
         require((task.image_seed is not None, f"image seeds need generated images, got {task.images!r}"))
         return [replace(task, images=replace(task.images, seed=seed)) for seed in listed]  # type: ignore[type-var]
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
     """Each task with other image sets, such as ``ImageFile.of("digits.npy")``; all of one shape."""
     listed = tuple(sets)
-    return _each(tasks, lambda task: [replace(task, images=images) for images in listed])
+    return each(tasks, lambda task: [replace(task, images=images) for images in listed])
 
 
 def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = ("wait", "decision", "end")) -> Tasks:
@@ -133,7 +132,7 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
         images = _with_room(task.images, max(observations.last_id for observations in shown) + 1)
         return [replace(task, observations=observations, images=images) for observations in shown]
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decision",)) -> Tasks:
@@ -155,7 +154,7 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
         shifts = (0, *(start + i * (last - first + 1) for i in range(num_sets - 1)))
         return shifted_ids(task, shifts, kinds)
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 # shape
@@ -178,7 +177,7 @@ def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) 
         require((not bad, f"depths must be in 1..{deepest}, the depth of the task, got {bad}; give a deeper task"))
         return [_cut(task, depth, nested) for depth in listed]
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
@@ -191,13 +190,13 @@ def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
         require((not bad, f"factors must be in 2..{widest}, the task's own, got {bad}; give a wider task"))
         return [replace(task, graph=replace(task.graph, branching_factor=factor)) for factor in listed]
 
-    return _each(tasks, vary)
+    return each(tasks, vary)
 
 
 def wait_probs(tasks: OneOrMore, probs: Iterable[float]) -> Tasks:
     """Each task with other wait probabilities, in [0, 1)."""
     listed = tuple(probs)
-    return _each(tasks, lambda task: [replace(task, graph=replace(task.graph, wait_prob=p)) for p in listed])
+    return each(tasks, lambda task: [replace(task, graph=replace(task.graph, wait_prob=p)) for p in listed])
 
 
 # observability
@@ -214,7 +213,7 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
         num_wait_images: for ``confounding``.
     """
     listed = require_all(str, "kinds", kinds)
-    return _each(tasks, lambda task: [reshaped(task, task.graph, kind, task.goal, num_wait_images) for kind in listed])
+    return each(tasks, lambda task: [reshaped(task, task.graph, kind, task.goal, num_wait_images) for kind in listed])
 
 
 def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wait_images: int = 100) -> Task:
@@ -258,117 +257,8 @@ def random_tasks(
     )
     goals = sum(CTGraph(b, d).num_end_states for b, d in itertools.product(*choices[:2]))
     _check_draws("num_tasks", num_tasks, goals * prod(map(len, choices[2:])))
-    generator = _generator(seed)
-    return tuple(_different(num_tasks, lambda: _random_task(choices, generator)))
-
-
-def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
-    """Tasks to train and tasks to hold out, drawn without replacement; both keep their order.
-
-    Args:
-        tasks: different tasks.
-        num_held_out: how many to hold out, fewer than there are.
-        seed: an integer >= 0.
-    """
-    everything = as_tasks(tasks)
-    count = len(everything)
-    require(
-        (is_int(num_held_out, 1, count - 1), f"num_held_out must be in 1..{count - 1}, got {num_held_out!r}"),
-        (len(set(everything)) == count, "tasks to split must differ, else a task is both trained and held out"),
-    )
-    held_out = set(_shuffled(range(count), seed)[:num_held_out])
-    rest = tuple(task for i, task in enumerate(everything) if i not in held_out)
-    return rest, tuple(everything[i] for i in sorted(held_out))
-
-
-# order
-
-
-def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
-    """Axes applied one after the other: the last one varies fastest."""
-    varied = as_tasks(tasks)
-    for axis in axes:
-        varied = axis(varied)
-    return varied
-
-
-def concatenate(*sequences: OneOrMore) -> Tasks:
-    """One sequence after the other."""
-    return tuple(task for tasks in sequences for task in as_tasks(tasks))
-
-
-def interleave(*sequences: OneOrMore) -> Tasks:
-    """The first task of each sequence, then the second of each; a sequence that has ended is left out."""
-    rounds = itertools.zip_longest(*map(as_tasks, sequences))
-    return tuple(task for turn in rounds for task in turn if task is not None)
-
-
-def repeat(tasks: OneOrMore, times: int) -> Tasks:
-    """Each task several times in a row: A A B B."""
-    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
-    return _each(tasks, lambda task: [task] * times)
-
-
-def cycle(tasks: OneOrMore, times: int) -> Tasks:
-    """The whole sequence several times: A B A B."""
-    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
-    return as_tasks(tasks) * times
-
-
-def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
-    """The tasks in an order drawn uniformly from a seed, an integer >= 0."""
-    return tuple(_shuffled(as_tasks(tasks), seed))
-
-
-def reverse(tasks: OneOrMore) -> Tasks:
-    """The last task first."""
-    return as_tasks(tasks)[::-1]
-
-
-# curriculum
-
-
-def sequence(
-    name: str,
-    tasks: Iterable[OneOrMore],
-    num_frames: int | Sequence[int],
-    version: int = 1,
-    source: str = "",
-    protocol: Protocol | None = None,
-    evaluation: Evaluation | None = None,
-    switch: Switch | None = None,
-) -> Curriculum:
-    """A curriculum with a block for each item.
-
-    Args:
-        name: name that a paper cites.
-        tasks: a task, or several that share a block, for each block.
-        num_frames: frames of every block, or a list with those of each.
-        version: raised when the content changes.
-        source: where the sequence comes from.
-        protocol: what the learner is told; None: no task ids, announced boundaries.
-        evaluation: how performance is measured; None: the defaults of `Evaluation`.
-        switch: how rows change between the tasks of a block.
-    """
-    items = [tasks] if isinstance(tasks, Task) else list(tasks)
-    frames = as_tuple(num_frames)
-    budgets = frames if isinstance(frames, tuple) else (num_frames,) * len(items)
-    require((len(budgets) == len(items), f"num_frames must be one for each of {len(items)} blocks, got {len(budgets)}"))
-    blocks = tuple(Block(as_tasks(item), n, switch) for item, n in zip(items, budgets, strict=True))
-    return Curriculum(name, version, source, blocks, evaluation or Evaluation(), protocol or Protocol())
-
-
-def as_tasks(tasks: OneOrMore) -> Tasks:
-    """A task or several as a tuple.
-
-    Raises:
-        ValueError: for anything else, and for no task.
-    """
-    return (tasks,) if isinstance(tasks, Task) else require_all(Task, "tasks", tasks)
-
-
-def _each(tasks: OneOrMore, vary: Callable[[Task], Iterable[Task]]) -> Tasks:
-    return tuple(varied for task in as_tasks(tasks) for varied in vary(task))
+    source = generator(seed)
+    return tuple(different(num_tasks, lambda: _random_task(choices, source)))
 
 
 def _check_number(count: int) -> None:
@@ -380,41 +270,15 @@ def _check_draws(name: str, wanted: object, available: int) -> None:
     require((is_int(wanted, 1, most), f"{name} must be in 1..{most}, as many as differ, got {wanted!r}"))
 
 
-def _generator(seed: int) -> random.Random:
-    require((is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"))
-    return random.Random(seed)
+def _random_goal(graph: CTGraph, source: random.Random) -> tuple[int, ...]:
+    return tuple(1 + below(source, graph.branching_factor) for _ in range(graph.depth))
 
 
-def _below(generator: random.Random, count: int) -> int:
-    """An integer in [0, count); for the small counts here, uniform to within 2**-36."""
-    return int(generator.random() * count)
-
-
-def _shuffled(items: Iterable[Any], seed: int) -> list[Any]:
-    shuffled, generator = list(items), _generator(seed)
-    for i in range(len(shuffled) - 1, 0, -1):
-        j = _below(generator, i + 1)
-        shuffled[i], shuffled[j] = shuffled[j], shuffled[i]
-    return shuffled
-
-
-def _different(count: int, draw: Callable[[], Task]) -> list[Task]:
-    """Draws until enough are different."""
-    found: dict[Task, None] = {}
-    while len(found) < count:
-        found[draw()] = None
-    return list(found)
-
-
-def _random_goal(graph: CTGraph, generator: random.Random) -> tuple[int, ...]:
-    return tuple(1 + _below(generator, graph.branching_factor) for _ in range(graph.depth))
-
-
-def _random_task(choices: Sequence[Sequence[Any]], generator: random.Random) -> Task:
-    b, d, p, kind, seed = (choice[_below(generator, len(choice))] for choice in choices)
+def _random_task(choices: Sequence[Sequence[Any]], source: random.Random) -> Task:
+    b, d, p, kind, seed = (choice[below(source, len(choice))] for choice in choices)
     graph = CTGraph(b, d, p)
     observations = _observations(graph, kind)
-    goal = _random_goal(graph, generator)
+    goal = _random_goal(graph, source)
     return Task(graph, goal, observations, PaperImages(observations.last_id + 1, seed))
 
 

@@ -11,7 +11,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
-from curricula.axes import Tasks
+from curricula.order import Tasks
 from curricula.paper import KINDS, configured
 
 GOALS = ("all", "random", "nested")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
-from curricula.axes import sequence
+from curricula.order import sequence
 from curricula.published import labelled, one_wait_image, pool_ids, words
 
 MASKS = "Ben-Iwhiwhu et al. 2023, arXiv 2212.11110; github.com/dlpbc/mask-lrl"
@@ -25,7 +25,7 @@ def ct8(num_frames: int = 102_400) -> Curriculum:
         num_frames: frames per task.
     """
     listing = "1:000 1:001 1:010 1:011 1:100 1:101 1:110 1:111"
-    return _curriculum("ct8", MASKS, listing, range(8), 8, num_frames)
+    return _curriculum("ct8", MASKS, listing, ids=range(8), num_ids=8, num_frames=num_frames)
 
 
 def ct12(num_frames: int = 102_400) -> Curriculum:
@@ -35,7 +35,7 @@ def ct12(num_frames: int = 102_400) -> Curriculum:
         num_frames: frames per task.
     """
     listing = "1:00 1:000 1:01 1:001 1:10 1:010 1:11 1:011 1:100 1:101 1:110 1:111"
-    return _curriculum("ct12", MASKS, listing, range(12), 12, num_frames)
+    return _curriculum("ct12", MASKS, listing, ids=range(12), num_ids=12, num_frames=num_frames)
 
 
 def ct8_md(num_frames: int = 102_400) -> Curriculum:
@@ -46,7 +46,7 @@ def ct8_md(num_frames: int = 102_400) -> Curriculum:
     """
     listing = "1:00 1:01 1:000 1:001 1:0000 1:0001 1:00000 1:00001"
     ids = pool_ids(words(listing), [(1, depth) for depth in range(2, 6)])
-    return _curriculum("ct8_md", MASKS, listing, ids, 60, num_frames)
+    return _curriculum("ct8_md", MASKS, listing, ids=ids, num_ids=60, num_frames=num_frames)
 
 
 def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
@@ -69,14 +69,14 @@ def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
     Args:
         num_frames: frames per task.
     """
-    return _curriculum("ct2_interfering", BASELINES, "1:000 1:111", (0, 7), 8, num_frames)
+    return _curriculum("ct2_interfering", BASELINES, "1:000 1:111", ids=(0, 7), num_ids=8, num_frames=num_frames)
 
 
 def _curriculum(
     name: str, source: str, listing: str, ids: range | list[int] | tuple[int, ...], num_ids: int, num_frames: int
 ) -> Curriculum:
     tasks = tuple(one_wait_image(path, seed) for seed, path in words(listing))
-    return labelled(name, source, tasks, ids, num_ids, num_frames)
+    return labelled(name, source, tasks, ids=ids, num_task_ids=num_ids, num_frames=num_frames)
 
 
 NAMED = {f.__name__: f for f in (ct2_interfering, ct8, ct8_md, ct12, single_task)}

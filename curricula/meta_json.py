@@ -25,7 +25,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import MOST_TASKS, Tasks, sequence
+from curricula.order import MOST_TASKS, Tasks, sequence
 from curricula.published import one_id_each
 
 MOST_BYTES = 4 * 2**20
@@ -69,7 +69,9 @@ def from_meta_json(
         numbers = _chosen(meta, pool.size)
         tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
         source = f"meta-JSON file {file.name}"
-        return sequence(name or file.stem, tasks, num_frames, 1, source, _labels(meta, tasks, numbers))
+        return sequence(
+            name or file.stem, tasks, num_frames, version=1, source=source, protocol=_labels(meta, tasks, numbers)
+        )
 
 
 class Pool:

@@ -92,7 +92,14 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
         agent: the task of one agent alone, 0..27; None: all tasks one after the other, which is ours.
     """
     tasks = _of_agent([*chain(*_inconsistent())], agent)
-    return _curriculum("ct28_mosaic_skips_d5", MOSAIC, tasks, num_frames, seed_set, Evaluation(num_episodes=50))
+    return _curriculum(
+        "ct28_mosaic_skips_d5",
+        MOSAIC,
+        tasks,
+        num_frames=num_frames,
+        seed_set=seed_set,
+        evaluation=Evaluation(num_episodes=50),
+    )
 
 
 def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
@@ -174,7 +181,15 @@ def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
     tasks = _of_agent(everything, agent)
     pool = [(family, depth) for family in (1, 2) for depth in range(2, 12)]
     made = tuple(one_wait_image(path, family) for family, path in tasks)
-    return labelled("ct20", L2D2C, made, pool_ids(tasks, pool), 8184, num_frames, Evaluation())
+    return labelled(
+        "ct20",
+        L2D2C,
+        made,
+        ids=pool_ids(tasks, pool),
+        num_task_ids=8184,
+        num_frames=num_frames,
+        evaluation=Evaluation(),
+    )
 
 
 def _family(number: int, deepest: int = 8) -> list[Named]:
@@ -194,7 +209,7 @@ def _of_agent(tasks: list[Named], agent: int | None) -> list[Named]:
 
 
 def _single(name: str, source: str, tasks: Sequence[Named], num_frames: int, seed_set: int = 1) -> Curriculum:
-    return _curriculum(name, source, tasks, num_frames, seed_set, MASK_EVALUATION)
+    return _curriculum(name, source, tasks, num_frames=num_frames, seed_set=seed_set, evaluation=MASK_EVALUATION)
 
 
 def _curriculum(
@@ -204,7 +219,15 @@ def _curriculum(
     require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
     ids = pool_ids(tasks, [(family, depth) for family in PATHS for depth in range(2, 12)])
     made = tuple(one_wait_image(path, SEED_SETS[seed_set][family - 1]) for family, path in tasks)
-    return labelled(name, source, made, ids, 16_368 if seed_set == 1 else 16_370, num_frames, evaluation)
+    return labelled(
+        name,
+        source,
+        made,
+        ids=ids,
+        num_task_ids=16_368 if seed_set == 1 else 16_370,
+        num_frames=num_frames,
+        evaluation=evaluation,
+    )
 
 
 NAMED = {

@@ -14,7 +14,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import Tasks, sequence
+from curricula.order import Tasks, sequence
 
 Pool = Sequence[tuple[int, int]]
 """(image seed, depth) of each environment whose goals the labs number one after the other."""
@@ -135,7 +135,7 @@ def labelled(
     """
     by_task = one_id_each(tasks, ids)
     protocol = Protocol("one_hot", num_task_ids=num_task_ids, task_ids=tuple(by_task.values()))
-    return sequence(name, tasks, num_frames, version, source, protocol, evaluation)
+    return sequence(name, tasks, num_frames, version=version, source=source, protocol=protocol, evaluation=evaluation)
 
 
 def one_id_each(tasks: Tasks, ids: Sequence[int]) -> Mapping[Task, int]:

@@ -146,14 +146,14 @@ def _part(section: Section, gallery: Gallery) -> Part:
     everything = next(pages(section.rows)) if len(section.rows) <= MOST_ROWS else None
     return Part(
         section,
-        list(_facts(section)),
-        gallery.write(names, pictures.of_section(section)),
-        next(pages(shown)),
-        everything,
-        [_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
-        max(0, len(section.results) - MOST_AGENTS),
-        [row for result in section.results for row in _runs(result)],
-        Counter(_system(run) for run in section.runs).most_common(),
+        facts=list(_facts(section)),
+        figures=gallery.write(names, pictures.of_section(section)),
+        table=next(pages(shown)),
+        everything=everything,
+        agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
+        unshown=max(0, len(section.results) - MOST_AGENTS),
+        runs=[row for result in section.results for row in _runs(result)],
+        systems=Counter(_system(run) for run in section.runs).most_common(),
     )
 
 

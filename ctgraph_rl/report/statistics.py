@@ -99,13 +99,17 @@ def mean(values: Values, level: float = LEVEL) -> Estimate:
     known, missing = _known(values)
     method = f"mean, Student t {level:.0%}"
     if len(known) == 0:
-        return Estimate(None, None, None, 0, missing, method, "no seed has a value")
+        return Estimate(
+            None, low=None, high=None, n=0, n_undefined=missing, method=method, reason="no seed has a value"
+        )
     centre = math.fsum(known) / len(known)
     if len(known) == 1 or min(known) == max(known):
         reason = "one seed has no interval" if len(known) == 1 else "all seeds are equal: no spread to estimate"
-        return Estimate(centre, None, None, len(known), missing, method, reason)
+        return Estimate(centre, low=None, high=None, n=len(known), n_undefined=missing, method=method, reason=reason)
     half = _student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known))
-    return Estimate(centre, float(centre - half), float(centre + half), len(known), missing, method)
+    return Estimate(
+        centre, low=float(centre - half), high=float(centre + half), n=len(known), n_undefined=missing, method=method
+    )
 
 
 def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate:
@@ -121,9 +125,11 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     n, k, missing = len(known), sum(known), len(solved) - len(known)
     method = f"share, Clopper-Pearson {level:.0%}"
     if n == 0:
-        return Estimate(None, None, None, 0, missing, method, "no seed has a result")
+        return Estimate(
+            None, low=None, high=None, n=0, n_undefined=missing, method=method, reason="no seed has a result"
+        )
     interval = stats.binomtest(k, n).proportion_ci(level, method="exact")
-    return Estimate(k / n, float(interval.low), float(interval.high), n, missing, method)
+    return Estimate(k / n, low=float(interval.low), high=float(interval.high), n=n, n_undefined=missing, method=method)
 
 
 def interquartile_mean(
@@ -146,12 +152,12 @@ def interquartile_mean(
     method = f"IQM, stratified percentile bootstrap {level:.0%}"
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
-        return Estimate(None, None, None, n, undefined, method, reason)
+        return Estimate(None, low=None, high=None, n=n, n_undefined=undefined, method=method, reason=reason)
     rng = np.random.default_rng(seed)
     samples = [rng.choice(task, (resamples, len(task))) for task in known]
     low, high = np.quantile(_middle_mean(np.concatenate(samples, axis=1)), [(1 - level) / 2, (1 + level) / 2])
     value = _middle_mean(np.concatenate(known)[None])[0]
-    return Estimate(float(value), float(low), float(high), n, undefined, method)
+    return Estimate(float(value), low=float(low), high=float(high), n=n, n_undefined=undefined, method=method)
 
 
 def compare(first: Values, second: Values, level: float = LEVEL) -> Comparison:
@@ -171,7 +177,14 @@ def compare(first: Values, second: Values, level: float = LEVEL) -> Comparison:
     known, _ = _known(differences)
     signs = [(each > 0) - (each < 0) for each in known]
     std, p_value = (float(np.std(known, ddof=1)), _sign_flip(known)) if len(known) > 1 else (None, None)
-    return Comparison(mean(differences, level), std, p_value, signs.count(1), signs.count(0), signs.count(-1))
+    return Comparison(
+        mean(differences, level),
+        std=std,
+        p_value=p_value,
+        wins=signs.count(1),
+        ties=signs.count(0),
+        losses=signs.count(-1),
+    )
 
 
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:

@@ -79,7 +79,7 @@ def draw_task(
         ids: observation ids in the nodes; False: the initials of the kinds.
         legend: name shapes and colours below the tree.
     """
-    _TaskPicture(axes, task, visits or {}, policy or {}, values or {}, ids).draw(legend)
+    _TaskPicture(axes, task, visits or {}, policy=policy or {}, values=values or {}, ids=ids).draw(legend)
 
 
 class _TaskPicture:
