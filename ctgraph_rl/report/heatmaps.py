@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.sections import Matrix, Result, Section
 from ctgraph_rl.report.style import WIDTH, short
+from ctgraph_rl.report.trees import Trees
 
 MOST_NUMBERS = 10
 """Tasks up to which cells have numbers."""
@@ -22,6 +24,24 @@ NEGATIVE = -0.05
 """Share of the scale from which on a cell without number is marked as negative."""
 
 Values = list[list[float]]
+
+
+def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure:
+    """Return an agent's performance matrix and what each block changed."""
+    count = len(section.labels)
+    marks = "" if count <= MOST_NUMBERS else " A dash marks losses."
+    intervals = f" In brackets: {INTERVAL}." if count <= MOST_INTERVALS else ""
+    if count <= MOST_NAMES:
+        intervals += " The tables below have all intervals, and n where a cell has fewer seeds."
+    caption = (
+        f"{result.agent}, means over n = {result.n} seeds. One map: mean return on each task after each block, block 0 "
+        "before any training. The other: what each block's training did to each task, the difference of two successive "
+        f"rows; purple is gain, orange is loss.{marks}{intervals} Framed: the tasks "
+        "that the block trains. Grey: not evaluated."
+    )
+    return CaptionedFigure(
+        "transfer", f"{result.agent}: performance and transfer", caption, draw_matrices(section, result)
+    )
 
 
 def draw_matrices(section: Section, result: Result) -> Any:

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
-from ctgraph_rl.report import pictures
+from ctgraph_rl.report.figures import of_agent, of_section
+from ctgraph_rl.report.gallery import Gallery, Written
 from ctgraph_rl.report.heatmaps import MOST_NAMES
-from ctgraph_rl.report.pictures import Gallery, Written
 from ctgraph_rl.report.results import (
     LEGEND,
     MEANS,
@@ -147,7 +147,7 @@ def _part(section: Section, gallery: Gallery) -> Part:
     return Part(
         section,
         facts=list(_facts(section)),
-        figures=gallery.write(names, pictures.of_section(section)),
+        figures=gallery.write(names, of_section(section)),
         table=next(pages(shown)),
         everything=everything,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
@@ -175,7 +175,8 @@ def _facts(section: Section) -> Iterator[tuple[str, Any]]:
 
 def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
     trees = find_trees(result.finished[0]) if result.finished else None
-    figures = gallery.write((section.name, result.agent), pictures.of_result(section, result, trees))
+    drawn = iter(()) if trees is None else of_agent(section, result, trees)
+    figures = gallery.write((section.name, result.agent), drawn)
     settings = list(result.runs[0].settings.items())
     return AgentPart(result, figures, list(_numbers(section, result)), settings, list(_sentences(result, trees)))
 

@@ -140,14 +140,14 @@ def evaluation_curve(runs: Iterable[Run], label: str) -> list[Point]:
 
 
 def training_curve(runs: Iterable[Run], block: int, start: int, end: int, places: int) -> list[Point]:
-    """Return while training in a block, as means over equal stretches of frames in which every run has a value.
+    """Return while training in a block, as means over equal spans of frames in which every run has a value.
 
     Args:
         runs: of one agent.
         block: the block, from 1.
         start: frames before it.
         end: frames at its end.
-        places: number of stretches.
+        places: number of spans.
     """
     curves = [_in_places(history.training.get(block, []), start, end, places) for history in _histories(runs)]
     return over_seeds(curves)
@@ -164,7 +164,7 @@ def over_seeds(curves: Sequence[Curve]) -> list[Point]:
 
 
 def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
-    """Means of a curve over equal stretches, each at its last frame."""
+    """Return means of a curve over equal spans of frames, each at its last frame."""
     width = max((end - start) / places, 1)
     values: dict[int, list[float]] = {}
     for frames, value in curve:

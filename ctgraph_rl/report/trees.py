@@ -6,6 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 from ctgraph_rl.log.files import AGENT, CURRICULUM
+from ctgraph_rl.report.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import WIDTH, short
 from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
@@ -19,15 +21,32 @@ EPISODES = 100
 
 
 class Trees(NamedTuple):
-    """What can be drawn of a run."""
+    """The curriculum and the trained agent of a run, as far as they can be read."""
 
     curriculum: Curriculum | None
     trained: Trained | None
     reason: str  # why the curriculum or the agent is missing; empty if it is not
 
 
+def task_trees(section: Section, result: Result, found: Trees) -> CaptionedFigure | None:
+    """Return the tasks' trees; None where the run has no curriculum that can be read."""
+    if found.curriculum is None:
+        return None
+    one = result.finished[0]
+    what = "Stars are goals."
+    if found.trained is not None:
+        what = (
+            f"What the trained agent of seed {one.seed}, the first of n = {result.n}, does in {EPISODES} greedy "
+            "episodes of each task; one seed has no interval. Numbers and lines are as the legend says, where there is "
+            "room for them. Stars are goals."
+        )
+    title = f"{result.agent}: the tasks' trees"
+    tasks = left_out(len(found.curriculum.tasks), MOST_TREES, "tasks")
+    return CaptionedFigure("trees", title, f"{title}. {what}{tasks}", draw_trees(found, one.seed))
+
+
 def draw_trees(trees: Trees, seed: int) -> Any:
-    """A panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
+    """Draw a panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     from matplotlib.figure import Figure
 
     assert trees.curriculum is not None
@@ -51,7 +70,7 @@ def _height(depth: int) -> float:
 
 
 def find_trees(run: Run) -> Trees:
-    """The agent and the curriculum of a run as far as its directory has them."""
+    """Return the agent and the curriculum of a run as far as its directory has them."""
     reason = f"{run.path} has no {AGENT}, the weights of its agent"
     try:
         if (run.path / AGENT).exists():

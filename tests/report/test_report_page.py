@@ -13,8 +13,8 @@ from helpers.made_runs import write_run
 import curricula
 from ctgraph_rl import RunLog
 from ctgraph_rl.report import __main__ as command
+from ctgraph_rl.report.gallery import Gallery
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.report.pictures import Gallery
 from ctgraph_rl.report.sections import evaluation_curve, sections, training_curve
 from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
@@ -31,7 +31,7 @@ HTML = "<img src=x onerror=alert(1)>"
 @pytest.fixture
 def no_figures(monkeypatch):
     """Figures cost most of the time, and say nothing in a test of words."""
-    monkeypatch.setattr(Gallery, "write", lambda self, names, pictures: [])
+    monkeypatch.setattr(Gallery, "write", lambda self, names, figures: [])
 
 
 def written(folder, *paths):

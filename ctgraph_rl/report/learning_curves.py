@@ -1,4 +1,4 @@
-"""Learning curves: what each task was worth over the run, and the return while training, as means over seeds."""
+"""Learning curves: mean return on each task over the run, and return while training, as means over seeds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, short
 from ctgraph_rl.runs.read import Curve
@@ -21,11 +22,40 @@ MOST_SEEDS = 20
 
 COLUMNS = 4
 PLACES = 160
-"""Means over stretches of frames that the return while training is shown as, in all blocks together."""
+"""Means over equal numbers of frames that the return while training is shown as, in all blocks together."""
+
+
+def learning_curves(section: Section) -> CaptionedFigure | None:
+    """Return the curves of all agents at evaluations; None without a finished run."""
+    if not any(result.finished for result in section.results):
+        return None
+    tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
+    caption = (
+        f"Mean return on each task at every evaluation, over the frames learned from.{tasks} {_agents(section)} Lines: "
+        f"means over seeds, where each has a value; bands: {INTERVAL}; thin lines: single seeds, up to {MOST_SEEDS}. "
+        "Grey: blocks that train the task; dashed: ends of blocks."
+    )
+    return CaptionedFigure("curves", "Learning curves", caption, draw_tasks(section))
+
+
+def training_curves(section: Section) -> CaptionedFigure | None:
+    """Return the return while training of all agents; None where no run measured it."""
+    if not has_training(section):
+        return None
+    caption = (
+        f"Return of the episodes that were finished while training, means over equal numbers of frames. "
+        f"{_agents(section)} Lines: means over seeds; bands: {INTERVAL}. Dashed: ends of blocks."
+    )
+    return CaptionedFigure("training", "Return while training", caption, draw_training(section))
+
+
+def _agents(section: Section) -> str:
+    shown = ", ".join(f"{result.agent} (n = {result.n})" for result in section.results[:MOST_AGENTS])
+    return f"Agents: {shown}.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
 
 
 def draw_tasks(section: Section) -> Any:
-    """A panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
+    """Draw a panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
     labels = section.labels[:MOST_TASKS]
     rows = math.ceil(len(labels) / COLUMNS)
     columns = min(COLUMNS, len(labels))
@@ -44,21 +74,21 @@ def draw_tasks(section: Section) -> Any:
 
 
 def draw_training(section: Section) -> Any:
-    """Return while training over all blocks, a curve for each agent."""
+    """Draw the return while training over all blocks, a curve for each agent."""
     figure = _figure(WIDTH, 2.3)
     axes = figure.subplots()
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
     for position, result in enumerate(section.results[:MOST_AGENTS]):
-        stretches = [training_curve(result.finished, block, *ends, places) for block, ends in blocks]
-        _draw(axes, position, stretches, ())
+        pieces = [training_curve(result.finished, block, *ends, places) for block, ends in blocks]
+        _draw(axes, position, pieces, ())
     _finish(figure, [[axes]], section, "return while training")
     return figure
 
 
 def has_training(section: Section) -> bool:
-    """Whether any run says what it was worth while training."""
+    """Return whether any run measured its return while training."""
     finished = [run for result in section.results for run in result.finished]
     return any(run.history is not None and run.history.training for run in finished)
 
@@ -79,13 +109,13 @@ def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
             axes.axvspan(start, end, color="0.9", zorder=-1, linewidth=0)
 
 
-def _draw(axes: Any, position: int, stretches: Sequence[list[Point]], seeds: Sequence[Curve]) -> None:
-    """A mean with its band, piece by piece, and thin lines for seeds."""
+def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[Curve]) -> None:
+    """Draw a mean with its band, piece by piece, and thin lines for seeds."""
     look = agent_style(position)
     if 1 < len(seeds) <= MOST_SEEDS:
         for curve in seeds:
             axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
-    for points in stretches:
+    for points in pieces:
         if points:
             frames = [point.frames for point in points]
             axes.plot(frames, [point.estimate.value for point in points], markevery=_every(points), zorder=3, **look)

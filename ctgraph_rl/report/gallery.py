@@ -1,0 +1,73 @@
+"""Figures of the report with their captions, written as PNG and PDF."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.report.style import style
+
+FOLDER = "figures"
+INTERVAL = "Student's 95 % interval of the mean over seeds, which one seed or seeds that are all equal do not have"
+LONGEST_STEM = 60
+
+
+class CaptionedFigure(NamedTuple):
+    """A figure with its title and caption."""
+
+    kind: str  # end of its file's name
+    title: str
+    caption: str  # what it shows, n, and what the interval is
+    figure: Any
+
+
+class Written(NamedTuple):
+    """A figure in its files."""
+
+    path: str  # of the PNG, seen from the report
+    alt: str
+    caption: str
+    png: str  # base64
+
+
+def left_out(count: int, most: int, what: str) -> str:
+    """Return a sentence that says so where not all are shown; empty where all are."""
+    return f" The first {most} of {count} {what} are shown." if count > most else ""
+
+
+class Gallery:
+    """Writes figures into the folder of a report, each under a name of its own.
+
+    Args:
+        folder: of the report.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._taken: set[str] = set()
+        (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+
+    def write(self, names: tuple[str, ...], figures: Iterator[CaptionedFigure]) -> list[Written]:
+        """Draw and write figures; ``names`` begin those of their files."""
+        written = []
+        with style():
+            for one in figures:
+                path = f"{FOLDER}/{self._stem(*names, one.kind)}"
+                one.figure.savefig(self.folder / f"{path}.png")
+                one.figure.set_layout_engine("none")  # its work is done, and is most of the time of a figure
+                one.figure.savefig(self.folder / f"{path}.pdf")
+                png = base64.b64encode((self.folder / f"{path}.png").read_bytes()).decode()
+                written.append(Written(f"{path}.png", one.title, one.caption, png))
+        return written
+
+    def _stem(self, *names: str) -> str:
+        """A new name for a file, of letters that every system takes."""
+        parts = [re.sub(r"[^A-Za-z0-9_.=]+", "-", name).strip("-.")[:LONGEST_STEM] for name in names]
+        stem = "-".join(part for part in parts if part)
+        same = sum(1 for taken in self._taken if taken == stem or re.fullmatch(rf"{re.escape(stem)}-\d+", taken))
+        stem = f"{stem}-{same + 1}" if same else stem
+        self._taken.add(stem)
+        return stem
