@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from baselines.networks import Data
-from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss, loss_weight
-from ctgraph_rl.checks import require
+from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss
+from ctgraph_rl.checks import not_negative, require
 
 
 class A2C(PolicyGradient):
@@ -37,13 +37,13 @@ class A2C(PolicyGradient):
         critic_coeff: float,
         **settings: Any,
     ) -> None:
-        require(*loss_weight(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
+        require(*not_negative(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
         super().__init__(observation_spec, action_spec, **settings)
         self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """Policy gradient, critic's error and entropy, as TorchRL's `A2CLoss` has them."""
-        log_probs, taken, values = self.judged(batch)
+        """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""
+        log_probs, taken, values = self.evaluate_actions(batch)
         return {
             "loss_objective": -(taken * batch["advantage"]).mean(),
             "loss_critic": critic_loss(values, batch, self.critic_coeff),

@@ -17,10 +17,9 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import MLP, QValueActor
 from torchrl.objectives import DQNLoss
 
-from baselines.learner import true_or_false
 from baselines.networks import Data, encoder
 from baselines.q_learning import QLearner
-from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, true_or_false
 
 
 class DQN(QLearner):
@@ -32,8 +31,8 @@ class DQN(QLearner):
         hidden_size: width of the two hidden layers.
         learning_rate: of Adam.
         gamma: discount factor.
-        double: let the online network choose the action whose target value counts.
-        priority_alpha: how much more often surprising transitions are replayed; 0 is uniform (Schaul et al. 2016, arXiv
+        double: let the online network choose the action of the target (double Q-learning).
+        priority_alpha: how strongly the TD error decides what is replayed; 0 is uniform (Schaul et al. 2016, arXiv
             1511.05952).
         priority_beta: how much of that the loss corrects, in [0, 1].
         settings: the arguments of `QLearner`. Where different states show the same image, a one-step target is the
@@ -59,7 +58,7 @@ class DQN(QLearner):
             *positive(learning_rate=learning_rate),
             *true_or_false(double=double),
             *fraction(priority_beta=priority_beta),
-            (is_real(priority_alpha, 0), f"priority_alpha must be a number >= 0, got {priority_alpha!r}"),
+            *not_negative(priority_alpha=priority_alpha),
         )
         self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
         super().__init__(gamma=gamma, **settings)
@@ -68,19 +67,19 @@ class DQN(QLearner):
         features = encoder(observation_spec, hidden_size)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
         self.dqn = DQNLoss(self.greedy, delay_value=True, double_dqn=double, action_space=action_spec)
-        self.act_with(self.greedy, self.dqn, action_spec, learning_rate)
+        self.set_networks(self.greedy, self.dqn, action_spec, learning_rate)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """Every step as a transition of up to ``n_steps`` steps."""
+        """Return every step as a transition of up to ``n_steps`` steps."""
         seen = self.policy.in_keys
         after = [("next", key) for key in (*seen, "reward", "done", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """The loss of transitions, with the target network's values, as TorchRL's `DQNLoss` has it; ``td_error``, too.
+        """Compute the loss of transitions, as TorchRL's `DQNLoss` does, and their squared errors, ``td_error``.
 
-        What is predicted is the value of the action taken; the target is the multi-step reward plus the discounted
-        value of the best action where it ends.
+        The prediction is the value of the action taken; the target is the multi-step reward plus the discounted value
+        of the best action after it, by the target network.
         """
         after = {key: batch["next", key] for key in self.greedy.in_keys}
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
@@ -88,20 +87,20 @@ class DQN(QLearner):
             later = self._target_values(after)
             best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
-            goes_on = (~batch["next", "terminated"]).int()
-            target = (batch["next", "reward"] + gamma * goes_on * later.gather(-1, best)).squeeze(-1)
+            running = (~batch["next", "terminated"]).int()
+            target = (batch["next", "reward"] + gamma * running * later.gather(-1, best)).squeeze(-1)
             squared = (predicted - target).square()
         loss, weight = (predicted - target).square(), batch.get("priority_weight")
         mean = loss.mean() if weight is None else (loss * weight).sum() / weight.sum()
         return {"loss_value": mean, "td_error": squared}
 
     def values(self, data: Data) -> Tensor:
-        """The online network's action values."""
+        """Compute the online network's action values."""
         trunk, head = self.greedy.module[0].module
         return head.module(trunk.over_time(data))
 
     def _target_values(self, data: Data) -> Tensor:
-        """The target network's action values."""
+        """Compute the target network's action values."""
         trunk, head = self.greedy.module[0].module
         old = [self.dqn.target_value_network_params["module", "0", "module", i, "module"] for i in ("0", "1")]
         weights = [dict(part.flatten_keys(".").items()) for part in old]

@@ -16,5 +16,5 @@ class DRQN(RecurrentQ):
     solves = "partially observable tasks too, where an episode is short enough to remember"
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """The squared error of the value."""
+        """Compute the squared error of the value."""
         return (predicted - target).square().squeeze(-1)

@@ -1,10 +1,11 @@
-"""What all learners share: an optimiser, the gradient step, and a state dict with both."""
+"""The base class of learning agents: an optimiser, the gradient step, and a state dict with both."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from types import FunctionType
 from typing import Any, ClassVar
 
 import torch
@@ -12,42 +13,40 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.compiled import compiled_step, total
-from baselines.methods.method import Method
+from baselines.hooks import Hooks
 from baselines.networks import Data
-from ctgraph_rl.checks import at_least_one, positive, require
+from baselines.optimisers import functional_step
+from ctgraph_rl.checks import at_least_one, positive, require, true_or_false
 
 LARGEST_WEIGHT = 1e12
 """Beyond this a network has diverged, and its outputs soon overflow."""
 
-OPTIMISERS = ("adam", "rmsprop")
-
 
 class Learner(nn.Module):
-    """A module with an optimiser. Agents derive from it; the defaults are those of an agent without memory.
+    """A module with an optimiser, from which agents derive; the defaults are those of an agent without memory.
 
     Args:
-        num_envs: rows that it learns from.
-        num_steps: steps of each row in a batch.
+        num_envs: environments that it learns from.
+        num_steps: steps of each environment in a batch.
         max_grad_norm: gradients are scaled down to this norm.
         compile: run gradient steps of the usual size through ``torch.compile``: faster where networks and minibatches
-            are small, after seconds of compiling. An agent with ``memory`` refuses it: its LSTM gains nothing.
+            are small, after seconds of compiling. An agent with ``memory`` refuses it: an LSTM gains nothing.
     """
 
     memory: ClassVar[bool] = False
-    """Whether what it did and saw earlier in an episode can change what it does."""
+    """Whether earlier steps of an episode can change the action."""
 
     solves: ClassVar[str]
-    """What it can solve in principle, in a few words."""
+    """Which tasks it can solve in principle, in a few words."""
 
     policy: TensorDictModuleBase
     optimiser: torch.optim.Optimizer
 
     output_keys: ClassVar[tuple[str, ...]]
-    """What `outputs` gives that the network itself makes."""
+    """The keys of `outputs` that the network computes itself."""
 
     minibatch_size: int
-    """Items that a gradient step learns from, unless a batch was shortened."""
+    """Items of a minibatch, unless the end of a block has shortened the batch."""
 
     def __init__(self, num_envs: int, num_steps: int, max_grad_norm: float, compile: bool = False) -> None:
         super().__init__()
@@ -57,26 +56,26 @@ class Learner(nn.Module):
             *true_or_false(compile=compile),
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
-        self.compiled_step = compiled_step() if compile else None
-        self.method = Method()
+        self.compiled_step = make_compiled_step() if compile else None
+        self.method = Hooks()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """No recurrent state."""
+        """Return an empty recurrent state."""
         return TensorDict(batch_size=[num_envs])
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """The policy that acts in a task; the same for all."""
+        """Return the policy, which is the same for all tasks."""
         return self.policy
 
     def start_task(self, task: int | None = None) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def end_task(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """The losses of a batch; see `ctgraph_rl.agent.Agent`."""
+        """Compute the losses of a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
@@ -84,67 +83,67 @@ class Learner(nn.Module):
         raise NotImplementedError
 
     def num_learnt(self, batch: TensorDictBase) -> int:
-        """Frames of a batch that one pass learns from."""
+        """Return how many frames of a batch one pass learns from."""
         return batch.numel()
 
     def outputs(self, data: Data) -> dict[str, Tensor]:
-        """What the network says of any number of steps, [..., n] each.
+        """Compute the network's outputs at any number of steps, [..., n] each.
 
-        ``log_probs`` of all actions; and those of `output_keys`: ``state_value`` or ``action_value``.
+        These are ``log_probs`` of all actions, and those of `output_keys`: ``state_value`` or ``action_value``.
         """
         raise NotImplementedError
 
     @cached_property
     def weights(self) -> list[nn.Parameter]:
-        """What the losses are differentiated by."""
-        return list(self.live)
+        """The parameters by which the losses are differentiated."""
+        return list(self.trainable)
 
     @property
-    def live(self) -> list[nn.Parameter]:
-        """What the optimiser changes: the weights, unless a method has put something else in their place."""
+    def trainable(self) -> list[nn.Parameter]:
+        """The optimiser's parameters: the weights, unless a method trains others in their place."""
         return self.optimiser.param_groups[0]["params"]
 
-    def optimise(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Let a new optimiser of the same kind change these parameters."""
+    def replace_optimiser(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Replace the optimiser by a new one of the same kind for these parameters."""
         self.optimiser = type(self.optimiser)(parameters, **self.optimiser.defaults)
         if self.compiled_step is not None:
-            self.compiled_step = compiled_step()
+            self.compiled_step = make_compiled_step()
 
-    def forget(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Let the optimiser forget what it knows of parameters."""
+    def clear_optimiser_state(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Set the optimiser's state of these parameters to zero."""
         for parameter in parameters:
             for value in self.optimiser.state.get(parameter, {}).values():
                 value.zero_()
 
-    def draw_weights(self) -> None:
-        """Draw all weights anew, in the way in which the agent began; layers need ``reset_parameters``."""
-        self.policy.apply(_draw)
+    def reset_parameters(self) -> None:
+        """Draw all weights again as at construction; layers need ``reset_parameters``."""
+        self.policy.apply(_reset)
 
     def weights_changed(self) -> None:
-        """Called where the weights were changed other than by learning; nothing else depends on them."""
+        """Called after weights were changed other than by learning; nothing else depends on them."""
 
     def losses(self, batch: Data) -> dict[str, Tensor]:
-        """The agent's losses and the method's."""
-        return {**self.loss(batch), **self.method.loss(batch)}
+        """Compute the agent's losses and the method's penalties."""
+        return {**self.loss(batch), **self.method.penalties(batch)}
 
     def gradient_step(self, batch: Data) -> dict[str, Tensor]:
-        """Minimise the sum of the losses of a batch by one step; returns losses and gradient norm."""
-        batch = self.method.mixed(batch)
+        """Minimise the sum of the losses of a batch by one step; return losses and gradient norm."""
+        batch = self.method.transform_minibatch(batch)
         weights = self.weights  # also for the compiled step: a cached property that is not there yet cannot be traced
         usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
         if self.compiled_step is not None and usual:
             return self.compiled_step(self, batch)
         losses = self.losses(batch)
-        gradients = torch.autograd.grad(total(losses), weights)
-        for parameter, gradient in zip(self.live, self.method.gradients(gradients), strict=True):
+        gradients = torch.autograd.grad(total_loss(losses), weights)
+        for parameter, gradient in zip(self.trainable, self.method.transform_gradients(gradients), strict=True):
             parameter.grad = gradient
-        norm = nn.utils.clip_grad_norm_(self.live, self.max_grad_norm)
+        norm = nn.utils.clip_grad_norm_(self.trainable, self.max_grad_norm)
         self.optimiser.step()
-        self.method.settle()
+        self.method.after_step()
         return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
-    def measured(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
-        """The mean of each measurement over gradient steps, none of which may have gone wrong.
+    def mean_measurements(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
+        """Return the mean of each measurement over gradient steps.
 
         Raises:
             FloatingPointError: names the first number that is not finite, or the largest weight.
@@ -158,45 +157,58 @@ class Learner(nn.Module):
         return dict(zip(steps[0], table.mean(dim=1).tolist(), strict=True))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The optimiser's state, so that `state_dict` is complete."""
+        """Return the optimiser's state, so that `state_dict` is complete."""
         return {"optimiser": self.optimiser.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
+        """Restore what `get_extra_state` returned."""
         self.optimiser.load_state_dict(state["optimiser"])
 
 
-def _draw(module: nn.Module) -> None:
-    """Draw the weights of a layer, as PyTorch does at its construction."""
+def _reset(module: nn.Module) -> None:
+    """Draw the weights of a layer as PyTorch does at its construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]
 
 
-def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
-    """The optimiser of a name in `OPTIMISERS`, otherwise as PyTorch sets it."""
-    if name == "rmsprop":
-        return torch.optim.RMSprop(parameters, lr=learning_rate)
-    return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+Step = Callable[[Learner, Data], dict[str, Tensor]]
 
 
-def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
-    """Rules that each named value is one of the choices."""
-    return [
-        (value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
-        for name, value in values.items()
-    ]
+def make_compiled_step() -> Step:
+    """Return `functional_gradient_step`, compiled for one agent and one size of minibatches.
+
+    With small networks and minibatches nearly all time is spent between operations; a compiled step has no such gaps.
+    Each call compiles a copy of the code, as the number of compilations of one function is limited. Between operations
+    there are no checks of sizes and, on machines without a GPU, no Python.
+    """
+    torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
+    step = FunctionType(functional_gradient_step.__code__.replace(), functional_gradient_step.__globals__)
+    options: dict[str, Any] = {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
+    return torch.compile(step, fullgraph=True, dynamic=False, options=options)
 
 
-def true_or_false(**values: object) -> list[tuple[bool, str]]:
-    """Rules that each named value is a bool."""
-    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in values.items()]
+def functional_gradient_step(learner: Learner, batch: Data) -> dict[str, Tensor]:
+    """Take `Learner.gradient_step` without a branch on data; the optimiser must have its state."""
+    losses = learner.losses(batch)
+    gradients = learner.method.transform_gradients(torch.autograd.grad(total_loss(losses), learner.weights))
+    norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()  # fuses; PyTorch's does not
+    scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+    with torch.no_grad():
+        functional_step(learner.optimiser, [gradient * scale for gradient in gradients])
+    learner.method.after_step()
+    return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
+
+
+def total_loss(losses: dict[str, Tensor]) -> Tensor:
+    """Return the sum of the losses named ``loss_*``, which is what is minimised."""
+    return sum((value for key, value in losses.items() if key.startswith("loss_")), start=torch.zeros(()))
 
 
 def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:
-    """Stop learning where a number is NaN, infinite or larger than ``most``.
+    """Check that a number is finite and at most ``most``.
 
     Raises:
-        FloatingPointError: names the number.
+        FloatingPointError: if it is not; names the number.
     """
     if not (value.isfinite() and value.abs() <= most):
         raise FloatingPointError(f"{name} is {value.item():g}")

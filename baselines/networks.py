@@ -18,7 +18,7 @@ Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
 
 STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")
-"""Where a recurrent policy keeps its state."""
+"""The keys of a recurrent policy's state."""
 
 
 class Encoder(nn.Module):
@@ -29,7 +29,7 @@ class Encoder(nn.Module):
         high: largest value of an observation.
         num_features: width of every layer.
         num_layers: linear layers, at least 1.
-        num_extra: numbers that are joined to the flat observation, such as a one-hot task id.
+        num_extra: width of further inputs, such as a one-hot task id.
     """
 
     def __init__(
@@ -42,21 +42,21 @@ class Encoder(nn.Module):
         self.further = nn.Sequential(*layers)
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
-        """uint8 [..., *shape] and [..., n] each to float32 [..., num_features]."""
+        """Map uint8 [..., *shape] and further inputs, [..., n] each, to float32 [..., num_features]."""
         flat = observation.flatten(-self.event_dims).float() * self.scale
         flat = torch.cat([flat, *(values.float() for values in extra)], dim=-1) if extra else flat
         return self.further(self.linear(flat).relu())
 
 
 class EncoderModule(TensorDictModule):
-    """An `Encoder` and the keys that it reads: a trunk without memory; writes ``features``."""
+    """A trunk without memory: an `Encoder` and the keys that it reads; writes ``features``."""
 
     def act(self, data: Data) -> dict[Any, Tensor]:
-        """What the trunk makes of one step of all rows."""
+        """Compute ``features`` for one step of all rows."""
         return {"features": self.over_time(data)}
 
     def over_time(self, data: Data) -> Tensor:
-        """The features of any number of steps."""
+        """Compute the features of any number of steps."""
         return self.module(*(data[key] for key in self.in_keys))
 
 
@@ -67,7 +67,7 @@ class RecurrentModule(TensorDictSequential):
     """
 
     def act(self, data: Data) -> dict[Any, Tensor]:
-        """What the trunk makes of one step of all rows: ``memory`` and the next state."""
+        """Compute ``memory`` and the next state for one step of all rows."""
         encoder, lstm = self.module[0], self.module[1].lstm
         fresh = data["is_init"].unsqueeze(-1)
         state = (torch.where(fresh, 0.0, data[key]).transpose(0, 1).contiguous() for key in STATE_KEYS)
@@ -76,19 +76,19 @@ class RecurrentModule(TensorDictSequential):
         return {"memory": memory.squeeze(1), **following}
 
     def over_time(self, data: Data) -> Tensor:
-        """``memory`` at all steps of sequences [rows, steps]; starts with the state there, and anew at ``is_init``.
+        """Compute ``memory`` at all steps of [rows, steps], from the stored initial state; reset at ``is_init``.
 
-        Each stretch between two starts is a sequence of its own, and the LSTM runs over all of them at once. What
-        depends on the inputs alone is computed once for frames that have the same.
+        Each segment between two resets is a sequence of its own, and the LSTM runs over all of them at once. Features
+        are computed once for frames with the same inputs.
         """
         encoder, lstm = self.module[0], self.module[1].lstm
         inputs = [data[key].flatten(0, 1) for key in encoder.in_keys]
-        examples, kinds = distinct(inputs)
+        examples, groups = distinct(inputs)
         features = encoder.module(*(value.index_select(0, examples) for value in inputs))
         starts = data["is_init"].squeeze(-1).clone()
         if not starts[:, 1:].any():
             state = (data[key][:, 0].transpose(0, 1).contiguous() for key in STATE_KEYS)
-            return lstm(features.index_select(0, kinds).unflatten(0, starts.shape), tuple(state))[0]
+            return lstm(features.index_select(0, groups).unflatten(0, starts.shape), tuple(state))[0]
         starts[:, 0] = True
         first = starts.flatten().nonzero().squeeze(-1)
         lengths, order = first.diff(append=first.new_tensor([starts.numel()])).sort(descending=True)
@@ -96,19 +96,19 @@ class RecurrentModule(TensorDictSequential):
         within = time < lengths
         places = (first + time)[within]
         state = (data[key].flatten(0, 1)[first].transpose(0, 1).contiguous() for key in STATE_KEYS)
-        memory = packed_lstm(lstm, features, kinds[places], within.sum(dim=1).cpu(), *state)
+        memory = packed_lstm(lstm, features, groups[places], within.sum(dim=1).cpu(), *state)
         back = torch.empty_like(places).scatter_(0, places, torch.arange(len(places), device=places.device))
         return memory.index_select(0, back).unflatten(0, starts.shape)
 
 
 def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Which frames have the same inputs: in a task without noise, thousands show a few images.
+    """Group frames with the same inputs: in a task without noise, thousands show a few images.
 
     Args:
-        inputs: numbers, [num_frames, ...] each.
+        inputs: tensors, [num_frames, ...] each.
 
     Returns:
-        A frame of each kind, int64 [num_kinds], and the kind of each frame, int64 [num_frames].
+        One frame of each group, int64 [num_groups], and the group of each frame, int64 [num_frames].
     """
     flat = [value.flatten(1) for value in inputs]
     frames = torch.arange(len(flat[0]), device=flat[0].device)
@@ -117,35 +117,35 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     widths = [value.shape[1] for value in flat]
     weights = torch.randn(sum(widths), generator=torch.Generator().manual_seed(0)).split(widths)
     sums = torch.stack([value.float() @ part for value, part in zip(flat, weights, strict=True)]).sum(dim=0)
-    different, kinds = sums.unique(return_inverse=True)
-    examples = frames.new_empty(len(different)).scatter_(0, kinds, frames)
-    same = examples[kinds]
-    differ = any((value != value.index_select(0, same)).any() for value in flat)  # though they have the same sum
-    return (frames, frames) if differ else (examples, kinds)
+    different, groups = sums.unique(return_inverse=True)
+    examples = frames.new_empty(len(different)).scatter_(0, groups, frames)
+    same = examples[groups]
+    differ = any((value != value.index_select(0, same)).any() for value in flat)  # despite equal sums
+    return (frames, frames) if differ else (examples, groups)
 
 
-def packed_lstm(lstm: nn.LSTM, features: Tensor, kinds: Tensor, sizes: Tensor, h: Tensor, c: Tensor) -> Tensor:
-    """An LSTM of one layer over a `PackedSequence`, with one product of features and weights for each kind of features.
+def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, h: Tensor, c: Tensor) -> Tensor:
+    """Run an LSTM of one layer over packed sequences, with one product of features and weights for each group.
 
-    PyTorch's own gradients write a tensor of all frames at each step.
+    PyTorch's own backward pass writes a tensor of all frames at each step.
 
     Args:
-        lstm: whose weights are used.
-        features: of each kind, [num_kinds, num_features].
-        kinds: of each frame in packed order, int64 [num_frames].
-        sizes: sequences at each step, int64 [num_steps] on the CPU.
-        h: the hidden states that the sequences start with, [1, num_sequences, hidden_size].
-        c: their cell states likewise.
+        lstm: the LSTM.
+        features: of each group, [num_groups, num_features].
+        groups: of each frame in packed order, int64 [num_frames].
+        sizes: number of sequences at each step, int64 [num_steps] on the CPU.
+        h: the initial hidden states of the sequences, [1, num_sequences, hidden_size].
+        c: the initial cell states likewise.
 
     Returns:
         The hidden states at all frames in packed order, [num_frames, hidden_size].
     """
     if features.is_cuda:
-        return lstm(PackedSequence(features.index_select(0, kinds), sizes), (h, c))[0].data
+        return lstm(PackedSequence(features.index_select(0, groups), sizes), (h, c))[0].data
     of_features, of_h, bias, other_bias = lstm.all_weights[0]
     given = nn.functional.linear(features, of_features, bias + other_bias)
     h, c, memory = h[0], c[0], []
-    for step in given.index_select(0, kinds).split(sizes.tolist()):
+    for step in given.index_select(0, groups).split(sizes.tolist()):
         left = len(step)
         i, f, g, o = torch.addmm(step, h[:left], of_h.t()).chunk(4, dim=1)
         c = torch.addcmul(f.sigmoid() * c[:left], i.sigmoid(), g.tanh())
@@ -155,7 +155,7 @@ def packed_lstm(lstm: nn.LSTM, features: Tensor, kinds: Tensor, sizes: Tensor, h
 
 
 def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:
-    """An `Encoder` that reads ``observation`` and, where the environment gives it, ``task_id``; writes ``features``.
+    """Build an encoder that reads ``observation`` and, if the environment has it, ``task_id``; it writes ``features``.
 
     Args:
         observation_spec: the environment's, without batch dimensions.
@@ -171,25 +171,25 @@ def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1,
 
 
 def recurrent(observation_spec: Composite, num_features: int, num_layers: int, **extra: int) -> RecurrentModule:
-    """An `encoder` with an LSTM of the same width behind it; writes ``memory``, and its state under `STATE_KEYS`."""
+    """Build an `encoder` with an LSTM of the same width; it writes ``memory``, and its state under `STATE_KEYS`."""
     lstm = LSTMModule(num_features, num_features, in_key="features", out_key="memory")
     return RecurrentModule(encoder(observation_spec, num_features, num_layers, **extra), lstm)
 
 
 def zero_state(trunk: TensorDictSequential, num_envs: int) -> TensorDict:
-    """Zeros, float32 [num_envs, 1, num_features] for both parts of the state of a `recurrent` trunk."""
+    """Return zeros, float32 [num_envs, 1, num_features], for both parts of the state of a `recurrent` trunk."""
     lstm = trunk[-1].lstm
     zeros = torch.zeros(num_envs, lstm.num_layers, lstm.hidden_size, device=lstm.weight_hh_l0.device)
     return TensorDict({key: zeros.clone() for key in STATE_KEYS}, batch_size=[num_envs])
 
 
 def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> TensorDictModule:
-    """One linear layer from ``in_key`` to ``out_key``."""
+    """Build a linear layer from ``in_key`` to ``out_key``."""
     return TensorDictModule(nn.Linear(num_features, num_outputs), in_keys=[in_key], out_keys=[out_key])
 
 
 def make_orthogonal(module: nn.Module, gain: float = 1.0) -> None:
-    """Give all linear layers orthogonal weights times a gain, and biases of 0."""
+    """Initialise all linear layers with orthogonal weights times a gain, and biases of 0."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.orthogonal_(layer.weight, gain)
@@ -197,7 +197,7 @@ def make_orthogonal(module: nn.Module, gain: float = 1.0) -> None:
 
 
 def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> ProbabilisticActor:
-    """A categorical policy that reads features and writes ``action`` and ``action_log_prob``."""
+    """Build a categorical policy that reads features and writes ``action`` and ``action_log_prob``."""
     return ProbabilisticActor(
         linear(in_key, num_features, "logits", action_spec.space.n),
         spec=action_spec,
@@ -208,14 +208,14 @@ def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> Probabilis
 
 
 def critic(in_key: str, num_features: int) -> ValueOperator:
-    """A value of features, ``state_value``."""
+    """Build a linear critic of features, which writes ``state_value``."""
     return ValueOperator(nn.Linear(num_features, 1), in_keys=[in_key])
 
 
 class ActorCritic(TensorDictSequential):
-    """A policy of a trunk, an `actor` and a `critic`: what TorchRL makes of the three, in plain tensors.
+    """A policy of a trunk, an `actor` and a `critic`; computes what TorchRL's modules do, in plain tensors.
 
-    Modules behind them act as they are.
+    Further modules are called as they are.
     """
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
@@ -240,12 +240,12 @@ class ActorCritic(TensorDictSequential):
 
 
 def log_probabilities(actor: ProbabilisticActor, features: Tensor) -> Tensor:
-    """The logarithms of an `actor`'s probabilities, [..., num_actions]."""
+    """Compute the logarithms of an `actor`'s probabilities, [..., num_actions]."""
     logits = actor.module[0].module(features)
     return logits - logits.logsumexp(dim=-1, keepdim=True)
 
 
 def entropy(log_probs: Tensor) -> Tensor:
-    """The entropy of categorical distributions, [...]."""
+    """Compute the entropy of categorical distributions, [...]."""
     least = torch.finfo(log_probs.dtype).min  # so that a probability of 0 counts as 0
     return -(log_probs.clamp(min=least) * log_probs.softmax(dim=-1)).sum(dim=-1)

@@ -1,4 +1,4 @@
-"""What agents that follow a policy's gradient share: networks, advantages, epochs of minibatches."""
+"""The base class of policy-gradient agents: networks, advantages, epochs of minibatches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from baselines.learner import OPTIMISERS, Learner, make_optimiser, one_of, true_or_false
+from baselines.learner import Learner
 from baselines.networks import (
     STATE_KEYS,
     ActorCritic,
@@ -25,7 +25,8 @@ from baselines.networks import (
     recurrent,
     zero_state,
 )
-from ctgraph_rl.checks import at_least_one, fraction, is_real, positive, require
+from baselines.optimisers import OPTIMISERS, make_optimiser
+from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require, true_or_false
 
 ACTED_KEYS = ("action", "action_log_prob", "state_value")
 
@@ -33,15 +34,15 @@ ACTED_KEYS = ("action", "action_log_prob", "state_value")
 class PolicyGradient(Learner):
     """An actor and a critic on one trunk, which ends in an LSTM if the class has ``memory``.
 
-    A class that derives from it gives the loss, and hands all arguments here that are not its own. With memory, whole
-    rows of a batch are the minibatches, so the trunk sees sequences in order, and its state starts anew wherever
-    ``is_init`` is set; without, the frames of all rows are shuffled.
+    A class that derives from it defines the loss, and passes on all arguments that are not its own. With memory,
+    minibatches are whole rows of a batch, so the trunk sees sequences in order, and its state is reset wherever
+    ``is_init`` is set; without memory, the frames of all rows are shuffled.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        num_envs: rows that it learns from.
-        num_steps: steps of each row in a batch.
+        num_envs: environments that it learns from.
+        num_steps: steps of each environment in a batch.
         hidden_size: width of all layers.
         num_layers: layers before the heads, or before the LSTM.
         optimiser: ``adam`` or ``rmsprop``.
@@ -52,8 +53,8 @@ class PolicyGradient(Learner):
         gae_lambda: lambda of the generalised advantage estimate (Schulman et al. 2016, arXiv 1506.02438); 1: returns
             of up to ``num_steps`` steps.
         compile: run gradient steps through ``torch.compile``; only without memory.
-        orthogonal_init: linear layers begin with orthogonal weights, those of the heads a thousand times smaller, and
-            biases of 0, as in the code of Ben-Iwhiwhu et al. 2023; False: as torch's do.
+        orthogonal_init: initialise linear layers with orthogonal weights, those of the heads a thousand times smaller,
+            and biases of 0, as in the code of Ben-Iwhiwhu et al. 2023; False: as PyTorch does.
     """
 
     num_epochs = num_minibatches = 1
@@ -103,17 +104,17 @@ class PolicyGradient(Learner):
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
     ) -> TensorDictModuleBase:
-        """What comes before the heads; with memory, it ends in an LSTM."""
+        """Build the layers before the heads, which with memory end in an LSTM."""
         make = recurrent if self.memory else encoder
         return make(observation_spec, hidden_size, num_layers)
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Zeros for the LSTM's state; empty without memory."""
+        """Return zeros for the LSTM's state; an empty state without memory."""
         return zero_state(self.trunk, num_envs) if self.memory else super().initial_state(num_envs)
 
-    def draw_weights(self) -> None:
+    def reset_parameters(self) -> None:
         """See `Learner`."""
-        super().draw_weights()
+        super().reset_parameters()
         self._make_orthogonal()
 
     def _make_orthogonal(self) -> None:
@@ -121,49 +122,49 @@ class PolicyGradient(Learner):
             make_orthogonal(self.trunk)
             make_orthogonal(nn.ModuleList([self.actor, self.critic]), 0.001)
 
-    def judged(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
-        """What the present networks say of data: log-probabilities of all actions and of those taken, and values.
+    def evaluate_actions(self, batch: Data) -> tuple[Tensor, Tensor, Tensor]:
+        """Compute log-probabilities of all actions, those of the actions taken, and values, with the present networks.
 
         The trunk runs once for actor and critic.
         """
-        said = self.outputs(batch)
-        taken = said["log_probs"].gather(-1, batch["action"].unsqueeze(-1))
-        return said["log_probs"], taken, said["state_value"]
+        outputs = self.outputs(batch)
+        log_probs = outputs["log_probs"]
+        return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 
     def outputs(self, data: Data) -> dict[str, Tensor]:
-        """Log-probabilities of all actions and the value; see `Learner`."""
+        """Compute log-probabilities of all actions and the value; see `Learner`."""
         features = self.trunk.over_time(data)
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Some epochs over a batch; returns mean losses, entropy and gradient norm."""
+        """Learn from a batch for some epochs; return mean losses, entropy and gradient norm."""
         given = self._with_advantage(batch)
         items = {key: value if self.memory else value.flatten(0, 1) for key, value in given.items()}
         steps: list[dict[str, Tensor]] = []
         for _ in range(self.num_epochs):
             steps += map(self.gradient_step, self._minibatches(items))
-        return self.measured(steps)
+        return self.mean_measurements(steps)
 
     def reward(self, batch: TensorDictBase) -> Tensor:
-        """What is maximised, float32 [num_envs, num_steps, 1]: the environment's reward."""
+        """Return the reward to maximise, float32 [num_envs, num_steps, 1]: the environment's."""
         return batch["next", "reward"]
 
     def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
-        """The minibatches of one pass."""
+        """Iterate over the minibatches of one epoch."""
         order = torch.randperm(len(items["action"])).to(items["action"].device)
         shuffled = [value.index_select(0, order).chunk(self.num_minibatches) for value in items.values()]
         return (dict(zip(items, parts, strict=True)) for parts in zip(*shuffled, strict=True))
 
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """The batch with ``advantage`` and ``value_target`` from the values that were computed while acting."""
+        """Add ``advantage`` and ``value_target`` to a batch, from the values that were computed while acting."""
         after = batch["next"]
-        return self._estimated(batch, self._next_values(batch), after["done"], after["terminated"])
+        return self._with_estimates(batch, self._next_values(batch), after["done"], after["terminated"])
 
-    def _estimated(
+    def _with_estimates(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
     ) -> dict[str, Tensor]:
-        """What is learned from: inputs, actions, advantages and targets; each argument is [num_envs, num_steps, 1]."""
+        """Return inputs, actions, advantages and value targets; each argument is [num_envs, num_steps, 1]."""
         given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
         advantage, target = vec_generalized_advantage_estimate(self.gamma, self.gae_lambda, *given)
         if self.normalize_advantage:
@@ -172,7 +173,7 @@ class PolicyGradient(Learner):
         return {key: batch[key] for key in keys} | {"advantage": advantage, "value_target": target}
 
     def _next_values(self, batch: TensorDictBase) -> Tensor:
-        """The value after each step: the next step's own, or that of another forward pass where there is none.
+        """Compute the value after each step: the next step's own, or that of another forward pass where there is none.
 
         There is none after the last step of the batch and where an episode was truncated. Where one has terminated,
         the value is not used.
@@ -186,17 +187,12 @@ class PolicyGradient(Learner):
         return next_values
 
 
-def loss_weight(**values: object) -> list[tuple[bool, str]]:
-    """Rules that each named value is a number >= 0."""
-    return [(is_real(value, 0), f"{name} must be a number >= 0, got {value!r}") for name, value in values.items()]
-
-
 def critic_loss(values: Tensor, batch: Data, weight: float) -> Tensor:
-    """The critic's weighed mean squared error."""
+    """Compute the critic's weighted mean squared error."""
     return (weight * (values - batch["value_target"]).square()).mean()
 
 
 def entropy_loss(log_probs: Tensor, weight: float) -> dict[str, Tensor]:
-    """What is lost where the policy's entropy is small, and the entropy."""
-    bits = entropy(log_probs)
-    return {"loss_entropy": (-weight * bits).mean(), "entropy": bits.detach().mean()}
+    """Return the negative weighted entropy of the policy as a loss, and the entropy."""
+    entropies = entropy(log_probs)
+    return {"loss_entropy": (-weight * entropies).mean(), "entropy": entropies.detach().mean()}

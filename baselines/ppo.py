@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from baselines.networks import Data
-from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss, loss_weight
-from ctgraph_rl.checks import at_least_one, is_int, positive, require
+from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss
+from ctgraph_rl.checks import at_least_one, is_int, not_negative, positive, require
 
 
 class PPO(PolicyGradient):
@@ -26,7 +26,7 @@ class PPO(PolicyGradient):
         entropy_coeff: weight of the entropy bonus.
         critic_coeff: weight of the critic's loss, a mean squared error.
         num_epochs: passes over a batch.
-        num_minibatches: minibatches a pass; they split the frames, or with memory the rows.
+        num_minibatches: minibatches of an epoch; they split the frames, or with memory the rows.
         settings: the arguments of `PolicyGradient`.
     """
 
@@ -45,7 +45,7 @@ class PPO(PolicyGradient):
     ) -> None:
         require(
             *positive(clip_epsilon=clip_epsilon),
-            *loss_weight(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff),
+            *not_negative(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff),
             *at_least_one(num_epochs=num_epochs, num_minibatches=num_minibatches),
         )
         super().__init__(observation_spec, action_spec, **settings)
@@ -55,8 +55,8 @@ class PPO(PolicyGradient):
         self.clip_range = torch.tensor([-clip_epsilon, clip_epsilon]).log1p().tolist()
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """Clipped surrogate, eq. (7) of the paper, critic's error and entropy, as TorchRL's `ClipPPOLoss` has them."""
-        log_probs, taken, values = self.judged(batch)
+        """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""
+        log_probs, taken, values = self.evaluate_actions(batch)
         change = taken - batch["action_log_prob"].unsqueeze(-1)
         gain, clipped = (value.exp() * batch["advantage"] for value in (change, change.clamp(*self.clip_range)))
         return {
@@ -66,7 +66,7 @@ class PPO(PolicyGradient):
         }
 
     def _split_rule(self, num_minibatches: int) -> tuple[bool, str]:
-        """Whether minibatches split the rows, or the frames, evenly."""
+        """Rule that minibatches split the rows, or the frames, evenly."""
         items = self.num_envs if self.memory else self.num_envs * self.num_steps
         what = f"num_envs={self.num_envs}" if self.memory else f"num_envs * num_steps = {items}"
         splits = is_int(num_minibatches, 1) and items % num_minibatches == 0

@@ -1,7 +1,7 @@
-"""PPO with a bonus for rarely seen observations, so that it explores where rewards are far.
+"""PPO with a bonus for rarely seen observations, for exploration where rewards are rare.
 
 Counts of hashed observations, "#Exploration", Tang et al. 2017 (arXiv 1611.04717): a step that leads to an observation
-is paid coeff / sqrt(times that its hash was seen), in addition to the environment's reward.
+gets a bonus of coeff / sqrt(times that its hash was seen), in addition to the environment's reward.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
-from baselines.policy_gradient import loss_weight
 from baselines.ppo import PPO
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, not_negative, require
 
 
 class SimHashCounts(nn.Module):
-    """How often observations with the same signs under random projections were seen.
+    """Counts of observations with the same signs under random projections.
 
     Args:
         num_inputs: numbers in an observation.
         high: largest value of an observation.
-        num_bits: projections; observations share a count where all signs agree.
+        num_bits: number of projections; observations share a count where all signs agree.
     """
 
     projection: Tensor
@@ -37,7 +36,7 @@ class SimHashCounts(nn.Module):
         self.register_buffer("counts", torch.zeros(2**num_bits, dtype=torch.int64))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Count a batch of uint8 observations; returns how often each was seen by now, int64 [n]."""
+        """Count a batch of uint8 observations, and return how often each was seen so far, int64 [n]."""
         flat = observation.reshape(-1, self.num_inputs).float() * self.scale - 1
         signs = (flat @ self.projection > 0).long()
         codes = (signs << torch.arange(signs.shape[1], device=signs.device)).sum(dim=1)
@@ -67,20 +66,20 @@ class PPOCount(PPO):
         **settings: Any,
     ) -> None:
         bits = (is_int(num_hash_bits, 1, 24), f"num_hash_bits must be an integer in 1..24, got {num_hash_bits!r}")
-        require(bits, *loss_weight(bonus_coeff=bonus_coeff))
+        require(bits, *not_negative(bonus_coeff=bonus_coeff))
         super().__init__(observation_spec, action_spec, **settings)
         spec = observation_spec["observation"]
         self.bonus_coeff = bonus_coeff
         self.seen = SimHashCounts(spec.shape.numel(), spec.space.high.max().item(), num_hash_bits)
 
     def start_task(self, task: int | None = None) -> None:
-        """Everything is new again."""
+        """Reset all counts."""
         self.seen.counts.zero_()
 
     def reward(self, batch: TensorDictBase) -> Tensor:
-        """The environment's reward plus the bonus for what each step led to; counts the batch."""
+        """Return the environment's reward plus the bonus for the next observation; count the batch."""
         return super().reward(batch) + self.bonus(batch["next", "observation"]).view(*batch.shape, 1)
 
     def bonus(self, observation: Tensor) -> Tensor:
-        """Count observations and return the bonus for each, float32 [n]."""
+        """Count observations, and return the bonus for each, float32 [n]."""
         return self.bonus_coeff * self.seen(observation).float().rsqrt()

@@ -1,7 +1,8 @@
 """Proportional prioritized replay (Schaul et al. 2016, arXiv 1511.05952) as a TorchRL sampler in plain PyTorch.
 
-TorchRL's own sampler keeps segment trees of an extension that is not there for every version of PyTorch, and it draws
-from numpy's generator. A draw here costs a pass over the priorities, little beside a gradient step at sizes below 10^6.
+TorchRL's own sampler keeps segment trees of an extension that is not available for every version of PyTorch, and it
+draws from numpy's generator. A draw here costs a pass over the priorities, little beside a gradient step below a size
+of 10^6.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from torchrl.data.replay_buffers.samplers import Sampler
 class PrioritySampler(Sampler):
     """Draws item i with probability p_i^alpha / sum p^alpha, with replacement, from torch's global generator.
 
-    A new item has the largest priority so far. With each item goes ``priority_weight``, at most 1:
+    A new item has the largest priority so far. Each item comes with ``priority_weight``, at most 1:
     (p_i^alpha / min p^alpha)^-beta.
 
     Args:
-        num_items: items that the storage keeps.
-        alpha: how much priorities count.
-        beta: how much of that the weights correct.
+        num_items: capacity of the storage.
+        alpha: exponent of the priorities.
+        beta: exponent of the weights, which correct for alpha.
     """
 
     def __init__(self, num_items: int, alpha: float, beta: float) -> None:
@@ -38,23 +39,23 @@ class PrioritySampler(Sampler):
     add = extend
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Draw items; returns their numbers and weights."""
+        """Draw items, and return their indices and weights."""
         chances = self.priorities[: len(storage)] ** self.alpha
         index = torch.multinomial(chances, batch_size, replacement=True)
         return index, {"priority_weight": (chances[index] / chances.min()) ** -self.beta}
 
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> dict | None:
-        """Set priorities, float32 [n]; they are kept above 0, so that every item is drawn at times."""
+        """Set priorities, float32 [n], to at least 1e-6, so that every item can be drawn."""
         self.priorities[index] = priority.clamp(min=1e-6)
         self.most = torch.maximum(self.most, priority.max())
         return None
 
     def state_dict(self) -> dict[str, Any]:
-        """All priorities."""
+        """Return all priorities."""
         return {"priorities": self.priorities.clone(), "most": self.most.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what `state_dict` gave."""
+        """Restore what `state_dict` returned."""
         self.priorities.copy_(state_dict["priorities"])
         self.most = state_dict["most"].clone()
 

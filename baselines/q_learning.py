@@ -1,4 +1,4 @@
-"""What agents that learn action values share: epsilon-greedy exploration, replay, a target network."""
+"""The base class of Q-learning agents: epsilon-greedy exploration, replay, a target network."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from baselines.learner import Learner, make_optimiser, one_of
+from baselines.learner import Learner
 from baselines.networks import Data
+from baselines.optimisers import make_optimiser
 from baselines.prioritized import PrioritySampler
-from ctgraph_rl.checks import at_least_one, fraction, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
 
 
 class EpsilonGreedy(TensorDictSequential):
-    """A `QValueActor` of a trunk and a head, and exploration: what TorchRL makes of the first, in plain tensors."""
+    """A `QValueActor` of a trunk and a head, with exploration; computes what TorchRL's does, in plain tensors."""
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action`` and the trunk's next state."""
@@ -38,12 +39,11 @@ class EpsilonGreedy(TensorDictSequential):
 class QLearner(Learner):
     """Learns action values from replayed experience; explores by random actions, less and less within a task.
 
-    A class that derives from it calls `act_with` with its networks, says what to store by `experience`, and gives the
-    loss.
+    A class that derives from it calls `set_networks`, and defines `experience` and the loss.
 
     Args:
-        num_envs: rows that it learns from.
-        num_steps: steps of each row between two rounds of updates.
+        num_envs: environments that it learns from.
+        num_steps: steps of each environment between two rounds of updates.
         gamma: discount factor.
         n_steps: steps of a multi-step target (uncorrected).
         buffer_size: steps that the replay buffer keeps.
@@ -61,7 +61,7 @@ class QLearner(Learner):
     output_keys = ("action_value",)
 
     priority_alpha = priority_beta = 0.0
-    """How much more often surprising items are replayed, and how much of that the loss corrects."""
+    """How strongly priorities count, and how much of that the loss corrects; alpha = 0 is uniform replay."""
 
     def __init__(
         self,
@@ -98,13 +98,13 @@ class QLearner(Learner):
         self.multi_step = MultiStep(gamma, n_steps)
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
         self.prioritized = self.priority_alpha != 0
-        self.replay = make_replay(self.items_of(buffer_size), batch_size, self.priority_alpha, self.priority_beta)
+        self.replay = make_replay(self.num_items(buffer_size), batch_size, self.priority_alpha, self.priority_beta)
 
-    def items_of(self, num_steps: int) -> int:
-        """How many items of the replay buffer hold so many steps."""
+    def num_items(self, num_steps: int) -> int:
+        """Return how many items of the replay buffer hold so many steps."""
         return num_steps
 
-    def act_with(
+    def set_networks(
         self,
         greedy: TensorDictModuleBase,
         objective: LossModule,
@@ -112,14 +112,14 @@ class QLearner(Learner):
         learning_rate: float,
         *state: Any,
     ) -> None:
-        """Act with a network's best action, explored from, and learn its parameters.
+        """Set the network that acts and learns, its target network and the exploration.
 
         Args:
             greedy: writes the best ``action``.
-            objective: has the network and its target network.
-            action_spec: what exploration draws from.
+            objective: holds the network and its target network.
+            action_spec: the actions that exploration draws from.
             learning_rate: of Adam.
-            state: keys of the network's recurrent state, as it writes them.
+            state: keys under which the network writes its recurrent state.
         """
         self.exploration = EGreedyModule(action_spec, *self.eps_range, self.annealing_batches)
         self.policy = EpsilonGreedy(greedy, self.exploration, selected_out_keys=["action", *state])
@@ -127,48 +127,48 @@ class QLearner(Learner):
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
 
     def start_task(self, task: int | None = None) -> None:
-        """Explore anew; forget the old task's experience if so configured."""
+        """Reset exploration; clear the replay buffer if so configured."""
         self.exploration.eps.copy_(self.exploration.eps_init)
         if self.replay_on_task_change == "clear":
             self.replay.empty()
 
     def weights_changed(self) -> None:
-        """The target network is the same again."""
+        """Copy the weights to the target network."""
         self.target_update.counter = self.target_update.value_network_update_interval
         self.target_update.step()
 
     def values(self, data: Data) -> Tensor:
-        """The network's action values, [..., num_actions]."""
+        """Compute the network's action values, [..., num_actions]."""
         raise NotImplementedError
 
     def outputs(self, data: Data) -> dict[str, Tensor]:
-        """The action values, and what their softmax takes for log-probabilities; see `Learner`."""
+        """Compute the action values, and the log-probabilities of their softmax; see `Learner`."""
         values = self.values(data)
         return {"log_probs": values.log_softmax(dim=-1), "action_value": values}
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """What the replay buffer stores of a batch with multi-step rewards, [items]."""
+        """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""
         raise NotImplementedError
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch, take gradient steps on replayed items, explore less; returns mean measurements."""
+        """Store a batch, take gradient steps on replayed items, and anneal exploration; return mean measurements."""
         self.replay.extend(self.experience(self.multi_step(batch)))
         steps = [self._update() for _ in range(self.num_updates)]
         self.exploration.step()
-        return {**self.measured(steps), "exploration": self.exploration.eps.item()}
+        return {**self.mean_measurements(steps), "exploration": self.exploration.eps.item()}
 
     def _update(self) -> dict[str, Tensor]:
         index, items = self._sample()
         measured = self.gradient_step(items)
         squared = measured.pop("td_error", None)
         if self.prioritized and squared is not None:
-            self.measured([measured])  # before a priority is not a number
+            self.mean_measurements([measured])  # raises before a priority becomes NaN
             self.replay.update_priority(index, squared.cpu().sqrt())
         self.target_update.step()
         return measured
 
     def _sample(self) -> tuple[Tensor, dict[Any, Tensor]]:
-        """Numbers of replayed items and the items: what ``replay.sample()`` gives, in plain tensors."""
+        """Return indices of replayed items and the items, as ``replay.sample()`` does, in plain tensors."""
         storage, device = self.replay.storage, next(self.parameters()).device
         index, more = self.replay.sampler.sample(storage, self.minibatch_size)
         stored = storage._storage.items(True, True)
@@ -176,21 +176,21 @@ class QLearner(Learner):
         return index, {**items, **{key: value.to(device) for key, value in more.items()}}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The optimiser's state, the replay buffer and the gradient steps since the last copy to the target network."""
+        """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""
         replay = self.replay.state_dict()
         for items in replay["_storage"]["_storage"].values():
-            if isinstance(items, Tensor):  # places without an item hold anything; equal agents have equal states
+            if isinstance(items, Tensor):  # unused places hold anything; equal agents have equal states
                 items[replay["_storage"]["_len"] :] = 0
         return {**super().get_extra_state(), "replay": replay, "target_age": self.target_update.counter}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
+        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])
         self.target_update.counter = state["target_age"]
 
 
 def make_replay(num_items: int, batch_size: int, alpha: float, beta: float) -> TensorDictReplayBuffer:
-    """A replay buffer, prioritized where ``alpha`` is not 0."""
+    """Return a replay buffer, prioritized if ``alpha`` is not 0."""
     sampler = PrioritySampler(num_items, alpha, beta) if alpha else RandomSampler()
     return TensorDictReplayBuffer(storage=LazyTensorStorage(num_items), sampler=sampler, batch_size=batch_size)

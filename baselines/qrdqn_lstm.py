@@ -34,7 +34,7 @@ class QRDQNLSTM(RecurrentQ):
         super().__init__(observation_spec, action_spec, **settings)
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """The quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""
+        """Compute the quantile Huber loss, eq. (10) of the paper with kappa = 1, summed over predicted quantiles."""
         predicted, target = torch.broadcast_tensors(predicted.unsqueeze(-1), target.unsqueeze(-2))
         fractions = (torch.arange(predicted.shape[-2], device=predicted.device) + 0.5) / predicted.shape[-2]
         weight = (fractions.unsqueeze(-1) - (target < predicted).float()).abs()

@@ -1,7 +1,7 @@
-"""What recurrent Q-learners share: an LSTM, replayed sequences with the state they began with, and double targets.
+"""The base class of recurrent Q-learning agents: an LSTM, replayed sequences with stored states, double targets.
 
 Sequences are the rows of the batches as they were collected, with the stored state of the LSTM at their first step
-(Kapturowski et al. 2019, R2D2); the state starts anew where ``is_init`` is set. One more step is kept after the last
+(Kapturowski et al. 2019, R2D2); the state is reset where ``is_init`` is set. One more step is kept after the last
 one, to bootstrap from.
 """
 
@@ -23,7 +23,7 @@ from ctgraph_rl.checks import at_least_one, is_int, positive, require
 
 
 class Quantiles(nn.Module):
-    """A linear layer to K numbers per action, whose mean is the action's value.
+    """A linear layer with K outputs per action, whose mean is the action's value.
 
     Args:
         num_features: width of the input.
@@ -37,13 +37,13 @@ class Quantiles(nn.Module):
         self.linear = nn.Linear(num_features, num_actions * num_quantiles)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Float32 [..., num_features] to values [..., A] and quantiles [..., A, K]."""
+        """Map float32 [..., num_features] to values [..., A] and quantiles [..., A, K]."""
         quantiles = self.linear(features).unflatten(-1, self.shape)
         return quantiles.mean(dim=-1), quantiles
 
 
 class RecurrentTargets(LossModule):
-    """Predicted quantiles of the actions taken, and what they should be.
+    """Computes the predicted quantiles of the actions taken, and their targets.
 
     Args:
         network: reads sequences, writes ``quantiles`` [B, L, A, K].
@@ -58,7 +58,7 @@ class RecurrentTargets(LossModule):
         self.convert_to_functional(network, "value_network", create_target_params=True)
 
     def forward(self, batch: Data) -> tuple[Tensor, Tensor]:
-        """Both [B, L, K]; where ``learnt`` is False, they mean nothing.
+        """Compute both, [B, L, K]; where ``learnt`` is False, they mean nothing.
 
         The target is the multi-step reward plus the target network's quantiles of the action that the online network
         finds best at the step where the rewards end.
@@ -81,13 +81,13 @@ class RecurrentTargets(LossModule):
 
 
 def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
-    """The quantiles [B, L, K] of one action at every step, of [B, L, A, K] and [B, L]."""
+    """Select the quantiles [B, L, K] of one action at every step, from [B, L, A, K] and [B, L]."""
     index = action[..., None, None].expand(*action.shape, 1, quantiles.shape[-1])
     return quantiles.gather(-2, index).squeeze(-2)
 
 
 class RecurrentQ(QLearner):
-    """Q-learning with an LSTM; classes that derive from it say how far a prediction is from its target.
+    """Q-learning with an LSTM; classes that derive from it define the distance of predictions from targets.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
@@ -124,45 +124,45 @@ class RecurrentQ(QLearner):
         )
         self.targets = RecurrentTargets(self.greedy)
         state = (("next", key) for key in STATE_KEYS)
-        self.act_with(self.greedy, self.targets, action_spec, learning_rate, *state)
+        self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state)
 
     def values(self, data: Data) -> Tensor:
-        """The means of the online network's quantiles."""
+        """Compute the means of the online network's quantiles."""
         head = self.greedy.module[0].module[1]
         return head.module(self.trunk.over_time(data))[0]
 
-    def items_of(self, num_steps: int) -> int:
-        """A sequence is an item."""
+    def num_items(self, num_steps: int) -> int:
+        """Return the number of sequences."""
         return num_steps // self.num_steps
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Zeros for the LSTM's state."""
+        """Return zeros for the LSTM's state."""
         return zero_state(self.trunk, num_envs)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
-        """A sequence of ``num_steps + 1`` steps per row; ``learnt`` is False where there is nothing to learn.
+        """Return a sequence of ``num_steps + 1`` steps per row; ``learnt`` is False where there is nothing to learn.
 
-        That is at the step added for bootstrapping, at what fills up a shortened batch, and where an episode was
-        truncated, for what followed is not in the sequence.
+        That is at the step added for bootstrapping, at the padding of a shortened batch, and where an episode was
+        truncated, as the sequence does not hold what followed.
         """
         after = batch["next"]
         steps = batch.select("action", "gamma", "steps_to_next_obs", ("next", "reward"), ("next", "terminated"))
         steps["learnt"] = (~after["done"] | after["terminated"]).squeeze(-1)
         missing = self.num_steps - batch.shape[1]
-        return pad(self._seen(batch), [0, 0, 0, missing]).update(pad(steps, [0, 0, 0, missing + 1]))
+        return pad(self._inputs(batch), [0, 0, 0, missing]).update(pad(steps, [0, 0, 0, missing + 1]))
 
-    def _seen(self, batch: TensorDictBase) -> TensorDictBase:
-        """What the network reads at all steps and after the last one."""
+    def _inputs(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the network's inputs at all steps and after the last one."""
         keys = self.trunk.in_keys
         last = batch["next"][:, -1:].select(*keys)
         return torch.cat([batch.select(*keys), last], dim=1)
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """The loss of every step, [B, L], of quantiles [B, L, K]."""
+        """Compute the loss of every step, [B, L], from quantiles [B, L, K]."""
         raise NotImplementedError
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """The mean loss of the steps of sequences."""
+        """Compute the mean loss of the steps of sequences."""
         distance = self.distance(*self.targets(batch))
         learnt = batch["learnt"]
         return {"loss_value": (distance * learnt).sum() / learnt.sum().clamp(min=1)}

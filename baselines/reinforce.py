@@ -1,7 +1,7 @@
-"""REINFORCE: the policy's gradient from whole returns less a learned baseline; one gradient step a batch, no memory.
+"""REINFORCE: policy gradients of whole returns minus a learned baseline; one gradient step a batch, no memory.
 
-Williams 1992 (Machine Learning 8, 229-256). An episode that the end of a batch cuts
-counts with the baseline's value in place of what would have followed; there is no bonus for entropy.
+Williams 1992 (Machine Learning 8, 229-256). An episode that the end of a batch cuts off
+is bootstrapped with the baseline's value; there is no bonus for entropy.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ class Reinforce(PolicyGradient):
     solves = "what one observation tells: fully observable tasks (CT-FO)"
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
-        """Policy gradient and the baseline's error, as TorchRL's `ReinforceLoss` has them."""
-        _, taken, values = self.judged(batch)
+        """Compute the losses of policy and baseline, as TorchRL's `ReinforceLoss` does."""
+        _, taken, values = self.evaluate_actions(batch)
         return {
             "loss_actor": -(taken * batch["advantage"]).mean(),
             "loss_value": critic_loss(values, batch, 1.0),

@@ -1,8 +1,8 @@
-"""RL^2: an LSTM that reads its last action and reward and remembers over the episodes of a trial.
+"""RL^2: an LSTM that reads its last action and reward and keeps its state over the episodes of a trial.
 
 Duan et al. 2016 (arXiv 1611.02779) and Wang et al. 2016 (arXiv 1611.05763), trained by PPO. A trial is a number of
-episodes with one goal, such as a task with ``goal_change=(4, 4)`` and trials of 4; what is maximised is the return of
-the whole trial, so an early episode may be spent on search.
+episodes with one goal, such as a task with ``goal_change=(4, 4)`` and trials of 4. PPO maximises the return of the
+whole trial, so an early episode may be spent on search.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ GOAL = 3
 """The ``outcome`` of an episode that reached the goal."""
 
 OWN_KEYS = ("trial", "previous_action", "reward")
-"""Beside the LSTM's state: episodes of the trial so far, and what was done and paid in the step before."""
+"""The state beside the LSTM's: the number of the episode in its trial, and the last action and reward."""
 
 
 class TrialTrunk(TensorDictModuleBase):
-    """A recurrent trunk whose state starts anew with a trial, and which reads the last action and reward.
+    """A recurrent trunk whose state is reset at the start of a trial, and which reads the last action and reward.
 
     Args:
         trunk: a `recurrent` trunk that also reads ``previous``, [num_actions + 1].
@@ -47,28 +47,28 @@ class TrialTrunk(TensorDictModuleBase):
         return tensordict.update(self.act(tensordict))
 
     def act(self, data: Data) -> dict[Any, Tensor]:
-        """What the trunk makes of one step of all rows: ``memory`` and the next state."""
-        given, episode = self._given(data)
-        return {**self.trunk.act(given), ("next", "trial"): torch.where(given["is_init"], 1, episode)}
+        """Compute ``memory`` and the next state for one step of all rows."""
+        inputs, episode = self._inputs(data)
+        return {**self.trunk.act(inputs), ("next", "trial"): torch.where(inputs["is_init"], 1, episode)}
 
     def over_time(self, data: Data) -> Tensor:
-        """``memory`` at all steps of sequences [rows, steps]."""
-        return self.trunk.over_time(self._given(data)[0])
+        """Compute ``memory`` at all steps of sequences [rows, steps]."""
+        return self.trunk.over_time(self._inputs(data)[0])
 
-    def _given(self, data: Data) -> tuple[dict[str, Tensor], Tensor]:
-        """What the inner trunk reads, and the number of the episode in its trial, from 1."""
+    def _inputs(self, data: Data) -> tuple[dict[str, Tensor], Tensor]:
+        """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
-        given = {key: data[key] for key in self.trunk.in_keys if key != "previous"}
+        inputs = {key: data[key] for key in self.trunk.in_keys if key != "previous"}
         for key in STATE_KEYS:
-            given[key] = torch.where(fresh.unsqueeze(-1), 0.0, given[key])
+            inputs[key] = torch.where(fresh.unsqueeze(-1), 0.0, inputs[key])
         action = one_hot(data["previous_action"], self.num_actions)
         previous = torch.cat([action, data["reward"]], dim=-1)
-        return given | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode
+        return inputs | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode
 
 
 class RL2(PPO):
-    """PPO over trials of several episodes, through which the memory lasts.
+    """PPO over trials of several episodes, over which the LSTM keeps its state.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
@@ -93,16 +93,16 @@ class RL2(PPO):
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
     ) -> TrialTrunk:
-        """A recurrent trunk that also reads the last action and reward."""
+        """Build a recurrent trunk that also reads the last action and reward."""
         num_actions = action_spec.space.n
         trunk = recurrent(observation_spec, hidden_size, num_layers, previous=num_actions + 1)
         return TrialTrunk(trunk, num_actions, self.trial_episodes)
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """No episode yet, nothing remembered.
+        """Return the state before the first trial: zeros.
 
-        The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step: when
-        it starts anew is decided here.
+        The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step; the
+        trunk resets it.
         """
         state = zero_state(self.trunk.trunk, num_envs)
         device = state[STATE_KEYS[0]].device
@@ -111,9 +111,9 @@ class RL2(PPO):
         return state.set("reward", torch.zeros(num_envs, 1, device=device))
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Some epochs over a batch; returns mean losses and the success rate of the trials' first and last episodes.
+        """Learn from a batch; return mean losses and the success rates of the first and last episodes of trials.
 
-        The last step of a batch only tells the value of what followed, so one step alone teaches nothing.
+        The last step of a batch only provides the value to bootstrap from, so nothing is learned from one step alone.
         """
         losses = super().learn(batch) if batch.shape[1] > 1 else {}
         ends = batch["next"][batch["next", "done"].squeeze(-1)]
@@ -125,26 +125,26 @@ class RL2(PPO):
         return losses
 
     def num_learnt(self, batch: TensorDictBase) -> int:
-        """All frames but each row's last."""
+        """Return the number of frames without each row's last."""
         return batch[:, :-1].numel()
 
     @torch.no_grad()
     def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """All steps but the last; only the end of a trial ends the return."""
+        """Return all steps but the last; only the end of a trial ends the return."""
         after = batch["next"]
         ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]
-        return self._estimated(batch[:, :-1], batch["state_value"][:, 1:], ends, ends)
+        return self._with_estimates(batch[:, :-1], batch["state_value"][:, 1:], ends, ends)
 
 
 def episodes_to_goal(ends: TensorDictBase, trial_episodes: int) -> Tensor:
-    """The number of the episode that first reached the goal in each trial, to compare with E[kappa] of the graph.
+    """Return the first episode of each trial that reached the goal, to compare with E[kappa] of the graph.
 
     Args:
-        ends: what `ctgraph_rl.evaluate` returns with ``episodes_per_row=trial_episodes``.
+        ends: the result of `ctgraph_rl.evaluate` with ``episodes_per_row=trial_episodes``.
         trial_episodes: episodes of a trial.
 
     Returns:
-        float64 [tasks, trials]; NaN where a trial did not reach it.
+        The numbers of episodes, float64 [tasks, trials]; NaN where a trial did not reach it.
     """
     found = (ends["outcome"].squeeze(-1) == GOAL).unflatten(-1, (-1, trial_episodes))
     first = 1 + found.int().argmax(dim=-1).double()

@@ -53,6 +53,24 @@ def fraction(**values: object) -> list[tuple[bool, str]]:
     return [(is_real(value, 0, 1), f"{name} must be in [0, 1], got {value!r}") for name, value in values.items()]
 
 
+def not_negative(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is a number >= 0."""
+    return [(is_real(value, 0), f"{name} must be a number >= 0, got {value!r}") for name, value in values.items()]
+
+
+def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is one of the choices."""
+    return [
+        (value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        for name, value in values.items()
+    ]
+
+
+def true_or_false(**values: object) -> list[tuple[bool, str]]:
+    """Rules that each named value is a bool."""
+    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in values.items()]
+
+
 def as_tuple(value: object) -> object:
     """A list-like value as a tuple (yaml has only lists); anything else unchanged."""
     if isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict, set, frozenset)):

@@ -1,4 +1,4 @@
-"""CLEAR: replay of a fair sample of all that was ever seen, where policy and values are to stay as they were.
+"""CLEAR: replay from a reservoir of all earlier steps, at which policy and values are cloned.
 
 Rolnick et al. 2019 (NeurIPS, arXiv 1811.11682), the cloning losses of section 3.2.
 """
@@ -7,31 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from baselines.learner import Learner
 from baselines.methods.method import Method
 from baselines.methods.weights import Weights
 from baselines.networks import Data
-from baselines.policy_gradient import loss_weight
-from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.checks import at_least_one, not_negative, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import require_memory
 
-if TYPE_CHECKING:
-    from baselines.learner import Learner
-
 
 class Reservoir:
-    """A sample of all items that were ever offered, each of which is in it with the same chance.
+    """A uniform random sample of all items that were ever offered.
 
-    Vitter 1985, Algorithm R: item number n takes a random one of n places, if there are so many.
+    Vitter 1985, Algorithm R: item number n takes a random one of n places, if the reservoir has that place.
 
     Args:
-        capacity: items at most.
+        capacity: the largest number of items.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -42,7 +39,7 @@ class Reservoir:
         return min(self.offered, self.capacity)
 
     def offer(self, items: Mapping[Any, Tensor]) -> None:
-        """Take items in, [n, ...] each, where chance gives them a place; the later of two has it."""
+        """Put items, [n, ...] each, at the random places that the reservoir has; later ones replace earlier ones."""
         if not self.items:
             self.items = {key: value.new_zeros(self.capacity, *value.shape[1:]) for key, value in items.items()}
         number = next(iter(items.values())).shape[0]
@@ -57,41 +54,42 @@ class Reservoir:
         self.offered += number
 
     def sample(self, number: int) -> dict[Any, Tensor]:
-        """So many items, with repetition."""
+        """Draw items with replacement."""
         places = torch.randint(len(self), [number])
         return {key: value.index_select(0, places.to(value.device)) for key, value in self.items.items()}
 
 
 class CLEAR(Method):
-    """Adds what is lost by leaving earlier behaviour, on as many replayed steps as there are fresh ones in a minibatch.
+    """Adds cloning losses for earlier behaviour, on as many replayed steps as a minibatch has new ones.
 
-    L = policy_coeff KL(mu || pi) + value_coeff |V_mu - V|^2, where mu and V_mu are what the network said when the step
-    was made; for a Q-learner value_coeff |Q_mu - Q|^2, the mean over actions. The agent's own losses are on its own
+    L = policy_coeff KL(mu || pi) + value_coeff |V_mu - V|^2, where mu and V_mu are the network's outputs when the step
+    was taken; for a Q-learner value_coeff |Q_mu - Q|^2, the mean over actions. The agent's own losses are on its own
     data: the paper's off-policy policy gradient (V-trace) on replayed steps is left out. It needs no task ids and no
     boundaries.
 
-    Stored are ``buffer_size`` steps, each with what the network reads and says, whatever the number of tasks; with
-    memory whole rows of a batch, of which those are left out that the end of a block has shortened.
+    Stored are ``buffer_size`` steps, each with the network's inputs and outputs, whatever the number of tasks; with
+    memory whole rows of a batch, without those that the end of a block has shortened.
 
     Args:
-        buffer_size: steps.
-        policy_coeff: weight of the policy's cloning.
-        value_coeff: weight of the values' cloning.
+        buffer_size: number of steps that are stored.
+        policy_coeff: weight of the policy's cloning loss.
+        value_coeff: weight of the values' cloning loss.
     """
 
     needs_boundaries = False
+    agent_members = (*Method.agent_members, "memory", "outputs", "output_keys")
 
     def __init__(self, buffer_size: int, policy_coeff: float, value_coeff: float) -> None:
         super().__init__()
         require(
             *at_least_one(buffer_size=buffer_size),
-            *loss_weight(policy_coeff=policy_coeff, value_coeff=value_coeff),
+            *not_negative(policy_coeff=policy_coeff, value_coeff=value_coeff),
         )
         self.buffer_size, self.policy_coeff, self.value_coeff = buffer_size, policy_coeff, value_coeff
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
+        super().setup(agent, weights, curriculum)
         steps = agent.num_steps if agent.memory else 1
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
         require((self.buffer_size >= steps, message))
@@ -101,25 +99,25 @@ class CLEAR(Method):
         self.reservoir = Reservoir(self.buffer_size // steps)
 
     @torch.no_grad()
-    def see(self, batch: TensorDictBase) -> None:
+    def on_batch(self, batch: TensorDictBase) -> None:
         """Offer the steps, or with memory the rows, of a batch to the reservoir."""
         agent = self.agent
         if agent.memory and batch.shape[1] != agent.num_steps:
             return
-        seen = {key: batch[key] for key in agent.policy.in_keys if key in batch.keys()}  # noqa: SIM118, rows otherwise
-        said = agent.outputs(seen)
-        items = {**seen, **{key: said[key] for key in agent.output_keys}}
+        inputs = {key: batch[key] for key in agent.policy.in_keys if key in batch.keys()}  # noqa: SIM118, rows otherwise
+        outputs = agent.outputs(inputs)
+        items = {**inputs, **{key: outputs[key] for key in agent.output_keys}}
         self.reservoir.offer(items if agent.memory else {key: value.flatten(0, 1) for key, value in items.items()})
 
-    def mixed(self, batch: Data) -> Data:
-        """The minibatch with as many replayed items, if there are any yet."""
+    def transform_minibatch(self, batch: Data) -> Data:
+        """Add as many replayed items to the minibatch, if there are any yet."""
         if not len(self.reservoir):
             return batch
         replayed = self.reservoir.sample(len(batch["action"]))
         return {**batch, **{("replay", key): value for key, value in replayed.items()}}
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
-        """What is lost by leaving earlier behaviour."""
+    def penalties(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the cloning losses."""
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
         if not replayed:
             return {}
@@ -134,12 +132,12 @@ class CLEAR(Method):
         return losses
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What is in the reservoir."""
+        """Return the contents of the reservoir."""
         items = {key: value[: len(self.reservoir)].clone() for key, value in self.reservoir.items.items()}
         return {"offered": self.reservoir.offered, "items": items}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
+        """Restore what `get_extra_state` returned."""
         self.reservoir = Reservoir(self.reservoir.capacity)
         self.reservoir.offered = state["offered"]
         for key, value in state["items"].items():

@@ -1,4 +1,4 @@
-"""EWC: elastic weight consolidation, by the diagonal of the Fisher information.
+"""EWC: elastic weight consolidation with the diagonal of the Fisher information.
 
 Kirkpatrick et al. 2017 (PNAS, arXiv 1612.00796), eq. (3); online as Schwarz et al. 2018 (arXiv 1805.06370).
 """
@@ -11,16 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.compiled import total
-from baselines.learner import one_of, true_or_false
-from baselines.methods.importance import SampledImportance, num_learnt, of_learnt
+from baselines.learner import total_loss
+from baselines.methods.importance import SampledImportance, learnt_steps, num_learnt
 from baselines.methods.weights import flat
 from baselines.networks import Data
-from ctgraph_rl.checks import fraction, require
+from ctgraph_rl.checks import fraction, one_of, require, true_or_false
 
 
 class EWC(SampledImportance):
-    """Adds lambda/2 * sum_i F_i (w_i - a_i)^2 for what was learned; F is the diagonal of the Fisher information.
+    """Adds lambda/2 * sum_i F_i (w_i - a_i)^2 for earlier tasks; F is the diagonal of the Fisher information.
 
     Separate: one such term for each earlier task k, with its own F_k and weights a_k. As a sum of squares is a square,
     they are kept exactly as one: F = sum_k F_k, a = sum_k F_k a_k / F. Online: F is the running mean
@@ -43,13 +42,15 @@ class EWC(SampledImportance):
         super().__init__(coeff=coeff, **settings)
         self.online, self.alpha, self.fisher = online, alpha, fisher
         self.coeff = coeff / 2
+        if fisher == "policy":
+            self.agent_members += ("outputs",)
 
     def task_importance(self) -> Tensor:
-        """The diagonal of the Fisher information."""
+        """Return the diagonal of the Fisher information."""
         return self.mean(self._of_policy) if self.fisher == "policy" else self._of_losses()
 
-    def remember(self, new: Tensor, weights: Tensor) -> None:
-        """Online: a running mean; separate: the sum of all tasks' terms."""
+    def consolidate(self, new: Tensor, weights: Tensor) -> None:
+        """Update the running mean, or add the task's term to those of earlier tasks."""
         if not self.online:
             total = self.importance + new
             moved = torch.where(total > 0, (self.importance * self.anchor + new * weights) / total, weights)
@@ -60,14 +61,14 @@ class EWC(SampledImportance):
         self.anchor.copy_(weights)
 
     def _of_policy(self, item: Data) -> Iterator[Tensor]:
-        for of_step in of_learnt(self.agent.outputs(item)["log_probs"], item):
-            for log_prob in of_step:
+        for step in learnt_steps(self.agent.outputs(item)["log_probs"], item):
+            for log_prob in step:
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 
     def _of_losses(self) -> Tensor:
         squares = torch.zeros_like(self.importance)
         for minibatch in self.samples.minibatches:
-            loss = total(self.agent.loss(minibatch))
+            loss = total_loss(self.agent.loss(minibatch))
             gradients = torch.autograd.grad(loss, self.weights.parameters, materialize_grads=True)
             squares += flat(gradients).square() / max(num_learnt(minibatch), 1)
         return squares

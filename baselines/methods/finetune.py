@@ -8,10 +8,10 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Finetune(Method):
-    """The agent as it is goes from task to task. Nothing is stored; it goes with any agent."""
+    """The agent learns one task after the other as it is. Nothing is stored, and any agent will do."""
 
     needs_boundaries = False
 
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """The agent itself."""
+        """Return the agent itself."""
         return agent

@@ -1,64 +1,62 @@
-"""Output layers of each task's own on a trunk that all tasks share."""
+"""Multi-head networks: output layers for each task on a trunk that all tasks share."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from baselines.learner import Learner
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-if TYPE_CHECKING:
-    from baselines.learner import Learner
-
 
 class Heads(TaskMethod):
-    """Each task has its own last linear layers of policy and critic; a new task's are those the agent began with.
+    """Each task has its own last linear layers of policy and critic; a new task starts with those of the new agent.
 
     Stored are their weights, 4 H bytes for each of the curriculum's tasks.
     """
 
+    agent_members = (*TaskMethod.agent_members, "clear_optimiser_state")
+
     kept: Tensor  # float32 [tasks, H]
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
-        self.inside = weights.in_heads
+        super().setup(agent, weights, curriculum)
+        self.in_heads = weights.in_heads
         message = f"{type(agent).__name__} has no output layers behind a trunk, so tasks cannot have their own"
-        require((bool(self.inside.any()), f"{message}: take a method that shares them, as some do with heads=single"))
-        self.register_buffer("kept", weights.vector().detach()[self.inside].repeat(self.num_tasks, 1))
+        require((bool(self.in_heads.any()), f"{message}: take a method that shares them, as some do with heads=single"))
+        self.register_buffer("kept", weights.vector().detach()[self.in_heads].repeat(self.num_tasks, 1))
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Go over to a task's output layers; the optimiser forgets what it knew of the former ones."""
+        """Load the task's output layers, and clear the optimiser's state of them."""
         super().start_task(task)
-        inside = self.inside.to(self.kept.device)
+        in_heads = self.in_heads.to(self.kept.device)
         weights = self.weights.vector()
-        weights[inside] = self.kept[self.place]
+        weights[in_heads] = self.kept[self.slot]
         self.weights.write(weights)
-        self.agent.forget(self.weights.in_head_parameters)
+        self.agent.clear_optimiser_state(self.weights.in_head_parameters)
         self.agent.weights_changed()
 
     @torch.no_grad()
     def end_task(self) -> None:
-        """Keep the task's."""
-        self.kept[self.place] = self.weights.vector()[self.inside.to(self.kept.device)]
+        """Store the task's output layers."""
+        self.kept[self.slot] = self.weights.vector()[self.in_heads.to(self.kept.device)]
 
-    def place_of(self, task: int) -> int:
-        """Where a task's output layers are; one that has not begun has those the agent began with, if there is room."""
-        unseen = task not in self.begun and len(self.begun) < self.num_tasks
-        return len(self.begun) if unseen else super().place_of(task)
+    def slot_of(self, task: int) -> int:
+        """Return the slot of a task's output layers; before it starts, a free one, which has those of the new agent."""
+        unseen = task not in self.started and len(self.started) < self.num_tasks
+        return len(self.started) if unseen else super().slot_of(task)
 
     @torch.no_grad()
-    def weights_of(self, task: int) -> Tensor | None:
-        """The present weights with a task's output layers."""
-        place = self.place_of(task)
-        if not self.begun or place == self.place:
+    def task_weights(self, task: int) -> Tensor | None:
+        """Return the present weights with the task's output layers."""
+        slot = self.slot_of(task)
+        if not self.started or slot == self.slot:
             return None
         weights = self.weights.vector()
-        weights[self.inside.to(weights.device)] = self.kept[place]
+        weights[self.in_heads.to(weights.device)] = self.kept[slot]
         return weights

@@ -1,4 +1,4 @@
-"""What methods share that hold the weights near those of earlier tasks, each as firmly as it was important."""
+"""The base classes of methods that hold weights near those of earlier tasks, in proportion to their importance."""
 
 from __future__ import annotations
 
@@ -6,38 +6,35 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.learner import one_of
+from baselines.learner import Learner
 from baselines.methods.heads import Heads
-from baselines.methods.method import Method, blocks_of_several
+from baselines.methods.method import Method, multi_task_blocks
 from baselines.methods.weights import Weights, flat
 from baselines.networks import Data
-from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.checks import at_least_one, one_of, positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-if TYPE_CHECKING:
-    from baselines.learner import Learner
 
 
 class Importance(Method):
-    """Adds coeff * sum_i I_i (w_i - a_i)^2 to the losses: I is how important weights were, a where they were.
+    """Adds coeff * sum_i I_i (w_i - a_i)^2 to the losses: I are importances, a the weights of earlier tasks.
 
-    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; where each task has
-    output layers of its own also those, see `Heads`.
+    Stored are I, a and which weights are held, 12 P bytes in all, whatever the number of tasks; and in a multi-head
+    network the output layers, see `Heads`.
 
     Args:
-        coeff: weight of what is added.
+        coeff: weight of the penalty.
         heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
-            own, which are not held; ``auto``: multi where the curriculum tells task ids and each block has one task,
+            own, which are not held; ``auto``: multi where the protocol tells task ids and each block has one task,
             else single.
     """
 
-    without_ids = ", or method.heads=single"
+    hidden_ids_hint = ", or method.heads=single"
 
     importance: Tensor  # float32 [P]
     anchor: Tensor  # float32 [P]
@@ -46,98 +43,100 @@ class Importance(Method):
     def __init__(self, coeff: float, heads: str) -> None:
         super().__init__()
         require(*positive(coeff=coeff), *one_of(("auto", "single", "multi"), heads=heads))
-        self.coeff, self.wanted = coeff, heads
+        self.coeff, self.heads_setting = coeff, heads
         self.needs_task_id = heads == "multi"
         self.heads: Heads | None = None
+        if heads != "single":
+            self.agent_members = tuple(dict.fromkeys((*self.agent_members, *Heads.agent_members)))
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
+        super().setup(agent, weights, curriculum)
         self.register_buffer("importance", torch.zeros(len(weights)))
         self.register_buffer("anchor", torch.zeros(len(weights)))
-        told = curriculum.protocol.task_id != "hidden" and not blocks_of_several(curriculum)
-        if self.wanted == "multi" or (self.wanted == "auto" and told):
+        ids = curriculum.protocol.task_id != "hidden" and not multi_task_blocks(curriculum)
+        if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
-            self.heads.put_on(agent, weights, curriculum)
+            self.heads.setup(agent, weights, curriculum)
         self.register_buffer("held", torch.ones(len(weights)) if self.heads is None else 1.0 - weights.in_heads.float())
 
     def start_task(self, task: int | None) -> None:
-        """Go to the task's output layers."""
+        """Load the task's output layers."""
         if self.heads is not None:
             self.heads.start_task(task)
 
     @torch.no_grad()
     def end_task(self) -> None:
-        """Weigh up what the task needs."""
+        """Compute the importances for the task, and consolidate them."""
         with torch.enable_grad():
             new = self.task_importance()
-        self.remember(new * self.held, self.weights.vector())
+        self.consolidate(new * self.held, self.weights.vector())
         if self.heads is not None:
             self.heads.end_task()
 
     def task_importance(self) -> Tensor:
-        """How important the weights are for the task that ends, float32 [P], each >= 0."""
+        """Compute how important the weights are for the task that ends, float32 [P], each >= 0."""
         raise NotImplementedError
 
-    def remember(self, new: Tensor, weights: Tensor) -> None:
-        """Sum importances up, and hold the weights where they are now."""
+    def consolidate(self, new: Tensor, weights: Tensor) -> None:
+        """Add new importances, and hold the weights near their present values."""
         self.importance += new
         self.anchor.copy_(weights)
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
-        """What is lost by moving away."""
+    def penalties(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the penalty for distance."""
         gap = self.weights.vector() - self.anchor
         return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
 
-    def weights_of(self, task: int) -> Tensor | None:
-        """The present weights with the task's own output layers."""
-        return None if self.heads is None else self.heads.weights_of(task)
+    def task_weights(self, task: int) -> Tensor | None:
+        """Return the present weights with the task's own output layers."""
+        return None if self.heads is None else self.heads.task_weights(task)
 
 
 def num_learnt(data: Data) -> int:
-    """Frames that are learned from; sequences of recurrent Q-learners have others, too."""
+    """Return how many frames are learned from; sequences of recurrent Q-learners have others, too."""
     return data["action"].numel() if "learnt" not in data else int(data["learnt"].sum())
 
 
-def of_learnt(outputs: Tensor, data: Data) -> Tensor:
-    """The outputs of the steps that are learned from, [steps, n], of those of all, [..., n]."""
+def learnt_steps(outputs: Tensor, data: Data) -> Tensor:
+    """Select the outputs of the steps that are learned from, [steps, n], from those of all, [..., n]."""
     return outputs.flatten(0, -2) if "learnt" not in data else outputs[data["learnt"]]
 
 
 class Samples:
-    """The last minibatches that were learned from, of at least so many frames in all; each batch's first pass alone.
+    """The last minibatches that were learned from, of the first pass over each batch only.
 
     Args:
-        num_frames: frames.
+        num_frames: the least number of frames that they have in all.
     """
 
     def __init__(self, num_frames: int) -> None:
         require(*at_least_one(num_samples=num_frames))
-        self.num_frames, self.held = num_frames, 0
-        self.due = math.inf
-        """Frames of the present batch that are still to be taken."""
+        self.num_frames, self.num_held = num_frames, 0
+        self.remaining = math.inf
+        """Frames of the present batch's first pass that are still to come."""
 
         self.minibatches: deque[dict[Any, Tensor]] = deque()
 
     def add(self, minibatch: Data) -> None:
-        """Take a minibatch in, and drop those that are not needed any more."""
+        """Add a minibatch of the first pass, and drop those that are no longer needed."""
         size = num_learnt(minibatch)
-        if self.due <= 0:
+        if self.remaining <= 0:
             return
-        self.due -= size
-        self.held += size
+        self.remaining -= size
+        self.num_held += size
         self.minibatches.append({key: value.clone() for key, value in minibatch.items()})  # not a whole pass
-        while self.held - (first := num_learnt(self.minibatches[0])) >= self.num_frames:
+        while self.num_held - (first := num_learnt(self.minibatches[0])) >= self.num_frames:
             self.minibatches.popleft()
-            self.held -= first
+            self.num_held -= first
 
     def clear(self) -> None:
-        """Drop all."""
+        """Drop all minibatches."""
         self.minibatches.clear()
-        self.held = 0
+        self.num_held = 0
 
     def items(self) -> Iterator[dict[Any, Tensor]]:
-        """The items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
+        """Yield the items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
         frames = 0
         for minibatch in reversed(self.minibatches):
             for number in range(len(minibatch["action"])):
@@ -148,55 +147,57 @@ class Samples:
                 yield item
 
     def state(self) -> dict[str, Any]:
-        """Plain values for a state dict."""
+        """Return plain values for a state dict."""
         alike = groupby(self.minibatches, lambda minibatch: minibatch["action"].shape[1:])  # steps of a sequence
         return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
     def restore(self, state: Mapping[str, Any], device: torch.device) -> None:
-        """Go back to what `state` gave."""
+        """Restore what `state` returned."""
         self.clear()
-        for part in state.get("parts", [state]):  # one alone, as once saved
+        for part in state.get("parts", [state]):  # a single one, as earlier versions saved it
             split = {key: value.to(device).split(part["sizes"]) for key, value in part["items"].items()}
             self.minibatches += [dict(zip(split, values, strict=True)) for values in zip(*split.values(), strict=True)]
-        self.held = sum(map(num_learnt, self.minibatches))
+        self.num_held = sum(map(num_learnt, self.minibatches))
 
 
 def _joined(minibatches: Sequence[dict[Any, Tensor]]) -> dict[str, Any]:
-    """Minibatches of items of one shape as one, with their sizes."""
+    """Concatenate minibatches of items of one shape, and return them with their sizes."""
     items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
     return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
 
 
 class SampledImportance(Importance):
-    """`Importance` that is a mean over what was learned from last.
+    """`Importance` that is a mean over the frames that were learned from last.
 
-    Until a task ends, the last of its minibatches are stored, too, of at least ``num_samples`` frames in all.
+    Until a task ends, the last of its minibatches are stored, too, with at least ``num_samples`` frames in all.
 
     Args:
-        num_samples: frames.
+        num_samples: number of these frames.
         settings: the arguments of `Importance`.
     """
+
+    agent_members = (*Importance.agent_members, "num_learnt")
 
     def __init__(self, num_samples: int, **settings: Any) -> None:
         super().__init__(**settings)
         self.samples = Samples(num_samples)
 
-    def see(self, batch: TensorDictBase) -> None:
-        """So many frames are to be kept."""
-        self.samples.due = self.agent.num_learnt(batch)
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Set how many frames the first pass has."""
+        self.samples.remaining = self.agent.num_learnt(batch)
 
-    def mixed(self, batch: Data) -> Data:
-        """The minibatch itself, which is kept for the end of the task."""
+    def transform_minibatch(self, batch: Data) -> Data:
+        """Return the same minibatch, and keep it for the end of the task."""
         self.samples.add(batch)
         return batch
 
     def end_task(self) -> None:
-        """Weigh up what the task needs; a later task's is a matter of its own samples."""
+        """Compute the importances for the task, and drop its samples."""
         super().end_task()
         self.samples.clear()
 
     def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
-        """The sum of the terms of every sample, [P] each, over the number of frames."""
+        """Return the sum of the terms of all samples, [P] each, divided by the number of frames."""
         total, frames = torch.zeros_like(self.importance), 0
         for item in self.samples.items():
             for term in terms(item):
@@ -205,13 +206,13 @@ class SampledImportance(Importance):
         return total / max(frames, 1)
 
     def gradient(self, value: Tensor) -> Tensor:
-        """The gradient of a number by the weights, [P]; the number's graph is kept."""
+        """Compute the gradient of a scalar by the weights, [P]; its graph is retained."""
         return flat(torch.autograd.grad(value, self.weights.parameters, retain_graph=True, materialize_grads=True))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The samples."""
+        """Return the samples."""
         return {"samples": self.samples.state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
+        """Restore what `get_extra_state` returned."""
         self.samples.restore(state["samples"], self.weights.device)

@@ -1,4 +1,4 @@
-"""L2: all weights are held near where they were at the end of the last task.
+"""L2: all weights are held near their values at the end of the last task.
 
 The simplest baseline of Kirkpatrick et al. 2017 (arXiv 1612.00796), where EWC was compared with it.
 """
@@ -18,10 +18,10 @@ class L2(Importance):
     """
 
     def task_importance(self) -> Tensor:
-        """1 for all weights."""
+        """Return 1 for all weights."""
         return torch.ones_like(self.importance)
 
-    def remember(self, new: Tensor, weights: Tensor) -> None:
-        """All are equally important after any number of tasks."""
+    def consolidate(self, new: Tensor, weights: Tensor) -> None:
+        """Keep all weights equally important after any number of tasks."""
         self.importance.copy_(new)
         self.anchor.copy_(weights)

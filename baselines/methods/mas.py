@@ -1,4 +1,4 @@
-"""MAS: memory aware synapses, important is what the network's outputs are sensitive to.
+"""MAS: memory aware synapses; weights are important if the network's outputs are sensitive to them.
 
 Aljundi et al. 2018 (ECCV, arXiv 1711.09601), eqs. (2) to (4).
 """
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from baselines.methods.importance import SampledImportance, of_learnt
+from baselines.methods.importance import SampledImportance, learnt_steps
 from baselines.networks import Data
 
 
@@ -21,12 +21,14 @@ class MAS(SampledImportance):
     the last task. The arguments are those of `SampledImportance`.
     """
 
+    agent_members = (*SampledImportance.agent_members, "outputs", "output_keys")
+
     def task_importance(self) -> Tensor:
-        """The mean sensitivity of the squared length of the outputs."""
+        """Return the mean sensitivity of the squared norm of the outputs."""
         return self.mean(self._sensitivity)
 
     def _sensitivity(self, item: Data) -> Iterator[Tensor]:
         outputs = self.agent.outputs(item)
-        shown = torch.cat([outputs[key] for key in self.agent.output_keys], dim=-1)
-        for of_step in of_learnt(shown, item):
-            yield self.gradient(of_step.square().sum()).abs()
+        joined = torch.cat([outputs[key] for key in self.agent.output_keys], dim=-1)
+        for step in learnt_steps(joined, item):
+            yield self.gradient(step.square().sum()).abs()

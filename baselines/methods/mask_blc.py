@@ -1,4 +1,4 @@
-"""Mask BLC: as Mask LC, but half of each new task's mask begins as its own.
+"""Mask BLC: as Mask LC, but the new scores have an initial share of one half.
 
 Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_BLC.
 """
@@ -12,9 +12,9 @@ from baselines.methods.masks import CombinedMasks
 
 
 class MaskBLC(CombinedMasks):
-    """`CombinedMasks` that begins with a share of 0.5 for the new scores, and the rest equally for the earlier ones."""
+    """`CombinedMasks` with an initial share of 0.5 for the new scores, and equal ones for the earlier tasks."""
 
-    def new_betas(self, num_earlier: int) -> Tensor:
-        """Logarithms of the shares."""
+    def initial_betas(self, num_earlier: int) -> Tensor:
+        """Return the logarithms of the shares."""
         shares = [0.5 / max(num_earlier, 1)] * num_earlier + [0.5]
         return torch.tensor(shares).log()

@@ -12,8 +12,8 @@ from baselines.methods.masks import CombinedMasks
 
 
 class MaskLC(CombinedMasks):
-    """`CombinedMasks` that begins with equal shares: 1 / k in the k-th task."""
+    """`CombinedMasks` with equal initial shares: 1 / k in the k-th task."""
 
-    def new_betas(self, num_earlier: int) -> Tensor:
-        """Equal numbers."""
+    def initial_betas(self, num_earlier: int) -> Tensor:
+        """Return equal numbers."""
         return torch.zeros(num_earlier + 1)

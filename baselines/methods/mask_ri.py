@@ -1,4 +1,4 @@
-"""Mask RI: modulating masks, each task's begins at random.
+"""Mask RI: modulating masks, each task starts with random scores.
 
 Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_RI.
 """

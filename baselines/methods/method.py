@@ -1,63 +1,63 @@
-"""What a lifelong-learning method is: a few hooks around the learning of an agent.
+"""The base classes of lifelong-learning methods, and an agent with a method, which is an agent like any other.
 
-`baselines.learner.Learner` calls them at every gradient step, `baselines.methods.wearing.Wearing` at task changes. A
-method knows the network's weights as one vector and the losses by name; it knows no agent.
+An agent calls the method's hooks in each gradient step, `AgentWithMethod` the others at batches, at task changes and in
+evaluation. A method knows the network's weights as one vector and the losses by name, and no agent in particular.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any, ClassVar, cast
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.networks import Data
+from baselines.hooks import Hooks
+from baselines.learner import Learner
+from baselines.methods.weights import Weights
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-if TYPE_CHECKING:
-    from baselines.learner import Learner
-    from baselines.methods.weights import Weights
 
-
-class Method(nn.Module):
-    """No method: the agent is fine-tuned on one task after the other. Other methods derive from this one.
-
-    Buffers and parameters of a method are part of the agent's state.
-    """
+class Method(Hooks):
+    """A method that does nothing, from which others derive: the agent is fine-tuned on one task after the other."""
 
     needs_task_id: bool = False
-    """Whether it must be told which task it is in, while learning and while acting."""
+    """Whether it needs the id of the task, in learning and in evaluation."""
 
-    without_ids = ""
+    hidden_ids_hint = ""
     """What else can be done where ids are hidden, for the message that refuses them."""
 
     needs_boundaries: ClassVar[bool] = True
-    """Whether it must be told when the task changes."""
+    """Whether task changes must be announced."""
 
-    agent: Learner
+    agent_members: tuple[str, ...] = ("method", "weights")
+    """The members of `Learner` that it uses beside those of `ctgraph_rl.agent.Agent`."""
+
+    agent: Learner  # or another module with the members that `agent_members` lists
     weights: Weights
 
-    def __init__(self) -> None:  # a module takes any arguments, a method those that it names
+    def __init__(self) -> None:  # nn.Module takes any arguments, a method only those that it names
         super().__init__()
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
-        """What is learned in place of a curriculum: mostly the same.
+        """Return the curriculum to learn in place of the given one, mostly the same.
 
         Raises:
-            ValueError: if the curriculum does not tell what the method needs to know.
+            ValueError: if the curriculum's protocol hides what the method needs.
         """
-        told, name, several = curriculum.protocol, type(self).__name__, blocks_of_several(curriculum)
+        protocol, name, several = curriculum.protocol, type(self).__name__, multi_task_blocks(curriculum)
         require(
             (
-                not self.needs_task_id or told.task_id != "hidden",
+                not self.needs_task_id or protocol.task_id != "hidden",
                 f"{name} needs task ids, which are hidden: "
-                f"set protocol.task_id=one_hot or at_boundaries{self.without_ids}",
+                f"set protocol.task_id=one_hot or at_boundaries{self.hidden_ids_hint}",
             ),
             (
-                not self.needs_boundaries or told.boundaries == "announced",
+                not self.needs_boundaries or protocol.boundaries == "announced",
                 f"{name} needs to be told when the task changes: set protocol.boundaries=announced",
             ),
             (
@@ -68,98 +68,153 @@ class Method(nn.Module):
         return curriculum
 
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """An agent with this method for a curriculum.
+        """Return the agent with this method attached.
+
+        Args:
+            agent: a `Learner`, or another module that has `agent_members` and calls the hooks of ``agent.method``.
+            curriculum: what `prepare` returned.
 
         Raises:
-            ValueError: if the two cannot go together.
+            ValueError: if agent and method do not fit together.
         """
-        from baselines.methods.wearing import wear  # which knows learners, which know methods
+        missing = [f"`{name}`" for name in self.agent_members if not hasattr(agent, name)]
+        missing += ["`torch.nn.Module` as its base"] * (not isinstance(agent, nn.Module))
+        message = f"{type(self).__name__} needs an agent with {', '.join(missing)}, got {type(agent).__name__}"
+        require((not missing, f"{message}: derive it from baselines.learner.Learner, or take method=finetune"))
+        return AgentWithMethod(cast(Learner, agent), self, curriculum)
 
-        return wear(agent, self, curriculum)
-
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """Called once, before anything is learned.
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """Called once, when the method is attached to an agent: register buffers and parameters here.
 
         Raises:
-            ValueError: if the two cannot go together.
+            ValueError: if agent and method do not fit together.
         """
-        object.__setattr__(self, "agent", agent)  # the method is part of the agent, not the other way round
+        object.__setattr__(self, "agent", agent)  # the method is a submodule of the agent, not the other way round
         self.weights = weights
 
     def start_task(self, task: int | None) -> None:
-        """Called where a task begins, with its id where it is told."""
+        """Called at the start of a task, with its id where the protocol tells ids."""
 
     def end_task(self) -> None:
-        """Called where a task ends."""
+        """Called at the end of a task."""
 
-    def see(self, batch: TensorDictBase) -> None:
+    def on_batch(self, batch: TensorDictBase) -> None:
         """Called with each batch, [num_envs, num_steps], before the agent learns from it."""
 
-    def mixed(self, batch: Data) -> Data:
-        """What a gradient step learns from in place of a minibatch."""
-        return batch
-
-    def loss(self, batch: Data) -> dict[str, Tensor]:
-        """What is added to the agent's losses, as scalars named ``loss_*``."""
-        return {}
-
-    def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The gradients of what the optimiser changes, from those of the weights."""
-        return gradients
-
-    def settle(self) -> None:
-        """Called after each step of the optimiser."""
-
-    def weights_of(self, task: int) -> Tensor | None:
-        """The weights to act with in a task, float32 [P]; None: as they are."""
+    def task_weights(self, task: int) -> Tensor | None:
+        """Return the weights to act with in a task, float32 [P]; None for the present ones."""
         return None
 
 
-def blocks_of_several(curriculum: Curriculum) -> list[int]:
-    """The numbers of the blocks with several tasks, from 1."""
+def multi_task_blocks(curriculum: Curriculum) -> list[int]:
+    """Return the numbers of the blocks with several tasks, from 1."""
     return [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
 
 
 class TaskMethod(Method):
-    """A method that keeps something for each task; its places are taken in the order in which the tasks begin.
+    """A method that keeps something for each task, in slots that are assigned in the order in which tasks start.
 
-    A task that has not begun is acted in as the first one is.
+    A task that has not started yet is played with the first slot.
     """
 
     needs_task_id = True
+    agent_members = (*Method.agent_members, "weights_changed")
 
     def __init__(self) -> None:
         super().__init__()
-        self.begun: list[int] = []
-        """The ids of the tasks that have begun."""
+        self.started: list[int] = []
+        """The ids of the tasks that have started, in the order of their slots."""
 
-        self.place = 0
-        """That of the present task."""
+        self.slot = 0
+        """The present task's."""
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
+        super().setup(agent, weights, curriculum)
         self.num_tasks = len(curriculum.tasks)
 
     def start_task(self, task: int | None) -> None:
-        """Go to the task's place."""
+        """Select the task's slot."""
         name = type(self).__name__
         if task is None:
             raise ValueError(f"{name} needs the id of the task that begins: blocks of one task, with ids that are told")
-        if task not in self.begun:
+        if task not in self.started:
             message = f"there is room for {self.num_tasks} tasks, got another, {task}"
-            require((len(self.begun) < self.num_tasks, message))
-            self.begun.append(task)
-        self.place = self.begun.index(task)
+            require((len(self.started) < self.num_tasks, message))
+            self.started.append(task)
+        self.slot = self.started.index(task)
 
-    def place_of(self, task: int) -> int:
-        """Where what is kept for a task is."""
-        return self.begun.index(task) if task in self.begun else 0
+    def slot_of(self, task: int) -> int:
+        """Return the slot of a task."""
+        return self.started.index(task) if task in self.started else 0
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Who has which place."""
-        return {"begun": list(self.begun), "place": self.place}
+        """Return the slots of the tasks."""
+        return {"begun": list(self.started), "place": self.slot}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
-        self.begun, self.place = list(state["begun"]), state["place"]
+        """Restore what `get_extra_state` returned."""
+        self.started, self.slot = list(state["begun"]), state["place"]
+
+
+class AgentWithMethod(nn.Module):
+    """An agent and a method; it calls the method's hooks at batches, at task changes and in evaluation.
+
+    Args:
+        agent: the agent, of which the method becomes a part.
+        method: the method.
+        curriculum: what will be learned.
+
+    Raises:
+        ValueError: if agent and method do not fit together.
+    """
+
+    def __init__(self, agent: Learner, method: Method, curriculum: Curriculum) -> None:
+        super().__init__()
+        self.agent: Learner = agent
+        method.setup(agent, Weights(agent.policy, agent.weights), curriculum)
+        agent.method = method
+        self.num_envs, self.num_steps = agent.num_envs, agent.num_steps
+        self.policy: TensorDictModuleBase = agent.policy
+        self._copies: dict[int, TensorDictModuleBase] = {}
+
+    @property
+    def method(self) -> Method:
+        """The agent's method."""
+        return cast(Method, self.agent.method)
+
+    def policy_for(self, task: int) -> TensorDictModuleBase:
+        """Return the agent's policy, or a copy of it where the method has other weights for a task."""
+        weights = self.method.task_weights(task)
+        policy = self.agent.policy_for(task)
+        if weights is None:
+            return policy
+        if task not in self._copies:
+            self._copies[task] = deepcopy(policy)
+        copy = self._copies[task]
+        copy.load_state_dict(policy.state_dict())
+        self.method.weights.write_to(copy, weights)
+        return copy
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return the agent's recurrent state."""
+        return self.agent.initial_state(num_envs)
+
+    def start_task(self, task: int | None = None) -> None:
+        """Start a task, first for the method, then for the agent."""
+        self.method.start_task(task)
+        self.agent.start_task(task)
+
+    def end_task(self) -> None:
+        """End a task, first for the agent, then for the method."""
+        self.agent.end_task()
+        self.method.end_task()
+
+    def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor]:
+        """Compute the agent's losses and the method's penalties."""
+        return {**self.agent.loss(batch), **self.method.penalties(batch)}
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Show the method a batch, and learn from it."""
+        self.method.on_batch(batch)
+        return self.agent.learn(batch)

@@ -11,14 +11,14 @@ from ctgraph_rl.tasks.switch import ByEpisode
 
 
 class Multitask(Finetune):
-    """In place of the blocks there is one with all their tasks and frames; each row takes them in turn by the episode.
+    """One block with all tasks and frames replaces the curriculum's; each environment changes tasks at every episode.
 
     The agent is as it is. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
     different can all be solved.
     """
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
-        """The tasks at once.
+        """Return the curriculum of one block.
 
         Raises:
             ValueError: for one task alone, and ids that are given at boundaries.

@@ -1,4 +1,4 @@
-"""PackNet: each task gets a share of the network's weights, which then stay as they are.
+"""PackNet: each task gets a share of the network's weights, which then stay fixed.
 
 Mallya and Lazebnik 2018 (CVPR, arXiv 1711.05769).
 """
@@ -6,20 +6,18 @@ Mallya and Lazebnik 2018 (CVPR, arXiv 1711.05769).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from baselines.learner import Learner
 from baselines.methods.heads import Heads
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-if TYPE_CHECKING:
-    from baselines.learner import Learner
 
 FREE = -1
 """Owner of a weight that no task has yet."""
@@ -29,17 +27,19 @@ class PackNet(TaskMethod):
     """In each block the free weights are trained; then the smallest are pruned, and the rest trained further and kept.
 
     The k-th of K tasks keeps, of each weight matrix, the largest 1 / (K - k + 1) of the weights that are free; pruned
-    ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are the first
-    task's, output layers each task's own, see `Heads`. A task that comes again trains its output layers alone.
+    ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are those of the
+    first task, and each task has output layers of its own, see `Heads`. A task that returns trains those alone.
 
-    Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task has it, 2 P bytes, its
-    value, 4 P bytes, and the output layers.
+    Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task uses it, 2 P bytes,
+    its value, 4 P bytes, and the output layers.
 
     Args:
         retrain: share of a block's frames, at its end, that is trained after pruning, in [0, 1).
     """
 
-    owner: Tensor  # int16 [P]: the place of the task that keeps a weight, or FREE
+    agent_members = Heads.agent_members
+
+    owner: Tensor  # int16 [P]: the slot of the task that keeps a weight, or FREE
     packed: Tensor  # float32 [P]: kept weights
     live: Tensor  # bool [P]: weights that may change
     mine: Tensor  # bool [P]: kept weights that the present task acts with
@@ -51,10 +51,10 @@ class PackNet(TaskMethod):
         self.retrain = retrain
         self.heads = Heads()
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
-        self.heads.put_on(agent, weights, curriculum)
+        super().setup(agent, weights, curriculum)
+        self.heads.setup(agent, weights, curriculum)
         self.budgets = [block.num_frames for block in curriculum.blocks]
         self.block = -1
         self.frames = 0
@@ -68,86 +68,86 @@ class PackNet(TaskMethod):
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Free weights may change; in a task that was here before, only its output layers."""
-        new = task not in self.begun
+        """Let free weights change; in a task that returns, only its output layers."""
+        new = task not in self.started
         super().start_task(task)
         self.heads.start_task(task)
         self.block, self.frames = self.block + 1, 0
-        first = new and self.place == 0
-        may = (self.owner == FREE) & new & (self._within(self.in_matrices) | first) | self._within(self.in_heads)
-        self.live.copy_(may)
-        self.mine.copy_(self._kept_up_to(self.place))
-        self._take()
-        self.agent.forget(self.weights.parameters)
+        first = new and self.slot == 0
+        free = (self.owner == FREE) & new & (self._on_device(self.in_matrices) | first)
+        self.live.copy_(free | self._on_device(self.in_heads))
+        self.mine.copy_(self._kept_up_to(self.slot))
+        self._load()
+        self.agent.clear_optimiser_state(self.weights.parameters)
 
     @torch.no_grad()
     def end_task(self) -> None:
-        """Prune, if that was not done yet; from now on the task's weights stay."""
+        """Prune if that was not done yet, and fix the task's weights."""
         self._prune()
-        self.packed.copy_(torch.where(self.owner == self.place, self.weights.vector(), self.packed))
+        self.packed.copy_(torch.where(self.owner == self.slot, self.weights.vector(), self.packed))
         self.heads.end_task()
 
-    def see(self, batch: TensorDictBase) -> None:
-        """Prune before the first batch that reaches into the share for retraining, unless nothing was learned yet."""
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Prune before the first batch that reaches into the share for retraining, unless it is the block's first."""
         budget = self.budgets[self.block % len(self.budgets)]
         if self.frames and self.frames + batch.numel() > (1 - self.retrain) * budget:
             self._prune()
         self.frames += batch.numel()
 
-    def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Those of weights that may change; 0 for the others."""
+    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the gradients of weights that may change, and 0 for the others."""
         live = self.weights.split(self.live)
         return [gradient * part.view_as(gradient) for gradient, part in zip(gradients, live, strict=True)]
 
     @torch.no_grad()
-    def settle(self) -> None:
-        """Take back what the optimiser changed in weights that may not change."""
+    def after_step(self) -> None:
+        """Undo the optimiser's changes of weights that may not change."""
         self.weights.write(torch.where(self.live, self.weights.vector(), torch.where(self.mine, self.packed, 0.0)))
 
     @torch.no_grad()
-    def weights_of(self, task: int) -> Tensor | None:
-        """The weights of the tasks up to this one, with its output layers."""
-        place = self.place_of(task)
-        if not self.begun or place == self.place:
+    def task_weights(self, task: int) -> Tensor | None:
+        """Return the weights of the tasks up to this one, with its output layers."""
+        slot = self.slot_of(task)
+        if not self.started or slot == self.slot:
             return None
-        weights = torch.where(self._kept_up_to(place), self.packed, 0.0)
-        weights[self._within(self.in_heads)] = self.heads.kept[place]
+        weights = torch.where(self._kept_up_to(slot), self.packed, 0.0)
+        weights[self._on_device(self.in_heads)] = self.heads.kept[slot]
         return weights
 
     @torch.no_grad()
     def _prune(self) -> None:
-        """Of the free weights that were trained, keep the largest share and give the others back."""
-        trained = self.live & ~self._within(self.in_heads) & (self.owner == FREE)
+        """Keep the largest of the free weights that were trained, and free the others."""
+        trained = self.live & ~self._on_device(self.in_heads) & (self.owner == FREE)
         if not trained.any():
             return
         weights, kept = self.weights.vector(), torch.zeros_like(self.live)
-        share = 1 / (self.num_tasks - self.place)
+        share = 1 / (self.num_tasks - self.slot)
         parts = zip(*(self.weights.split(each) for each in (weights, trained, kept)), strict=True)
         for parameter, (values, free, keep) in zip(self.weights.parameters, parts, strict=True):
             count = int(free.sum())
             most = count if parameter.ndim < 2 else round(share * count)
             keep[values.abs().masked_fill(~free, -1.0).topk(most).indices] = True
-        self.owner[kept] = self.place
-        self.live.copy_(kept | self._within(self.in_heads))
-        self._take()
+        self.owner[kept] = self.slot
+        self.live.copy_(kept | self._on_device(self.in_heads))
+        self._load()
 
-    def _take(self) -> None:
-        """Give the network the present task's weights, where they may not change."""
-        self.settle()
+    def _load(self) -> None:
+        """Load the present task's weights where they may not change."""
+        self.after_step()
         self.agent.weights_changed()
 
-    def _kept_up_to(self, place: int) -> Tensor:
-        """bool [P]: the weights that the tasks up to this place keep."""
-        return (self.owner >= 0) & (self.owner <= place)
+    def _kept_up_to(self, slot: int) -> Tensor:
+        """Return bool [P], true for the weights that the tasks up to this slot keep."""
+        return (self.owner >= 0) & (self.owner <= slot)
 
-    def _within(self, chosen: Tensor) -> Tensor:
+    def _on_device(self, chosen: Tensor) -> Tensor:
         return chosen.to(self.owner.device)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Who has which place, and how far the block is."""
+        """Return the slots of the tasks, the block's number and its frames so far."""
         return {**super().get_extra_state(), "block": self.block, "frames": self.frames}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` gave."""
+        """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.block, self.frames = state["block"], state["frames"]

@@ -1,4 +1,4 @@
-"""SI: synaptic intelligence, important is what made the loss fall along the way.
+"""SI: synaptic intelligence; weights are important if their changes made the loss fall.
 
 Zenke et al. 2017 (ICML, arXiv 1703.04200), eqs. (3) to (5).
 """
@@ -6,31 +6,29 @@ Zenke et al. 2017 (ICML, arXiv 1703.04200), eqs. (3) to (5).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from baselines.learner import Learner
 from baselines.methods.importance import Importance
 from baselines.methods.weights import Weights, flat
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-if TYPE_CHECKING:
-    from baselines.learner import Learner
 
 
 class SI(Importance):
     """Adds c * sum_i O_i (w_i - a_i)^2, O_i = sum over tasks of max(0, v_i) / (d_i^2 + xi).
 
     v_i is the sum over gradient steps of -(d loss / d w_i) times the change of w_i, with the gradient of the agent's
-    own losses; d_i is how far w_i went in the task; a are the weights at the end of the last task.
+    own losses; d_i is the change of w_i over the task; a are the weights at the end of the last task.
 
     Stored are, besides what `Importance` stores, v, the weights at the task's start and two vectors of a step: 28 P
     bytes in all.
 
     Args:
-        epsilon: xi, which bounds what is divided by.
+        epsilon: xi, which is added to the divisor.
         settings: the arguments of `Importance`; ``coeff`` is the paper's c.
     """
 
@@ -44,32 +42,32 @@ class SI(Importance):
         require(*positive(epsilon=epsilon))
         self.epsilon = epsilon
 
-    def put_on(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        super().put_on(agent, weights, curriculum)
+        super().setup(agent, weights, curriculum)
         for name in ("path", "start", "before", "slope"):
             self.register_buffer(name, torch.zeros(len(weights)))
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Begin a new path."""
+        """Start a new path."""
         super().start_task(task)
         self.path.zero_()
         self.start.copy_(self.weights.vector())
 
     @torch.no_grad()
-    def gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The same; what the agent's own losses have in them is kept."""
+    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the same, and store the part that comes from the agent's own losses."""
         self.before.copy_(self.weights.vector())
         added = 2 * self.coeff * self.importance * (self.before - self.anchor)
         self.slope.copy_(flat(gradients) - added)
         return gradients
 
     @torch.no_grad()
-    def settle(self) -> None:
-        """Go a step along the path."""
+    def after_step(self) -> None:
+        """Add the step to the path."""
         self.path -= self.slope * (self.weights.vector() - self.before)
 
     def task_importance(self) -> Tensor:
-        """What the weights did for the loss, by the square of how far they went."""
+        """Return the fall of the loss along the path, divided by the squared changes of the weights."""
         return self.path.clamp(min=0) / ((self.weights.vector().detach() - self.start).square() + self.epsilon)

@@ -8,19 +8,26 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
+from ctgraph_rl.checks import require
+
 
 class Weights:
     """The parameters that an agent learns, P numbers in all.
 
     Args:
-        policy: what acts; it has all of the parameters.
-        parameters: what the agent's losses are differentiated by.
+        policy: the module that acts, which has all of the parameters.
+        parameters: those by which the agent's losses are differentiated.
+
+    Raises:
+        ValueError: if the policy lacks a parameter.
     """
 
     def __init__(self, policy: TensorDictModuleBase, parameters: Sequence[nn.Parameter]) -> None:
         self.parameters = list(parameters)
         self.sizes = [parameter.numel() for parameter in self.parameters]
         names = {id(parameter): name for name, parameter in policy.named_parameters()}
+        within = all(id(parameter) in names for parameter in self.parameters)
+        require((within, "the weights of an agent must all be parameters of its policy"))
         self.names = [names[id(parameter)] for parameter in self.parameters]
         self.head_names = head_names(policy)
 
@@ -29,37 +36,37 @@ class Weights:
 
     @property
     def device(self) -> torch.device:
-        """Where they are."""
+        """The parameters' device."""
         return self.parameters[0].device
 
     def vector(self) -> Tensor:
-        """A copy, float32 [P]; gradients reach the parameters."""
+        """Return a copy of all values, float32 [P]; gradients flow back to the parameters."""
         return flat(self.parameters)
 
     @torch.no_grad()
     def write(self, vector: Tensor) -> None:
-        """Give the parameters the values of a vector, [P]."""
+        """Set the parameters to the values of a vector, [P]."""
         self.write_parts(self.split(vector))
 
     @torch.no_grad()
     def write_parts(self, parts: Sequence[Tensor]) -> None:
-        """Give each parameter the values of a vector, [n] each."""
+        """Set each parameter to the values of its own vector, [n] each."""
         for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.copy_(part.view_as(parameter))
 
     def split(self, vector: Tensor) -> Sequence[Tensor]:
-        """The parts of a vector [..., P] that belong to each parameter."""
+        """Split a vector [..., P] into the parts of each parameter."""
         return vector.split(self.sizes, dim=-1)
 
-    def where(self, names: Collection[str]) -> Tensor:
-        """bool [P]: the numbers in the parameters with these names."""
+    def mask_of(self, names: Collection[str]) -> Tensor:
+        """Return bool [P], true in the parameters with these names."""
         named = zip(self.names, self.parameters, strict=True)
         return flat([torch.full_like(value, name in names, dtype=torch.bool) for name, value in named])
 
     @property
     def in_heads(self) -> Tensor:
-        """bool [P]: the numbers of the output layers."""
-        return self.where(self.head_names)
+        """bool [P], true in the output layers."""
+        return self.mask_of(self.head_names)
 
     @property
     def in_head_parameters(self) -> list[nn.Parameter]:
@@ -69,24 +76,27 @@ class Weights:
 
     @property
     def in_matrices(self) -> Tensor:
-        """bool [P]: the numbers of weight matrices, which are no biases."""
-        return self.where([name for name, value in zip(self.names, self.parameters, strict=True) if value.ndim > 1])
+        """bool [P], true in weight matrices and false in biases."""
+        return self.mask_of([name for name, value in zip(self.names, self.parameters, strict=True) if value.ndim > 1])
 
     @torch.no_grad()
-    def give(self, policy: TensorDictModuleBase, vector: Tensor) -> None:
-        """Give a copy of the policy the weights of a vector."""
+    def write_to(self, policy: TensorDictModuleBase, vector: Tensor) -> None:
+        """Set the weights of a copy of the policy to the values of a vector, [P]."""
         parameters = dict(policy.named_parameters())
         for name, part in zip(self.names, self.split(vector), strict=True):
             parameters[name].copy_(part.view_as(parameters[name]))
 
 
 def flat(tensors: Sequence[Tensor]) -> Tensor:
-    """Tensors as one vector."""
+    """Concatenate tensors to one vector."""
     return torch.cat([tensor.flatten() for tensor in tensors])
 
 
 def head_names(policy: TensorDictModuleBase) -> list[str]:
-    """The parameters of a policy's output layers: the last linear layer of each module behind the trunk."""
+    """Return the names of the parameters of a policy's output layers.
+
+    These are the last linear layers of the modules behind the trunk.
+    """
     names = []
     for place, module in policy.named_modules():
         behind = isinstance(module, TensorDictModule) and isinstance(module.module, nn.Module)

@@ -134,7 +134,7 @@ def test_an_orthogonal_start_has_small_heads_and_no_biases(build_agent, again):
     agent = build_agent("ppo_published", [ct_su_b1()])
     before = agent.trunk.module.linear.weight.clone()
     if again:
-        agent.draw_weights()
+        agent.reset_parameters()
 
     assert torch.equal(agent.trunk.module.linear.weight, before) is not again
     trunk = [layer for layer in agent.trunk.modules() if isinstance(layer, nn.Linear)]

@@ -16,7 +16,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
 from baselines import benchmark
-from baselines.compiled import whole_step
+from baselines.learner import functional_gradient_step
 from baselines.networks import distinct, packed_lstm
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
@@ -28,7 +28,7 @@ COMPILED = ("a2c", "dqn", "ppo", "ppo_count", "ppo_published", "reinforce")
 def whole_step_of(agent, batch) -> dict:
     """A gradient step as it is compiled, without compiling it, after one that gives the optimiser its state."""
     agent.gradient_step(batch)
-    return whole_step(agent, batch)
+    return functional_gradient_step(agent, batch)
 
 
 def test_a_step_in_plain_tensors_equals_torchrls():
@@ -168,7 +168,7 @@ def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent
     minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[-1]
     other.load_state_dict(saved_and_loaded(agent.state_dict()))
 
-    eager, whole = agent.gradient_step(minibatch), whole_step(other, minibatch)
+    eager, whole = agent.gradient_step(minibatch), functional_gradient_step(other, minibatch)
 
     assert list(eager) == list(whole)
     torch.testing.assert_close(whole, eager)

@@ -13,15 +13,23 @@ from inspect import isfunction
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.paths import CHECKOUT
+from helpers.small_agents import batches
 from omegaconf import OmegaConf
 
 import curricula
+from baselines.hooks import Hooks
+from baselines.learner import Learner
 from baselines.methods.__main__ import main, methods
+from baselines.methods.finetune import Finetune
+from baselines.methods.l2 import L2
 from baselines.methods.method import Method
-from ctgraph_rl import Protocol, RunLog, cli, load
+from baselines.methods.weights import flat
+from ctgraph_rl import CTGraphEnv, Protocol, RunLog, cli, load
 from ctgraph_rl.run import conf_dir, target
 from ctgraph_rl.runs.train import new_agent
+from curricula.paper import ct_su_b1
 
 TEXT = (CHECKOUT / "docs" / "methods.md").read_text(encoding="utf-8")
 YAML = {path.stem: path for path in sorted(Path(conf_dir(), "method").glob("*.yaml"))}
@@ -102,7 +110,7 @@ def test_a_method_stores_the_bytes_that_the_page_says(compose, name):
     curriculum = make_method().prepare(target(cfg, "curriculum")())
     agent = new_agent(curriculum, lambda *specs: make_method().attach(target(cfg, "agent")(*specs), curriculum), 0)
 
-    method = agent.agent.method
+    method = agent.method
     stored = sum(each.numel() * each.element_size() for each in (*method.buffers(), *method.parameters()))
 
     weights, (*_, at_all, by_task, _) = method.weights, row.split("|")
@@ -111,10 +119,11 @@ def test_a_method_stores_the_bytes_that_the_page_says(compose, name):
 
 
 def test_the_page_has_every_hook():
-    hooks = {name for name, value in vars(Method).items() if isfunction(value) and not name.startswith("_")}
+    own = [*vars(Method).items(), *vars(Hooks).items()]
+    hooks = {name for name, value in own if isfunction(value) and not name.startswith("_")}
 
-    assert {"prepare", "loss", "settle"} <= hooks
-    assert [hook for hook in hooks - {"attach"} if f"`{hook}(" not in TEXT] == []
+    assert {"prepare", "task_weights", "after_step"} <= hooks
+    assert [hook for hook in hooks if f"`{hook}(" not in TEXT] == []
 
 
 def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(tmp_path):
@@ -135,5 +144,58 @@ def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(t
     names = {}
     exec(compile(blocks("python")[0], "my_method.py", "exec"), names)
     trained = load(tmp_path / "out", make_method=partial(names["L2Init"], coeff=0.001))
-    gap = trained.agent.agent.method.weights.vector() - trained.agent.agent.method.first
+    gap = trained.agent.method.weights.vector() - trained.agent.method.first
     assert gap.abs().max() > 0
+
+
+def table_of_members() -> list[tuple[list[str], list[str]]]:
+    """Methods and members of the rows of the table under the heading of agents that are no `Learner`."""
+    rows = TEXT.split("members that the agent needs |")[1].split("\n\n")[0].splitlines()[2:]
+    return [tuple(re.findall(r"`([\w=]+)`", cell) for cell in row.split("|")[1:3]) for row in rows]
+
+
+@pytest.mark.parametrize("name", sorted(YAML))
+def test_the_page_lists_the_members_that_a_method_needs(compose, name):
+    *rows, (_, of_heads) = table_of_members()
+    (members,) = (members for names, members in rows if name in names)
+    with_heads = "heads" in compose(f"method={name}").method
+
+    def needed(*overrides: str) -> list[str]:
+        method = target(compose(f"method={name}", *overrides), "method")()
+        return [] if isinstance(method, Finetune) else sorted(method.agent_members)
+
+    assert needed(*["method.heads=single"] * with_heads) == sorted(members)
+    if with_heads:
+        assert needed("method.heads=auto") == needed("method.heads=multi") == sorted([*members, *of_heads])
+
+
+def test_the_page_says_what_each_member_is_and_a_learner_has_them():
+    members = {member for _, members in table_of_members() for member in members}
+
+    assert [name for name in members if not re.search(rf"^\|[^|]*`{name}[(`][^|]*\| [^|`]", TEXT, re.MULTILINE)] == []
+    assert {name for name in members if hasattr(Learner, name)} | {"method", "output_keys"} == members
+
+
+def test_an_agent_that_is_no_learner_learns_with_the_gradient_step_of_the_page():
+    """Plain gradient descent on the losses of the page about agents and the penalty of L2, against it by hand."""
+    names: dict = {}
+    exec(re.findall(r"```python\n(.*?)```", (CHECKOUT / "docs" / "agents.md").read_text("utf-8"), re.DOTALL)[0], names)
+    exec(blocks("python")[-1], names)
+    specs = CTGraphEnv([ct_su_b1()])
+    agent = names["MyAgent"](specs.observation_spec_unbatched, specs.action_spec_unbatched, 4, 3, learning_rate=0.1)
+    agent.method, agent.weights = Hooks(), list(agent.policy.parameters())
+    agent.optimiser = torch.optim.SGD(agent.weights, 0.1)
+    learned = []
+    agent.gradient_step = lambda batch: (learned.append(batch), names["gradient_step"](agent, batch))[1]
+    attached = L2(coeff=3.0, heads="single").attach(agent, curricula.load("su_b1_4tasks"))
+    attached.end_task()
+    weights, before = attached.method.weights, attached.method.anchor + 0.5
+    weights.write(before)
+
+    losses = attached.learn(batches(attached, ct_su_b1(), 1)[0])
+
+    after = weights.vector().detach()
+    weights.write(before)
+    own = flat(torch.autograd.grad(agent.loss(learned[0])["loss_policy"], agent.weights))
+    torch.testing.assert_close(after, before - 0.1 * (own + 2 * 3.0 * 0.5))
+    assert losses["loss_method"] == pytest.approx(3.0 * 0.25 * len(weights)) and "loss_policy" in losses

@@ -9,8 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from baselines.learner import Learner
-from baselines.methods.method import Method
-from baselines.methods.wearing import Wearing
+from baselines.methods.method import AgentWithMethod, Method
 from ctgraph_rl import Block, CTGraphEnv, run
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import SMALL_AGENT, batches
@@ -36,23 +35,23 @@ def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
     return make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
 
 
-def wearing(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> Wearing:
+def with_method(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> AgentWithMethod:
     """A small agent with a method, which is told the ids of tasks that have a block each."""
     curriculum = method.prepare(of(*(Block(task, 160) for task in tasks), task_id="at_boundaries"))
     return method.attach(small(compose, agent, tasks, *overrides), curriculum)
 
 
-def stay(worn: Wearing, number: int, tasks=TASKS, number_of_batches: int = 2) -> None:
+def stay(attached: AgentWithMethod, number: int, tasks=TASKS, number_of_batches: int = 2) -> None:
     """A block of some batches."""
-    worn.start_task(number)
-    for batch in batches(worn, tasks[number], number_of_batches, seed=number):
-        worn.learn(batch)
-    worn.end_task()
+    attached.start_task(number)
+    for batch in batches(attached, tasks[number], number_of_batches, seed=number):
+        attached.learn(batch)
+    attached.end_task()
 
 
-def weights_for(worn, number: int) -> list[torch.Tensor]:
+def weights_for(attached, number: int) -> list[torch.Tensor]:
     """Copies of the weights that a task is acted in with."""
-    return [parameter.detach().clone() for parameter in worn.policy_for(number).parameters()]
+    return [parameter.detach().clone() for parameter in attached.policy_for(number).parameters()]
 
 
 RATE = 0.1

@@ -81,11 +81,11 @@ def learn_with(method: dict, run_dir: Path):
     told = instantiate(method).prepare(replace(LEARNED, protocol=Protocol("one_hot")))
     made = []
 
-    def make_worn(*specs):
+    def make_attached(*specs):
         made.append(instantiate(method).attach(make_agent(*specs), told))
         return made[-1]
 
-    train(told, make_worn, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
+    train(told, make_attached, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
     return made[-1]
 
 

@@ -15,7 +15,6 @@ from helpers.with_methods import made, weights_for
 
 from baselines.methods.importance import Samples
 from baselines.methods.method import Method
-from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum, run
 from ctgraph_rl.runs.train import new_agent
 
@@ -50,7 +49,7 @@ KEPT = (4, 8)
 
 
 class Life(NamedTuple):
-    """Learns a curriculum with a new agent that wears a method."""
+    """Learns a curriculum with a new agent with a method."""
 
     curriculum: Curriculum
     make_agent: Any
@@ -147,9 +146,7 @@ def test_an_agent_that_is_no_learner_is_refused_before_it_is_touched(compose, me
     agent = Scripted()
     before = dict(vars(agent))
 
-    with pytest.raises(
-        ValueError, match=r" needs an agent that derives from baselines\.learner\.Learner, got Scripted; "
-    ):
+    with pytest.raises(ValueError, match=r" needs an agent with `method`, `weights`.*, got Scripted: derive it from "):
         made(compose, "method", method)().attach(agent, CURRICULUM)
 
     assert vars(agent) == before
@@ -199,7 +196,7 @@ def test_a_buffer_that_holds_no_whole_row_is_refused_where_rows_are_replayed(com
     with pytest.raises(ValueError, match="buffer_size must be at least the 4 steps of a row, got 3"):
         life(compose, "lstm_ppo", "clear", "method.buffer_size=3").new()
 
-    assert len(life(compose, "ppo", "clear", "method.buffer_size=3").new().agent.method.reservoir) == 0
+    assert len(life(compose, "ppo", "clear", "method.buffer_size=3").new().method.reservoir) == 0
 
 
 # Runs
@@ -237,13 +234,13 @@ def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_
 def test_a_state_of_kept_minibatches_of_one_length_is_read_as_it_once_was_saved():
     samples, restored = Samples(8), Samples(8)
     for size in (3, 5):
-        samples.due = 8
+        samples.remaining = 8
         samples.add({"action": torch.rand(size, 2), "learnt": torch.rand(size, 2) < 0.5})
     (part,) = samples.state()["parts"]
 
     for state in (samples.state(), part):
         restored.restore(state, torch.device("cpu"))
-        assert restored.held == samples.held
+        assert restored.num_held == samples.num_held
         assert equal(restored.state(), samples.state())
     restored.restore({"sizes": [], "items": {}}, torch.device("cpu"))
     assert not restored.minibatches
@@ -255,7 +252,7 @@ def test_frames_that_are_not_learned_from_do_not_count_among_the_samples():
         samples.add({"action": torch.arange(4), "learnt": torch.arange(4) < learnt})
 
     assert [int(each["learnt"].sum()) for each in samples.minibatches] == [1, 3]
-    assert samples.held == 4
+    assert samples.num_held == 4
 
 
 def check_policies(its: Life, whole: Any, differ: bool) -> None:
@@ -284,7 +281,7 @@ def test_ids_at_boundaries_are_enough(compose, method):
 
     whole, lines, _ = life(compose, "ppo", method, curriculum=curriculum).live()
 
-    assert whole.agent.method.begun if method != "ewc_published" else whole.agent.method.heads.begun == [0, 1, 2]
+    assert whole.method.started if method != "ewc_published" else whole.method.heads.started == [0, 1, 2]
     assert sum(line["kind"] == "evaluation" for line in lines) == 12
 
 
@@ -295,8 +292,8 @@ def test_each_task_has_output_layers_of_its_own_where_ids_are_told_unless_it_is_
     told = life(compose, "ppo", method, "method.heads=auto").new()
     secret = life(compose, "ppo", method, "method.heads=auto", curriculum=hidden).new()
 
-    assert told.agent.method.heads is not None
-    assert secret.agent.method.heads is None
+    assert told.method.heads is not None
+    assert secret.method.heads is None
 
 
 def test_a_first_block_that_is_no_whole_batch_can_be_learned_with_replayed_rows(compose):
@@ -304,7 +301,7 @@ def test_a_first_block_that_is_no_whole_batch_can_be_learned_with_replayed_rows(
 
     whole, _, _ = life(compose, "lstm_ppo", "clear", curriculum=curriculum).live()
 
-    assert len(whole.agent.method.reservoir) == 12  # the second block's rows, of which 12 have 48 steps
+    assert len(whole.method.reservoir) == 12  # the second block's rows, of which 12 have 48 steps
 
 
 # Fine-tuning
@@ -320,9 +317,9 @@ def test_fine_tuning_is_the_agent_itself(compose, agent):
 @pytest.mark.parametrize("agent", AGENTS)
 def test_the_hooks_of_no_method_change_no_bit(compose, agent):
     alone = life(compose, agent, "finetune")
-    worn = Life(alone.curriculum, lambda *specs: Wearing(alone.make_agent(*specs), Method(), alone.curriculum))
+    attached = Life(alone.curriculum, lambda *specs: Method().attach(alone.make_agent(*specs), alone.curriculum))
 
-    (plain, lines, _), (hooked, others, _) = alone.live(), worn.live()
+    (plain, lines, _), (hooked, others, _) = alone.live(), attached.live()
 
     assert equal(dict(plain.state_dict()), dict(hooked.agent.state_dict()))
     assert lines == others

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import batches
-from helpers.with_methods import RATE, TASKS, Tiny, seen, stay, wearing, weights_for
+from helpers.with_methods import RATE, TASKS, Tiny, seen, stay, weights_for, with_method
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -16,8 +16,8 @@ from baselines.methods.ewc import EWC
 from baselines.methods.importance import Importance
 from baselines.methods.l2 import L2
 from baselines.methods.mas import MAS
+from baselines.methods.method import AgentWithMethod
 from baselines.methods.si import SI
-from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block
 
 CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
@@ -38,17 +38,17 @@ def vector(agent: Tiny) -> Tensor:
     return torch.cat([agent.linear.weight.flatten(), agent.linear.bias])
 
 
-def tiny(method: Importance, kind: type[Tiny] = Tiny) -> Wearing:
+def tiny(method: Importance, kind: type[Tiny] = Tiny) -> AgentWithMethod:
     torch.manual_seed(0)
-    return Wearing(kind(), method, CURRICULUM)
+    return AgentWithMethod(kind(), method, CURRICULUM)
 
 
-def task_with(worn: Wearing, number: int, *minibatches: dict[str, Tensor]) -> None:
+def task_with(attached: AgentWithMethod, number: int, *minibatches: dict[str, Tensor]) -> None:
     """A task in which these minibatches are learned from, without a change of the weights."""
-    worn.start_task(number)
+    attached.start_task(number)
     for minibatch in minibatches:
-        worn.agent.method.mixed(minibatch)
-    worn.end_task()
+        attached.method.transform_minibatch(minibatch)
+    attached.end_task()
 
 
 def softmax_fisher(agent: Tiny, observation: Tensor) -> Tensor:
@@ -60,17 +60,17 @@ def softmax_fisher(agent: Tiny, observation: Tensor) -> Tensor:
     return torch.cat([of_weight.mean(dim=0).flatten(), of_bias.mean(dim=0)]).detach()
 
 
-def gradient_of_penalty(worn: Wearing) -> Tensor:
-    losses = worn.agent.method.loss({})
+def gradient_of_penalty(attached: AgentWithMethod) -> Tensor:
+    losses = attached.method.penalties({})
     assert list(losses) == ["loss_method"]
-    parts = torch.autograd.grad(losses["loss_method"], worn.agent.weights)
+    parts = torch.autograd.grad(losses["loss_method"], attached.agent.weights)
     return torch.cat([part.flatten() for part in parts])
 
 
-def move(worn: Wearing, seed: int) -> Tensor:
+def move(attached: AgentWithMethod, seed: int) -> Tensor:
     """Other weights."""
     weights = torch.randn(9, generator=torch.Generator().manual_seed(seed))
-    worn.agent.method.weights.write(weights)
+    attached.method.weights.write(weights)
     return weights
 
 
@@ -78,63 +78,63 @@ def move(worn: Wearing, seed: int) -> Tensor:
 
 
 def test_the_fisher_information_of_a_softmax_policy_is_its_closed_form():
-    worn, minibatch = tiny(EWC(coeff=1, **EWC_SETTINGS)), seen(7)
+    attached, minibatch = tiny(EWC(coeff=1, **EWC_SETTINGS)), seen(7)
 
-    task_with(worn, 0, minibatch)
+    task_with(attached, 0, minibatch)
 
-    expected = softmax_fisher(worn.agent, minibatch["observation"])
-    torch.testing.assert_close(worn.agent.method.importance, expected)
+    expected = softmax_fisher(attached.agent, minibatch["observation"])
+    torch.testing.assert_close(attached.method.importance, expected)
 
 
 @pytest.mark.parametrize("method", [EWC, MAS])
 def test_importance_is_of_the_last_samples_alone(method):
     settings = {**(EWC_SETTINGS if method is EWC else {"heads": "single"}), "num_samples": 7}
-    worn, other = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    attached, other = (tiny(method(coeff=1, **settings)) for _ in range(2))
     last = seen(3, seed=4)
 
-    task_with(worn, 0, seen(50, seed=1), seen(4, seed=3), last)
+    task_with(attached, 0, seen(50, seed=1), seen(4, seed=3), last)
     task_with(other, 0, {key: torch.cat([value, last[key]]) for key, value in seen(4, seed=3).items()})
 
-    torch.testing.assert_close(worn.agent.method.importance, other.agent.method.importance)
-    assert worn.agent.method.importance.any()
+    torch.testing.assert_close(attached.method.importance, other.method.importance)
+    assert attached.method.importance.any()
 
 
 @pytest.mark.parametrize("method", [EWC, MAS])
 def test_frames_that_are_learned_from_again_are_counted_once(method):
     settings = EWC_SETTINGS if method is EWC else {"heads": "single", "num_samples": 100}
-    worn, once = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    attached, once = (tiny(method(coeff=1, **settings)) for _ in range(2))
     minibatches = [seen(4, seed=1), seen(4, seed=2)]
-    worn.start_task(0)
+    attached.start_task(0)
     for _ in range(2):
-        worn.agent.method.see(TensorDict(batch_size=[8]))
+        attached.method.on_batch(TensorDict(batch_size=[8]))
         for minibatch in (*minibatches, seen(8, seed=3)):  # the second pass
-            worn.agent.method.mixed(minibatch)
+            attached.method.transform_minibatch(minibatch)
 
-    worn.end_task()
+    attached.end_task()
     task_with(once, 0, *minibatches, *minibatches)
 
-    torch.testing.assert_close(worn.agent.method.importance, once.agent.method.importance)
+    torch.testing.assert_close(attached.method.importance, once.method.importance)
 
 
 @pytest.mark.parametrize("method", [EWC, MAS])
 def test_a_short_task_is_not_weighed_up_by_the_samples_of_the_one_before(method):
     settings = EWC_SETTINGS if method is EWC else {"heads": "single", "num_samples": 100}
-    worn, alone = (tiny(method(coeff=1, **settings)) for _ in range(2))
-    task_with(worn, 0, seen(9, seed=1))
-    before = worn.agent.method.importance.clone()
+    attached, alone = (tiny(method(coeff=1, **settings)) for _ in range(2))
+    task_with(attached, 0, seen(9, seed=1))
+    before = attached.method.importance.clone()
 
-    task_with(worn, 1, seen(5, seed=2))
+    task_with(attached, 1, seen(5, seed=2))
     task_with(alone, 0, seen(5, seed=2))
 
-    torch.testing.assert_close(worn.agent.method.importance - before, alone.agent.method.importance)
+    torch.testing.assert_close(attached.method.importance - before, alone.method.importance)
 
 
 @pytest.mark.parametrize("learnt", [4, 3, 0])
 def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_minibatches(learnt):
-    worn = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
+    attached = tiny(EWC(coeff=1, **{**EWC_SETTINGS, "fisher": "loss"}))
     minibatches = [{**seen(4, seed=1), "learnt": torch.arange(4) < learnt}, seen(6, seed=2)]
 
-    task_with(worn, 0, *minibatches)
+    task_with(attached, 0, *minibatches)
 
     # The losses sum up to mean_n sum_k f_nk z_nk, whose gradient by W_kj is mean_n f_nk x_nj.
     gradients = [
@@ -142,90 +142,90 @@ def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_m
         for m in minibatches
     ]
     expected = gradients[0].square() / max(learnt, 1) + gradients[1].square() / 6
-    torch.testing.assert_close(worn.agent.method.importance, expected)
+    torch.testing.assert_close(attached.method.importance, expected)
 
 
 def test_mas_is_the_mean_sensitivity_of_the_squared_length_of_linear_outputs():
-    worn, first, second = tiny(MAS(coeff=1, num_samples=100, heads="single")), seen(5, seed=1), seen(8, seed=2)
-    worn.agent.output_keys = ("action_value",)
+    attached, first, second = tiny(MAS(coeff=1, num_samples=100, heads="single")), seen(5, seed=1), seen(8, seed=2)
+    attached.agent.output_keys = ("action_value",)
 
-    task_with(worn, 0, first)
-    once = worn.agent.method.importance.clone()
-    task_with(worn, 1, second)
+    task_with(attached, 0, first)
+    once = attached.method.importance.clone()
+    task_with(attached, 1, second)
 
     def by_hand(observation: Tensor) -> Tensor:  # |W x + b|^2 has the derivatives 2 z_k x_j and 2 z_k
-        outputs = (observation @ worn.agent.linear.weight.T + worn.agent.linear.bias).detach()
+        outputs = (observation @ attached.agent.linear.weight.T + attached.agent.linear.bias).detach()
         of_weight = (2 * outputs.unsqueeze(2) * observation.unsqueeze(1)).abs().mean(dim=0)
         return torch.cat([of_weight.flatten(), (2 * outputs).abs().mean(dim=0)])
 
     torch.testing.assert_close(once, by_hand(first["observation"]))
-    torch.testing.assert_close(worn.agent.method.importance, once + by_hand(second["observation"]))
+    torch.testing.assert_close(attached.method.importance, once + by_hand(second["observation"]))
 
 
 def test_the_outputs_that_mas_weighs_are_log_probabilities_and_value(compose):
-    worn = wearing(compose, "a2c", MAS(coeff=1, num_samples=4, heads="single"))
-    batch = batches(worn, ONE, 1)[0]
-    worn.start_task(0)
+    attached = with_method(compose, "a2c", MAS(coeff=1, num_samples=4, heads="single"))
+    batch = batches(attached, ONE, 1)[0]
+    attached.start_task(0)
     minibatch = {key: batch[key].flatten(0, 1)[:4] for key in ("observation", "action")}
-    worn.agent.method.mixed(minibatch)
-    worn.end_task()
+    attached.method.transform_minibatch(minibatch)
+    attached.end_task()
 
-    expected = torch.zeros(len(worn.agent.method.weights))
+    expected = torch.zeros(len(attached.method.weights))
     for observation in minibatch["observation"]:
-        said = worn.agent.outputs({"observation": observation})
+        said = attached.agent.outputs({"observation": observation})
         squared = said["log_probs"].square().sum() + said["state_value"].square().sum()
-        parts = torch.autograd.grad(squared, worn.agent.weights)
+        parts = torch.autograd.grad(squared, attached.agent.weights)
         expected += torch.cat([part.flatten() for part in parts]).abs() / 4
-    torch.testing.assert_close(worn.agent.method.importance, expected)
+    torch.testing.assert_close(attached.method.importance, expected)
 
 
 @pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
 def test_every_agents_policy_has_the_fisher_information_of_its_frames(compose, agent):
     """Against sum_a (d pi_a / d w)^2 / pi_a, which is the same as E[(d log pi_a / d w)^2], frame by frame."""
-    worn = wearing(compose, agent, EWC(coeff=1, **{**EWC_SETTINGS, "num_samples": 16}))
-    keys = [*worn.policy.in_keys, "action"]
-    rows = batches(worn, ONE, 1)[0][:2]
-    minibatch = {key: rows[key] if worn.memory else rows[key].flatten(0, 1) for key in keys}
-    worn.start_task(0)
-    worn.agent.method.mixed(minibatch)
-    worn.end_task()
+    attached = with_method(compose, agent, EWC(coeff=1, **{**EWC_SETTINGS, "num_samples": 16}))
+    keys = [*attached.policy.in_keys, "action"]
+    rows = batches(attached, ONE, 1)[0][:2]
+    minibatch = {key: rows[key] if attached.agent.memory else rows[key].flatten(0, 1) for key in keys}
+    attached.start_task(0)
+    attached.method.transform_minibatch(minibatch)
+    attached.end_task()
 
-    expected = torch.zeros(len(worn.agent.method.weights))
-    for chances in worn.agent.outputs(minibatch)["log_probs"].exp().flatten(0, -2):
+    expected = torch.zeros(len(attached.method.weights))
+    for chances in attached.agent.outputs(minibatch)["log_probs"].exp().flatten(0, -2):
         for chance in chances:
-            parts = torch.autograd.grad(chance, worn.agent.weights, retain_graph=True, materialize_grads=True)
+            parts = torch.autograd.grad(chance, attached.agent.weights, retain_graph=True, materialize_grads=True)
             expected += torch.cat([part.flatten() for part in parts]).square() / chance.detach() / 16
-    torch.testing.assert_close(worn.agent.method.importance, expected)
+    torch.testing.assert_close(attached.method.importance, expected)
 
 
 @pytest.mark.parametrize("method", [EWC, MAS])
 def test_steps_that_are_not_learned_from_are_not_weighed(compose, method):
     settings = {**(EWC_SETTINGS if method is EWC else {"heads": "single"}), "num_samples": 5}
-    worn, other = (wearing(compose, "drqn", method(coeff=1, **settings)) for _ in range(2))
-    batch = batches(worn, ONE, 1)[0][:2]
-    first = {key: batch[key] for key in [*worn.policy.in_keys, "action"]}
+    attached, other = (with_method(compose, "drqn", method(coeff=1, **settings)) for _ in range(2))
+    batch = batches(attached, ONE, 1)[0][:2]
+    first = {key: batch[key] for key in [*attached.policy.in_keys, "action"]}
     steps = torch.arange(batch.shape[1])
     masked = {**first, "learnt": torch.stack([steps < 3, steps < 2])}
-    for each, minibatch in ((worn, masked), (other, {key: value[:, :3] for key, value in first.items()})):
+    for each, minibatch in ((attached, masked), (other, {key: value[:, :3] for key, value in first.items()})):
         each.start_task(0)
-        each.agent.method.mixed(minibatch)
-    other.agent.method.samples.minibatches[0]["learnt"] = torch.tensor([[True, True, True], [True, True, False]])
+        each.method.transform_minibatch(minibatch)
+    other.method.samples.minibatches[0]["learnt"] = torch.tensor([[True, True, True], [True, True, False]])
 
-    worn.end_task()
+    attached.end_task()
     other.end_task()
 
-    assert worn.agent.method.importance.any()
-    torch.testing.assert_close(worn.agent.method.importance, other.agent.method.importance)
+    assert attached.method.importance.any()
+    torch.testing.assert_close(attached.method.importance, other.method.importance)
 
 
 def test_a_first_pass_of_rl2_has_no_last_steps(compose):
-    worn = wearing(compose, "rl2", MAS(coeff=1, num_samples=1000, heads="single"), TASKS, "agent.num_epochs=2")
-    (batch,) = batches(worn, ONE, 1)
+    attached = with_method(compose, "rl2", MAS(coeff=1, num_samples=1000, heads="single"), TASKS, "agent.num_epochs=2")
+    (batch,) = batches(attached, ONE, 1)
 
-    worn.start_task(0)
-    worn.learn(batch)
+    attached.start_task(0)
+    attached.learn(batch)
 
-    assert worn.agent.method.samples.held == batch.shape[0] * (batch.shape[1] - 1)
+    assert attached.method.samples.num_held == batch.shape[0] * (batch.shape[1] - 1)
 
 
 # Penalties
@@ -243,85 +243,85 @@ PENALTIES = {
 @pytest.mark.parametrize("name", PENALTIES)
 def test_the_penalty_and_its_gradient_are_those_by_hand(name):
     method, factor = PENALTIES[name]
-    worn = tiny(method)
+    attached = tiny(method)
     importance, anchor = torch.rand(9), torch.randn(9)
     method.importance.copy_(importance)
     method.anchor.copy_(anchor)
-    weights = move(worn, seed=1)
+    weights = move(attached, seed=1)
 
-    losses = worn.loss(seen(4))
+    losses = attached.loss(seen(4))
 
     expected = factor * (importance * (weights - anchor) ** 2).sum()
     torch.testing.assert_close(losses["loss_method"], expected)
     assert list(losses) == ["loss_first", "loss_others", "entropy", "loss_method"]
-    torch.testing.assert_close(gradient_of_penalty(worn), 2 * factor * importance * (weights - anchor))
+    torch.testing.assert_close(gradient_of_penalty(attached), 2 * factor * importance * (weights - anchor))
 
 
 @pytest.mark.parametrize("name", PENALTIES)
 def test_a_gradient_step_goes_down_the_losses_and_the_penalty(name):
     method, factor = PENALTIES[name]
-    worn = tiny(method)
+    attached = tiny(method)
     method.importance.copy_(torch.rand(9))
     method.anchor.copy_(torch.randn(9))
-    weights, batch = move(worn, seed=1), seen(4)
+    weights, batch = move(attached, seed=1), seen(4)
     own = torch.cat([(batch["factor"].T @ batch["observation"] / 4).flatten(), batch["factor"].mean(dim=0)])
 
-    worn.agent.gradient_step(batch)
+    attached.agent.gradient_step(batch)
 
     expected = weights - RATE * (own + 2 * factor * method.importance * (weights - method.anchor))
-    torch.testing.assert_close(vector(worn.agent).detach(), expected)
+    torch.testing.assert_close(vector(attached.agent).detach(), expected)
 
 
 def test_l2_holds_all_weights_alike_where_they_were_last_and_nothing_before():
-    worn = tiny(L2(coeff=0.5, heads="single"))
-    worn.start_task(0)
-    assert not gradient_of_penalty(worn).any()
-    worn.end_task()
-    worn.start_task(1)
-    last = move(worn, seed=3)
-    worn.end_task()
+    attached = tiny(L2(coeff=0.5, heads="single"))
+    attached.start_task(0)
+    assert not gradient_of_penalty(attached).any()
+    attached.end_task()
+    attached.start_task(1)
+    last = move(attached, seed=3)
+    attached.end_task()
 
-    weights = move(worn, seed=4)
+    weights = move(attached, seed=4)
 
-    torch.testing.assert_close(gradient_of_penalty(worn), weights - last)
+    torch.testing.assert_close(gradient_of_penalty(attached), weights - last)
 
 
-def remembered(worn: Wearing) -> tuple[list[Tensor], list[Tensor]]:
+def remembered(attached: AgentWithMethod) -> tuple[list[Tensor], list[Tensor]]:
     """Three tasks with random importances and weights."""
     fishers, anchors = torch.rand(3, 9), []
     fishers[1, 2:4], fishers[:, 5] = 0, 0
     for number, fisher in enumerate(fishers):
-        worn.start_task(number)
-        anchors.append(move(worn, seed=number))
-        worn.agent.method.task_importance = lambda fisher=fisher: fisher
-        worn.end_task()
+        attached.start_task(number)
+        anchors.append(move(attached, seed=number))
+        attached.method.task_importance = lambda fisher=fisher: fisher
+        attached.end_task()
     return list(fishers), anchors
 
 
 def test_separate_ewc_is_the_sum_of_one_term_for_each_earlier_task():
-    worn = tiny(EWC(coeff=4, **EWC_SETTINGS))
-    fishers, anchors = remembered(worn)
+    attached = tiny(EWC(coeff=4, **EWC_SETTINGS))
+    fishers, anchors = remembered(attached)
 
     def explicit(weights: Tensor) -> Tensor:
         return 2 * sum((f * (weights - a) ** 2).sum() for f, a in zip(fishers, anchors, strict=True))
 
     differences = []
     for seed in (7, 8):
-        weights = move(worn, seed).requires_grad_()
+        weights = move(attached, seed).requires_grad_()
         (expected,) = torch.autograd.grad(explicit(weights), weights)
-        torch.testing.assert_close(gradient_of_penalty(worn), expected)
-        differences.append(explicit(weights) - worn.agent.method.loss({})["loss_method"])
+        torch.testing.assert_close(gradient_of_penalty(attached), expected)
+        differences.append(explicit(weights) - attached.method.penalties({})["loss_method"])
     torch.testing.assert_close(*differences)  # a constant, which no gradient has
 
 
 def test_online_ewc_is_one_term_with_the_running_mean_at_the_last_weights():
-    worn = tiny(EWC(coeff=4, **{**EWC_SETTINGS, "online": True, "alpha": 0.25}))
-    fishers, anchors = remembered(worn)
+    attached = tiny(EWC(coeff=4, **{**EWC_SETTINGS, "online": True, "alpha": 0.25}))
+    fishers, anchors = remembered(attached)
 
-    weights = move(worn, seed=7)
+    weights = move(attached, seed=7)
 
     mean = 0.75 * (0.25**2 * fishers[0] + 0.25 * fishers[1] + fishers[2])  # begins at 0
-    torch.testing.assert_close(gradient_of_penalty(worn), 4 * mean * (weights - anchors[2]))
+    torch.testing.assert_close(gradient_of_penalty(attached), 4 * mean * (weights - anchors[2]))
 
 
 # The path of synaptic intelligence
@@ -330,25 +330,25 @@ def test_online_ewc_is_one_term_with_the_running_mean_at_the_last_weights():
 def test_synaptic_intelligence_is_the_path_integral_of_a_quadratic_loss_by_hand():
     """Over two tasks: in the second the penalty bends the way, but its gradient is no part of the integral."""
     c, xi = 3.0, 0.05
-    worn = tiny(SI(coeff=c, epsilon=xi, heads="single"), Bowl)
-    weights = vector(worn.agent).detach().double()
+    attached = tiny(SI(coeff=c, epsilon=xi, heads="single"), Bowl)
+    weights = vector(attached.agent).detach().double()
     steep, importance, anchor = Bowl.steepness.double(), torch.zeros(9).double(), weights.clone()
     action = torch.zeros(1, dtype=torch.int64)
 
     for number in range(2):
         targets = torch.randn(5, 9, generator=torch.Generator().manual_seed(number))
         start, path = weights.clone(), torch.zeros(9).double()
-        worn.start_task(number)
+        attached.start_task(number)
         for target in targets:
-            worn.agent.gradient_step({"action": action, "target": target.unsqueeze(0)})
+            attached.agent.gradient_step({"action": action, "target": target.unsqueeze(0)})
             own = steep * (weights - target.double())
             step = -RATE * (own + 2 * c * importance * (weights - anchor))
             path, weights = path - own * step, weights + step
-        worn.end_task()
+        attached.end_task()
         importance = importance + path.clamp(min=0) / ((weights - start) ** 2 + xi)
         anchor = weights.clone()
-        torch.testing.assert_close(worn.agent.method.importance.double(), importance, atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(worn.agent.method.anchor.double(), anchor, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(attached.method.importance.double(), importance, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(attached.method.anchor.double(), anchor, atol=1e-5, rtol=1e-4)
 
     assert (path < 0).any()  # which counts as 0
 
@@ -367,31 +367,31 @@ MULTI = {
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
 @pytest.mark.parametrize("name", MULTI)
 def test_output_layers_are_swapped_with_the_task_and_not_held(compose, agent, name):
-    worn = wearing(compose, agent, MULTI[name]())
-    method, inside = worn.agent.method, worn.agent.method.weights.in_heads
+    attached = with_method(compose, agent, MULTI[name]())
+    method, inside = attached.method, attached.method.weights.in_heads
     begun_with = method.weights.vector().detach()[inside]
 
-    stay(worn, 0)
+    stay(attached, 0)
     first = method.weights.vector().detach()
     assert not torch.equal(first[inside], begun_with)
-    worn.start_task(1)
+    attached.start_task(1)
     assert torch.equal(method.weights.vector()[inside], begun_with)
     assert torch.equal(method.weights.vector()[~inside], first[~inside])
-    stay(worn, 1)
+    stay(attached, 1)
     second = method.weights.vector().detach()
 
-    acted = torch.cat([weights.flatten() for weights in weights_for(worn, 0)])
+    acted = torch.cat([weights.flatten() for weights in weights_for(attached, 0)])
     assert method.importance[~inside].any() and not method.importance[inside].any()
-    worn.start_task(0)
+    attached.start_task(0)
     assert torch.equal(method.weights.vector()[inside], first[inside])
     assert torch.equal(method.weights.vector()[~inside], second[~inside])
-    assert torch.equal(acted, torch.cat([parameter.flatten() for parameter in worn.policy.parameters()]))
+    assert torch.equal(acted, torch.cat([parameter.flatten() for parameter in attached.policy.parameters()]))
 
 
 def test_the_output_layers_are_the_last_layers_of_policy_and_critic(compose):
     found = {}
     for agent in ("a2c", "dqn", "lstm_ppo", "ppo"):
-        weights = wearing(compose, agent, L2(coeff=1, heads="multi")).agent.method.weights
+        weights = with_method(compose, agent, L2(coeff=1, heads="multi")).method.weights
         found[agent] = sorted(tuple(parameter.shape) for parameter in weights.in_head_parameters)
 
     heads = [(1,), (1, 8), (3,), (3, 8)]
@@ -399,25 +399,25 @@ def test_the_output_layers_are_the_last_layers_of_policy_and_critic(compose):
 
 
 def test_the_optimiser_forgets_former_output_layers_and_nothing_else(compose):
-    worn = wearing(compose, "ppo", L2(coeff=0.1, heads="multi"))
-    stay(worn, 0)
+    attached = with_method(compose, "ppo", L2(coeff=0.1, heads="multi"))
+    stay(attached, 0)
 
-    worn.start_task(1)
+    attached.start_task(1)
 
-    state, heads = worn.agent.optimiser.state, worn.agent.method.weights.in_head_parameters
-    known = {parameter: any(value.any() for value in state[parameter].values()) for parameter in worn.agent.weights}
+    state, heads = attached.agent.optimiser.state, attached.method.weights.in_head_parameters
+    known = {parameter: any(value.any() for value in state[parameter].values()) for parameter in attached.agent.weights}
     assert [known[parameter] for parameter in heads] == [False] * 4
     assert all(known[parameter] for parameter in known if not any(parameter is head for head in heads))
 
 
 def test_the_target_network_gets_the_task_s_output_layers(compose):
-    worn = wearing(compose, "dqn", L2(coeff=0.1, heads="multi"))
-    stay(worn, 0)
+    attached = with_method(compose, "dqn", L2(coeff=0.1, heads="multi"))
+    stay(attached, 0)
 
-    worn.start_task(1)
+    attached.start_task(1)
 
-    target = worn.agent.dqn.target_value_network_params.flatten_keys(".")
-    online = worn.agent.dqn.value_network_params.flatten_keys(".")
+    target = attached.agent.dqn.target_value_network_params.flatten_keys(".")
+    online = attached.agent.dqn.value_network_params.flatten_keys(".")
     assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
 
 
@@ -429,13 +429,13 @@ def test_an_agent_without_layers_behind_a_trunk_has_no_output_layers_to_swap():
 
 
 def test_a_task_that_never_began_is_acted_in_with_output_layers_that_have_learned_nothing(compose):
-    worn = wearing(compose, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
-    method, inside = worn.agent.method, worn.agent.method.weights.in_heads
+    attached = with_method(compose, "ppo", L2(coeff=0.1, heads="multi"), (ONE, TWO, THREE))
+    method, inside = attached.method, attached.method.weights.in_heads
     begun_with = method.weights.vector().detach()[inside]
-    stay(worn, 0)
-    stay(worn, 1)
+    stay(attached, 0)
+    stay(attached, 1)
 
-    unseen, present = method.weights_of(2), method.weights.vector()
+    unseen, present = method.task_weights(2), method.weights.vector()
 
     assert torch.equal(unseen[inside], begun_with)
     assert torch.equal(unseen[~inside], present[~inside])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import GREEDY, batches
-from helpers.with_methods import RATE, TASKS, Tiny, same, seen, small, stay, wearing, weights_for
+from helpers.with_methods import RATE, TASKS, Tiny, same, seen, small, stay, weights_for, with_method
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import set_exploration_type
@@ -19,9 +19,9 @@ from baselines.methods.mask_blc import MaskBLC
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
 from baselines.methods.masks import Masks
+from baselines.methods.method import AgentWithMethod
 from baselines.methods.packnet import FREE, PackNet
 from baselines.methods.scratch import Scratch
-from baselines.methods.wearing import Wearing
 from baselines.methods.weights import flat
 from ctgraph_rl import Block
 
@@ -32,17 +32,17 @@ KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {"PackNet": 
 every_mask = pytest.mark.parametrize("method", MASKS)
 
 
-def said(worn: Wearing, number: int, data: Any) -> dict[Any, Tensor]:
+def said(attached: AgentWithMethod, number: int, data: Any) -> dict[Any, Tensor]:
     """All that the policy for a task writes."""
     with torch.no_grad(), set_exploration_type(GREEDY):
-        written = worn.policy_for(number)(data.select(*worn.policy.in_keys))
+        written = attached.policy_for(number)(data.select(*attached.policy.in_keys))
     return dict(written.items(True, True))
 
 
-def masked(method: type[Masks]) -> Wearing:
+def masked(method: type[Masks]) -> AgentWithMethod:
     """A `Tiny` agent with masks."""
     torch.manual_seed(0)
-    return Wearing(Tiny(), method(), CURRICULUM)
+    return AgentWithMethod(Tiny(), method(), CURRICULUM)
 
 
 class Normed(Tiny):
@@ -68,18 +68,18 @@ class Scaled(nn.Module):
 @every_mask
 def test_weights_that_are_no_matrix_are_refused(method):
     with pytest.raises(ValueError, match=r"weight matrices, and module\.1\.weight are none: take another"):
-        Wearing(Normed(), method(), CURRICULUM)
+        AgentWithMethod(Normed(), method(), CURRICULUM)
 
 
 def test_networks_from_scratch_have_all_kinds_of_layers_drawn_anew():
-    worn = Wearing(Normed(), Scratch(), CURRICULUM)
-    norm = worn.agent.policy.module[1]
-    worn.start_task(0)
+    attached = AgentWithMethod(Normed(), Scratch(), CURRICULUM)
+    norm = attached.agent.policy.module[1]
+    attached.start_task(0)
     with torch.no_grad():
         norm.weight.fill_(2.0)
-    worn.end_task()
+    attached.end_task()
 
-    worn.start_task(1)
+    attached.start_task(1)
 
     assert norm.weight.tolist() == [1.0, 1.0, 1.0]
 
@@ -90,7 +90,7 @@ def test_a_layer_that_cannot_be_drawn_anew_is_refused_where_that_is_needed():
     agent.optimiser = torch.optim.SGD(agent.policy.parameters(), RATE)
 
     with pytest.raises(ValueError, match=r"by reset_parameters, which module\.1 lack: add it"):
-        Wearing(agent, Scratch(), CURRICULUM)
+        AgentWithMethod(agent, Scratch(), CURRICULUM)
 
 
 # What holds for all of them
@@ -99,82 +99,82 @@ def test_a_layer_that_cannot_be_drawn_anew_is_refused_where_that_is_needed():
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
 @pytest.mark.parametrize("name", KEEPS)
 def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(compose, agent, name):
-    worn = wearing(compose, agent, KEEPS[name]())
-    data = batches(worn, ONE, 1)[0][:, 0].clone()
-    stay(worn, 0)
-    first = said(worn, 0, data), weights_for(worn, 0)
-    stay(worn, 1)
-    second = said(worn, 1, data), weights_for(worn, 1)
-    stay(worn, 2)
+    attached = with_method(compose, agent, KEEPS[name]())
+    data = batches(attached, ONE, 1)[0][:, 0].clone()
+    stay(attached, 0)
+    first = said(attached, 0, data), weights_for(attached, 0)
+    stay(attached, 1)
+    second = said(attached, 1, data), weights_for(attached, 1)
+    stay(attached, 2)
 
     for number, (outputs, weights) in enumerate((first, second)):
-        assert same(weights_for(worn, number), weights)
-        assert same(said(worn, number, data), outputs)
-    others = [weights_for(worn, number) for number in range(3)]
+        assert same(weights_for(attached, number), weights)
+        assert same(said(attached, number, data), outputs)
+    others = [weights_for(attached, number) for number in range(3)]
     assert not same(others[0], others[1]) and not same(others[1], others[2])
 
 
 @pytest.mark.parametrize("name", KEEPS)
 def test_a_task_that_comes_again_goes_on_with_what_it_had(compose, name):
-    worn = wearing(compose, "ppo", KEEPS[name]())
-    stay(worn, 0)
-    had = weights_for(worn, 0)
-    stay(worn, 1)
-    other = weights_for(worn, 1)
+    attached = with_method(compose, "ppo", KEEPS[name]())
+    stay(attached, 0)
+    had = weights_for(attached, 0)
+    stay(attached, 1)
+    other = weights_for(attached, 1)
 
-    worn.start_task(0)
-    again = weights_for(worn, 0)
-    stay(worn, 0)
+    attached.start_task(0)
+    again = weights_for(attached, 0)
+    stay(attached, 0)
 
     assert same(again, had)
-    assert not same(weights_for(worn, 0), had)
-    assert same(weights_for(worn, 1), other)
+    assert not same(weights_for(attached, 0), had)
+    assert same(weights_for(attached, 1), other)
 
 
 @pytest.mark.parametrize("name", KEEPS)
 def test_a_task_that_never_began_is_acted_in_as_the_first(compose, name):
-    worn = wearing(compose, "ppo", KEEPS[name]())
-    before = weights_for(worn, 2)
-    assert same(before, weights_for(worn, 0))
-    stay(worn, 1)  # the first one that begins has the id 1
-    stay(worn, 0)
+    attached = with_method(compose, "ppo", KEEPS[name]())
+    before = weights_for(attached, 2)
+    assert same(before, weights_for(attached, 0))
+    stay(attached, 1)  # the first one that begins has the id 1
+    stay(attached, 0)
 
-    unseen, first, second = (weights_for(worn, number) for number in (2, 1, 0))
+    unseen, first, second = (weights_for(attached, number) for number in (2, 1, 0))
 
     assert same(unseen, first) and not same(unseen, second)
 
 
 @pytest.mark.parametrize("name", KEEPS)
 def test_a_task_beyond_those_of_the_curriculum_is_refused(compose, name):
-    worn = wearing(compose, "ppo", KEEPS[name](), (ONE, TWO))
+    attached = with_method(compose, "ppo", KEEPS[name](), (ONE, TWO))
     for number in (0, 1, 0):
-        stay(worn, number, (ONE, TWO), 1)
+        stay(attached, number, (ONE, TWO), 1)
 
     with pytest.raises(ValueError, match="there is room for 2 tasks, got another, 5"):
-        worn.start_task(5)
+        attached.start_task(5)
 
 
 @pytest.mark.parametrize("name", KEEPS)
 def test_the_target_network_follows_where_weights_are_changed(compose, name):
-    worn = wearing(compose, "dqn", KEEPS[name]())
-    stay(worn, 0)
+    attached = with_method(compose, "dqn", KEEPS[name]())
+    stay(attached, 0)
 
-    worn.start_task(1)
+    attached.start_task(1)
 
-    loss = worn.agent.dqn
+    loss = attached.agent.dqn
     target, online = (part.flatten_keys(".") for part in (loss.target_value_network_params, loss.value_network_params))
     assert all(torch.equal(target[key], online[key]) for key in online.keys())  # noqa: SIM118
 
 
 def test_a_policy_for_another_task_explores_as_the_present_one_does(compose):
-    worn = wearing(compose, "dqn", MaskRI())
-    stay(worn, 0)
-    worn.start_task(1)
-    assert worn.policy_for(0).module[1].eps.item() == 1.0
+    attached = with_method(compose, "dqn", MaskRI())
+    stay(attached, 0)
+    attached.start_task(1)
+    assert attached.policy_for(0).module[1].eps.item() == 1.0
 
-    worn.learn(batches(worn, TWO, 1)[0])
+    attached.learn(batches(attached, TWO, 1)[0])
 
-    assert worn.policy_for(0).module[1].eps.item() == worn.policy_for(1).module[1].eps.item() < 1.0
+    assert attached.policy_for(0).module[1].eps.item() == attached.policy_for(1).module[1].eps.item() < 1.0
 
 
 # Masks
@@ -183,11 +183,11 @@ def test_a_policy_for_another_task_explores_as_the_present_one_does(compose):
 @pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
 def test_the_network_is_of_signed_constants_and_zero_biases(compose, agent):
     drawn = [weights.detach().clone() for weights in small(compose, agent).policy.parameters()]
-    worn = wearing(compose, agent, MaskRI())
+    attached = with_method(compose, agent, MaskRI())
 
     for number in range(2):
-        stay(worn, number)
-        for before, now in zip(drawn, weights_for(worn, number), strict=True):
+        stay(attached, number)
+        for before, now in zip(drawn, weights_for(attached, number), strict=True):
             constant = before.sign() * (2 / before.shape[-1]) ** 0.5 if before.ndim == 2 else torch.zeros_like(before)
             kept = now != 0
             torch.testing.assert_close(now, torch.where(kept, constant, 0.0), atol=0, rtol=1e-6)
@@ -201,9 +201,9 @@ def vector(parts: Iterable[Tensor]) -> Tensor:
 
 def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_inputs(compose):
     method = MaskRI()
-    worn = wearing(compose, "ppo", method, TASKS, "agent.hidden_size=64")
+    attached = with_method(compose, "ppo", method, TASKS, "agent.hidden_size=64")
 
-    worn.start_task(0)
+    attached.start_task(0)
 
     for parameter, scores in zip(method.weights.parameters, method.own, strict=True):
         if parameter.ndim == 1:
@@ -218,23 +218,23 @@ def test_scores_begin_uniform_between_plus_and_minus_one_over_the_root_of_the_in
 
 @every_mask
 def test_each_new_task_s_own_scores_are_drawn_anew(compose, method):
-    worn = wearing(compose, "ppo", method())
+    attached = with_method(compose, "ppo", method())
     own = []
     for number in range(2):
-        worn.start_task(number)
-        own.append(vector(worn.agent.method.own))
-        worn.end_task()
+        attached.start_task(number)
+        own.append(vector(attached.method.own))
+        attached.end_task()
 
-    assert (own[0] != own[1])[worn.agent.method.weights.in_matrices].float().mean() > 0.99
+    assert (own[0] != own[1])[attached.method.weights.in_matrices].float().mean() > 0.99
 
 
 def test_the_gradient_goes_straight_through_the_mask_to_all_scores():
-    worn, minibatch = masked(MaskRI), seen(6)
-    worn.start_task(0)
-    method = worn.agent.method
+    attached, minibatch = masked(MaskRI), seen(6)
+    attached.start_task(0)
+    method = attached.method
     before, weights = vector(method.own), method.weights.vector().detach()
 
-    worn.agent.gradient_step(minibatch)
+    attached.agent.gradient_step(minibatch)
 
     # dL/dW_kj = mean_n f_nk x_nj whatever the weights are; dL/ds = c dL/dw, and biases have c = 0.
     of_weight = (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
@@ -252,33 +252,33 @@ SHARES = {MaskLC: [[1.0], [0.5] * 2, [1 / 3] * 3], MaskBLC: [[1.0], [0.5, 0.5], 
 
 @pytest.mark.parametrize("method", SHARES)
 def test_a_linear_combination_begins_with_its_shares(compose, method):
-    worn = wearing(compose, "ppo", method())
-    its = worn.agent.method
+    attached = with_method(compose, "ppo", method())
+    its = attached.method
 
     for number in range(3):
-        worn.start_task(number)
-        present, own = vector(its.present_scores()), vector(its.own)
+        attached.start_task(number)
+        present, own = vector(its.current_scores()), vector(its.own)
         expected = sum(
             share * scores for share, scores in zip(SHARES[method][number], [*its.scores[:number], own], strict=True)
         )
         torch.testing.assert_close(present, expected)
         assert torch.equal(its.weights.vector(), torch.where(present >= 0, its.constant, 0.0))
-        stay(worn, number)
+        stay(attached, number)
 
 
 @pytest.mark.parametrize("method", SHARES)
 def test_a_step_moves_the_combination_of_each_weight_tensor_by_its_own_shares(method):
-    worn, minibatch = masked(method), seen(6)
-    its = worn.agent.method
+    attached, minibatch = masked(method), seen(6)
+    its = attached.method
     for number in range(2):
-        worn.start_task(number)
-        worn.agent.gradient_step(minibatch)
-        worn.end_task()
-    worn.start_task(2)
+        attached.start_task(number)
+        attached.agent.gradient_step(minibatch)
+        attached.end_task()
+    attached.start_task(2)
     shares, own, old = torch.tensor(SHARES[method][2]), vector(its.own), its.scores[:2].clone()
     betas = its.betas.detach().clone()
 
-    worn.agent.gradient_step(minibatch)
+    attached.agent.gradient_step(minibatch)
 
     of_scores = its.constant[:6] * (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
     torch.testing.assert_close(vector(its.own)[:6], own[:6] - RATE * shares[2] * of_scores)
@@ -292,35 +292,35 @@ def test_a_step_moves_the_combination_of_each_weight_tensor_by_its_own_shares(me
 
 @pytest.mark.parametrize("method", SHARES)
 def test_the_combination_is_consolidated_at_the_tasks_end(compose, method):
-    worn = wearing(compose, "ppo", method())
-    its = worn.agent.method
-    stay(worn, 0)
-    worn.start_task(1)
-    for batch in batches(worn, TWO, 2):
-        worn.learn(batch)
-    combined, weights = vector(its.present_scores()), weights_for(worn, 1)
+    attached = with_method(compose, "ppo", method())
+    its = attached.method
+    stay(attached, 0)
+    attached.start_task(1)
+    for batch in batches(attached, TWO, 2):
+        attached.learn(batch)
+    combined, weights = vector(its.current_scores()), weights_for(attached, 1)
     assert not torch.equal(combined, vector(its.own))
 
-    worn.end_task()
+    attached.end_task()
 
     assert torch.equal(its.scores[1], combined)
-    assert torch.equal(vector(its.present_scores()), combined)
-    assert same(weights_for(worn, 1), weights)
+    assert torch.equal(vector(its.current_scores()), combined)
+    assert same(weights_for(attached, 1), weights)
 
 
 @pytest.mark.parametrize("method", SHARES)
 def test_a_task_that_comes_again_learns_its_consolidated_scores_alone(method):
-    worn, minibatch = masked(method), seen(6)
-    its = worn.agent.method
+    attached, minibatch = masked(method), seen(6)
+    its = attached.method
     for number in (0, 1, 2):
-        worn.start_task(number)
-        worn.agent.gradient_step(minibatch)
-        worn.end_task()
+        attached.start_task(number)
+        attached.agent.gradient_step(minibatch)
+        attached.end_task()
     kept = its.scores.clone()
 
-    worn.start_task(1)
-    worn.agent.gradient_step(minibatch)
-    worn.end_task()
+    attached.start_task(1)
+    attached.agent.gradient_step(minibatch)
+    attached.end_task()
 
     of_weight = (minibatch["factor"].T @ minibatch["observation"] / 6).flatten()
     torch.testing.assert_close(its.scores[1, :6], kept[1, :6] - RATE * its.constant[:6] * of_weight)
@@ -329,33 +329,33 @@ def test_a_task_that_comes_again_learns_its_consolidated_scores_alone(method):
 
 @every_mask
 def test_the_optimiser_starts_anew_with_each_task(compose, method):
-    worn = wearing(compose, "ppo", method())
-    stay(worn, 0)
-    assert worn.agent.optimiser.state
+    attached = with_method(compose, "ppo", method())
+    stay(attached, 0)
+    assert attached.agent.optimiser.state
 
-    worn.start_task(1)
+    attached.start_task(1)
 
-    assert not worn.agent.optimiser.state
-    live = worn.agent.live
-    its = worn.agent.method
+    assert not attached.agent.optimiser.state
+    live = attached.agent.trainable
+    its = attached.method
     expected = [*its.own] if method is MaskRI else [*its.own, its.betas]
     assert all(one is other for one, other in zip(live, expected, strict=True))
-    assert worn.agent.optimiser.defaults == small(compose, "ppo").optimiser.defaults
+    assert attached.agent.optimiser.defaults == small(compose, "ppo").optimiser.defaults
 
 
 # PackNet
 
 
-def packed(compose, agent: str = "ppo", retrain: float = 0.5) -> tuple[Wearing, PackNet]:
+def packed(compose, agent: str = "ppo", retrain: float = 0.5) -> tuple[AgentWithMethod, PackNet]:
     method = PackNet(retrain=retrain)
-    return wearing(compose, agent, method), method
+    return with_method(compose, agent, method), method
 
 
 @pytest.mark.parametrize("agent", ["dqn", "lstm_ppo"])
 def test_each_task_keeps_an_equal_share_of_every_weight_matrix(compose, agent):
-    worn, method = packed(compose, agent)
+    attached, method = packed(compose, agent)
     for number in range(3):
-        stay(worn, number)
+        stay(attached, number)
 
     of_parameters = zip(
         method.weights.names, method.weights.parameters, method.weights.split(method.owner), strict=True
@@ -371,12 +371,12 @@ def test_each_task_keeps_an_equal_share_of_every_weight_matrix(compose, agent):
 
 
 def test_the_largest_free_weights_are_kept_and_the_others_are_zero(compose):
-    worn, method = packed(compose)
-    worn.start_task(0)
-    worn.learn(batches(worn, ONE, 1)[0])
+    attached, method = packed(compose)
+    attached.start_task(0)
+    attached.learn(batches(attached, ONE, 1)[0])
     trained = [parameter.detach().clone() for parameter in method.weights.parameters]
 
-    worn.end_task()
+    attached.end_task()
 
     for name, before, now, owner in zip(
         method.weights.names, trained, method.weights.parameters, method.weights.split(method.owner), strict=True
@@ -390,14 +390,14 @@ def test_the_largest_free_weights_are_kept_and_the_others_are_zero(compose):
 
 
 def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_zero(compose):
-    worn, method = packed(compose)
-    stay(worn, 0)
+    attached, method = packed(compose)
+    stay(attached, 0)
     trunk = ~method.in_heads
     kept, first = (method.owner == 0) & trunk, method.weights.vector().detach()
-    stay(worn, 1)
+    stay(attached, 1)
     second = method.weights.vector().detach()
     free = (method.owner == FREE) & trunk
-    stay(worn, 2)
+    stay(attached, 2)
 
     last = method.weights.vector().detach()
 
@@ -411,15 +411,16 @@ def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_ze
 def test_pruning_leaves_a_share_of_the_block_for_retraining(compose, retrain, number_of_prunings):
     """Blocks of 160 frames are announced; batches have 16."""
     method = PackNet(retrain=retrain)
-    worn = wearing(compose, "ppo", method, TASKS, "agent.num_envs=4", "agent.num_steps=10", "agent.num_minibatches=1")
-    worn.start_task(0)
+    shape = ("agent.num_envs=4", "agent.num_steps=10", "agent.num_minibatches=1")
+    attached = with_method(compose, "ppo", method, TASKS, *shape)
+    attached.start_task(0)
 
     pruned = []
-    for batch in batches(worn, ONE, 4):
-        worn.learn(batch)
+    for batch in batches(attached, ONE, 4):
+        attached.learn(batch)
         pruned.append(bool((method.owner == 0).any()))
     before = method.weights.vector().detach()
-    worn.end_task()
+    attached.end_task()
 
     assert pruned == [number >= number_of_prunings for number in range(4)]
     zero = (method.owner == FREE) & ~method.in_heads
@@ -428,15 +429,15 @@ def test_pruning_leaves_a_share_of_the_block_for_retraining(compose, retrain, nu
 
 
 def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(compose):
-    worn, method = packed(compose, retrain=0.999)
-    worn.start_task(0)
-    one, other, more = batches(worn, ONE, 3)
-    worn.learn(one)
-    worn.learn(other)
+    attached, method = packed(compose, retrain=0.999)
+    attached.start_task(0)
+    one, other, more = batches(attached, ONE, 3)
+    attached.learn(one)
+    attached.learn(other)
     kept, free = (method.owner == 0) & ~method.in_heads, (method.owner == FREE) & ~method.in_heads
     before = method.weights.vector().detach()
 
-    worn.learn(more)
+    attached.learn(more)
 
     after = method.weights.vector().detach()
     assert kept.any() and free.any()
@@ -445,23 +446,23 @@ def test_pruned_weights_stay_zero_and_kept_ones_are_trained_further(compose):
 
 
 def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_acts_with(compose):
-    worn, method = packed(compose)
+    attached, method = packed(compose)
     for number in range(3):
-        stay(worn, number)
+        stay(attached, number)
     inside, packed_before, owner = method.in_heads, method.packed.clone(), method.owner.clone()
-    acted, others = worn.policy_for(0), [weights_for(worn, number) for number in (1, 2)]
+    acted, others = attached.policy_for(0), [weights_for(attached, number) for number in (1, 2)]
     had = torch.cat([dict(acted.named_parameters())[name].flatten() for name in method.weights.names]).detach().clone()
 
-    worn.start_task(0)
-    for batch in batches(worn, ONE, 2):
-        worn.learn(batch)
+    attached.start_task(0)
+    for batch in batches(attached, ONE, 2):
+        attached.learn(batch)
     trained = method.weights.vector().detach()
-    worn.end_task()
+    attached.end_task()
 
     assert torch.equal(trained[~inside], had[~inside])
     assert not torch.equal(trained[inside], had[inside])
     assert torch.equal(method.packed, packed_before) and torch.equal(method.owner, owner)
-    assert all(same(weights_for(worn, number), weights) for number, weights in zip((1, 2), others, strict=True))
+    assert all(same(weights_for(attached, number), weights) for number, weights in zip((1, 2), others, strict=True))
 
 
 # From scratch
@@ -469,32 +470,32 @@ def test_a_returning_task_trains_its_output_layers_alone_on_the_network_that_it_
 
 def test_a_new_task_draws_a_new_network_and_forgets_the_optimisers_state(compose):
     begun_with = [weights.detach().clone() for weights in small(compose, "ppo").policy.parameters()]
-    worn = wearing(compose, "ppo", Scratch())
+    attached = with_method(compose, "ppo", Scratch())
 
-    worn.start_task(0)
-    assert same([*worn.policy.parameters()], begun_with)
-    stay(worn, 0)
-    first = weights_for(worn, 0)
-    worn.start_task(1)
-    drawn = weights_for(worn, 1)
+    attached.start_task(0)
+    assert same([*attached.policy.parameters()], begun_with)
+    stay(attached, 0)
+    first = weights_for(attached, 0)
+    attached.start_task(1)
+    drawn = weights_for(attached, 1)
 
     for was, learned, now in zip(begun_with, first, drawn, strict=True):
         assert not (now == was).any() and not (now == learned).any()
         inputs = now.shape[1] if now.ndim == 2 else None
         assert inputs is None or 0 < now.abs().max() <= inputs**-0.5  # as PyTorch draws linear layers
-    assert not any(value.any() for state in worn.agent.optimiser.state.values() for value in state.values())
+    assert not any(value.any() for state in attached.agent.optimiser.state.values() for value in state.values())
 
 
 def test_a_task_from_scratch_is_learned_as_by_a_new_agent_with_those_weights(compose):
-    worn, alone = wearing(compose, "ppo", Scratch()), small(compose, "ppo")
-    stay(worn, 0)
-    worn.start_task(1)
-    alone.policy.load_state_dict(deepcopy(worn.policy.state_dict()))
-    given = batches(worn, THREE, 2)
+    attached, alone = with_method(compose, "ppo", Scratch()), small(compose, "ppo")
+    stay(attached, 0)
+    attached.start_task(1)
+    alone.policy.load_state_dict(deepcopy(attached.policy.state_dict()))
+    given = batches(attached, THREE, 2)
 
-    for agent in (worn, alone):
+    for agent in (attached, alone):
         torch.manual_seed(5)
         for batch in given:
             agent.learn(batch)
 
-    assert same([*worn.policy.parameters()], [*alone.policy.parameters()])
+    assert same([*attached.policy.parameters()], [*alone.policy.parameters()])

@@ -11,10 +11,10 @@ import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import batches, saved_and_loaded
-from helpers.with_methods import TASKS, same, small, stay, wearing, weights_for
+from helpers.with_methods import TASKS, same, small, stay, weights_for, with_method
 from torch import Tensor
 
-from baselines.compiled import whole_step
+from baselines.learner import functional_gradient_step
 from baselines.methods.clear import CLEAR, Reservoir
 from baselines.methods.ewc import EWC
 from baselines.methods.l2 import L2
@@ -22,12 +22,11 @@ from baselines.methods.mas import MAS
 from baselines.methods.mask_blc import MaskBLC
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
-from baselines.methods.method import Method
+from baselines.methods.method import AgentWithMethod, Method
 from baselines.methods.multitask import Multitask
 from baselines.methods.packnet import PackNet
 from baselines.methods.scratch import Scratch
 from baselines.methods.si import SI
-from baselines.methods.wearing import Wearing
 from ctgraph_rl import Block
 from ctgraph_rl.learn.collect import collect, make_env
 from ctgraph_rl.policies import OptimalPolicy
@@ -103,15 +102,15 @@ def test_samples_are_drawn_alike_from_what_is_there():
 # Behaviour cloning
 
 
-def cloning(compose, agent: str, **settings: float) -> tuple[Wearing, dict[str, Tensor], dict[Any, Tensor]]:
+def cloning(compose, agent: str, **settings: float) -> tuple[AgentWithMethod, dict[str, Tensor], dict[Any, Tensor]]:
     """An agent with a batch of 128 steps in its reservoir, its losses, and what was replayed."""
     method = CLEAR(**{"buffer_size": 128, "policy_coeff": 1.0, "value_coeff": 1.0, **settings})
-    worn = wearing(compose, agent, method)
-    method.see(batches(worn, ONE, 1)[0])
+    attached = with_method(compose, agent, method)
+    method.on_batch(batches(attached, ONE, 1)[0])
     torch.manual_seed(1)
-    mixed = method.mixed({"action": torch.zeros(6, dtype=torch.int64)})
+    mixed = method.transform_minibatch({"action": torch.zeros(6, dtype=torch.int64)})
     replayed = {key[1]: value for key, value in mixed.items() if isinstance(key, tuple) and key[0] == "replay"}
-    return worn, mixed, replayed
+    return attached, mixed, replayed
 
 
 def test_the_memory_that_replay_asks_for_is_that_of_its_images_and_states(compose, monkeypatch):
@@ -120,19 +119,19 @@ def test_the_memory_that_replay_asks_for_is_that_of_its_images_and_states(compos
 
     states = []
     for agent in ("ppo", "lstm_ppo"):
-        worn = wearing(compose, agent, CLEAR(buffer_size=128, policy_coeff=1.0, value_coeff=1.0))
-        states.append(sum(each[0].nbytes for each in worn.agent.initial_state(3).values()))
+        attached = with_method(compose, agent, CLEAR(buffer_size=128, policy_coeff=1.0, value_coeff=1.0))
+        states.append(sum(each[0].nbytes for each in attached.agent.initial_state(3).values()))
 
-    image = batches(worn, ONE, 1)[0]["observation"][0, 0].nbytes
+    image = batches(attached, ONE, 1)[0]["observation"][0, 0].nbytes
     assert states[0] == 0 < states[1]
     assert asked == [("replay of buffer_size=128 steps", 128 * (image + state)) for state in states]
 
 
 @pytest.mark.parametrize("agent", ["a2c", "dqn", "lstm_ppo", "ppo"])
 def test_cloning_loses_nothing_right_after_storing(compose, agent):
-    worn, mixed, replayed = cloning(compose, agent)
+    attached, mixed, replayed = cloning(compose, agent)
 
-    losses = worn.agent.method.loss(mixed)
+    losses = attached.method.penalties(mixed)
 
     names = ["loss_policy_cloning", "loss_value_cloning"] if agent != "dqn" else ["loss_value_cloning"]
     assert list(losses) == names
@@ -140,45 +139,45 @@ def test_cloning_loses_nothing_right_after_storing(compose, agent):
     assert all(len(value) == 6 for value in replayed.values())
 
 
-def change(worn: Wearing) -> None:
+def change(attached: AgentWithMethod) -> None:
     """Other weights."""
-    weights = worn.agent.method.weights
+    weights = attached.method.weights
     weights.write(weights.vector() + 0.3 * torch.randn(len(weights), generator=torch.Generator().manual_seed(2)))
 
 
 @pytest.mark.parametrize("agent", ["lstm_ppo", "ppo"])
 def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error_of_values(compose, agent):
-    worn, mixed, replayed = cloning(compose, agent, policy_coeff=0.5, value_coeff=3.0)
-    change(worn)
+    attached, mixed, replayed = cloning(compose, agent, policy_coeff=0.5, value_coeff=3.0)
+    change(attached)
 
-    losses = worn.agent.method.loss(mixed)
+    losses = attached.method.penalties(mixed)
 
-    now = worn.agent.outputs(replayed)
+    now = attached.agent.outputs(replayed)
     old, new = (torch.distributions.Categorical(logits=each["log_probs"]) for each in (replayed, now))
     divergence = torch.distributions.kl_divergence(old, new)
     assert divergence.min() > 1e-4
     torch.testing.assert_close(losses["loss_policy_cloning"], 0.5 * divergence.mean())
     error = (replayed["state_value"] - now["state_value"]) ** 2
     torch.testing.assert_close(losses["loss_value_cloning"], 3 * error.mean())
-    gradients = torch.autograd.grad(sum(losses.values()), worn.agent.weights)
+    gradients = torch.autograd.grad(sum(losses.values()), attached.agent.weights)
     assert all(gradient.any() for gradient in gradients)
 
 
 def test_a_q_learner_clones_its_action_values(compose):
-    worn, mixed, replayed = cloning(compose, "dqn", value_coeff=3.0)
-    change(worn)
+    attached, mixed, replayed = cloning(compose, "dqn", value_coeff=3.0)
+    change(attached)
 
-    losses = worn.agent.method.loss(mixed)
+    losses = attached.method.penalties(mixed)
 
-    error = (replayed["action_value"] - worn.agent.values(replayed)) ** 2
+    error = (replayed["action_value"] - attached.agent.values(replayed)) ** 2
     assert list(losses) == ["loss_value_cloning"] and error.shape == (6, 3)
     torch.testing.assert_close(losses["loss_value_cloning"], 3 * error.mean())
 
 
 def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(compose):
-    worn, _, replayed = cloning(compose, "ppo")
-    batch = batches(worn, ONE, 1)[0]
-    said = worn.agent.outputs({"observation": batch["observation"].flatten(0, 1)})["log_probs"]
+    attached, _, replayed = cloning(compose, "ppo")
+    batch = batches(attached, ONE, 1)[0]
+    said = attached.agent.outputs({"observation": batch["observation"].flatten(0, 1)})["log_probs"]
 
     known = {
         (*map(float, o), *p) for o, p in zip(batch["observation"].flatten(0, 1).tolist(), said.tolist(), strict=True)
@@ -192,13 +191,13 @@ def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(compo
 
 
 def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(compose):
-    worn = wearing(compose, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
-    sizes, loss = Counter(), worn.agent.method.loss
-    worn.agent.method.loss = lambda batch: (sizes.update([len(batch["replay", "log_probs"])]), loss(batch))[1]
+    attached = with_method(compose, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
+    sizes, loss = Counter(), attached.method.penalties
+    attached.method.penalties = lambda batch: (sizes.update([len(batch["replay", "log_probs"])]), loss(batch))[1]
 
-    worn.learn(batches(worn, ONE, 1)[0])
+    attached.learn(batches(attached, ONE, 1)[0])
 
-    assert sizes == {worn.agent.minibatch_size: 16}
+    assert sizes == {attached.agent.minibatch_size: 16}
 
 
 # All tasks at once
@@ -259,23 +258,23 @@ def test_what_is_stored_is_what_is_counted(compose, name):
     make, counted = COUNTED[name]
     method = make()
     if name in ("None", "Multitask"):
-        worn = Wearing(small(compose, "ppo"), method, of(*(Block(task, 160) for task in TASKS)))
+        attached = AgentWithMethod(small(compose, "ppo"), method, of(*(Block(task, 160) for task in TASKS)))
     else:
-        worn = wearing(compose, "ppo", method)
-    assert len(worn.agent.method.weights) == WEIGHTS and len(worn.agent.method.weights.parameters) == LAYERS
+        attached = with_method(compose, "ppo", method)
+    assert len(attached.method.weights) == WEIGHTS and len(attached.method.weights.parameters) == LAYERS
 
     for number in range(3):
-        stay(worn, number)
+        stay(attached, number)
 
         assert nbytes(dict(method.state_dict())) == counted
 
 
 def test_the_samples_of_a_task_are_stored_until_its_end(compose):
     method = EWC(**{**OF_EWC, "num_samples": 20}, heads="single")
-    worn = wearing(compose, "ppo", method)
-    worn.start_task(0)
+    attached = with_method(compose, "ppo", method)
+    attached.start_task(0)
 
-    worn.learn(batches(worn, ONE, 1)[0])
+    attached.learn(batches(attached, ONE, 1)[0])
 
     # 32 frames, the last minibatch: observation, action, chance, advantage, target.
     assert nbytes(method.get_extra_state()) == 32 * (5 + 8 + 3 * 4)
@@ -296,27 +295,27 @@ COMPILED = {
 }
 
 
-def two_tasks(compose, name: str, *overrides: str, whole: bool = False) -> Wearing:
-    worn = wearing(compose, "ppo", COMPILED[name](), TASKS, *overrides)
+def two_tasks(compose, name: str, *overrides: str, whole: bool = False) -> AgentWithMethod:
+    attached = with_method(compose, "ppo", COMPILED[name](), TASKS, *overrides)
     if whole:  # the step that is compiled, without compiling it
-        worn.agent.compiled_step = whole_step
-        worn.agent.optimise = lambda parameters: _optimise(worn.agent, parameters)
+        attached.agent.compiled_step = functional_gradient_step
+        attached.agent.replace_optimiser = lambda parameters: _optimise(attached.agent, parameters)
     for number in range(2):
         torch.manual_seed(number)
-        stay(worn, number)
-    return worn
+        stay(attached, number)
+    return attached
 
 
 def _optimise(agent: Any, parameters: Any) -> None:
-    type(agent).optimise(agent, parameters)
-    agent.compiled_step = whole_step
+    type(agent).replace_optimiser(agent, parameters)
+    agent.compiled_step = functional_gradient_step
 
 
-def check_close(one: Wearing, other: Wearing) -> None:
+def check_close(one: AgentWithMethod, other: AgentWithMethod) -> None:
     """Equal up to rounding: weights of all tasks, and the method's buffers."""
     for found, expected in zip(one.agent.parameters(), other.agent.parameters(), strict=True):
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-3)
-    for found, expected in zip(one.agent.method.buffers(), other.agent.method.buffers(), strict=True):
+    for found, expected in zip(one.method.buffers(), other.method.buffers(), strict=True):
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-2)
 
 
@@ -331,7 +330,7 @@ def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(co
 @pytest.mark.parametrize(("name", "backend"), [*((name, "eager") for name in COMPILED), ("mask_lc", "inductor")])
 def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monkeypatch, name, backend):
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
-    whole, resumed = (wearing(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
+    whole, resumed = (with_method(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
     torch.manual_seed(1)
     stay(whole, 0)
     whole.start_task(1)
@@ -339,10 +338,10 @@ def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monk
     whole.learn(first)
     resumed.load_state_dict(saved_and_loaded(whole.state_dict()))
 
-    for worn in (whole, resumed):
+    for attached in (whole, resumed):
         torch.manual_seed(2)
-        worn.learn(second)
-        worn.end_task()
+        attached.learn(second)
+        attached.end_task()
 
     for number in range(2):
         assert same(weights_for(resumed, number), weights_for(whole, number))
@@ -353,11 +352,11 @@ def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, monk
 def test_no_task_needs_more_than_one_compiled_step(compose, monkeypatch, name):
     """There is a limit, so else a curriculum of many tasks stops."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    worn = wearing(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
+    attached = with_method(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
 
     with torch._dynamo.config.patch(recompile_limit=1):
         for number in (0, 1, 2, 0):
-            stay(worn, number)
+            stay(attached, number)
 
 
 @pytest.mark.slow

@@ -1,0 +1,31 @@
+"""What a lifelong-learning method can change in a gradient step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from baselines.networks import Data
+
+
+class Hooks(nn.Module):
+    """Hooks that change nothing; an agent calls them in each gradient step, in this order.
+
+    `baselines.methods.method.Method` derives from it. Buffers and parameters are saved with the agent.
+    """
+
+    def transform_minibatch(self, batch: Data) -> Data:
+        """Return the minibatch to learn from in place of the given one."""
+        return batch
+
+    def penalties(self, batch: Data) -> dict[str, Tensor]:
+        """Return what is added to the agent's losses, as scalars named ``loss_*``."""
+        return {}
+
+    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the gradients of the optimiser's parameters, given those of the agent's weights."""
+        return gradients
+
+    def after_step(self) -> None:
+        """Called after each step of the optimiser."""
