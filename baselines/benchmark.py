@@ -145,7 +145,7 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
         task = TASKS[label]
         yield Contender(name, label, "ours", partial(Ours, name, task))
         if find_spec("sb3_contrib"):
-            from baselines._stable import Stable, ways
+            from baselines._stable import Stable, ways  # needs Stable-Baselines3, which is optional
 
             for who, way in ways().items():
                 yield Contender(name, label, who, partial(Stable, name, settings(name), task, way))

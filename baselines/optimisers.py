@@ -30,12 +30,14 @@ def functional_step(optimiser: torch.optim.Optimizer, gradients: list[Tensor]) -
     state: dict[str, list[Tensor]] = {
         key: [optimiser.state[parameter][key] for parameter in parameters] for key in optimiser.state[parameters[0]]
     }
-    same: dict[str, Any] = {key: group[key] for key in ("lr", "eps", "weight_decay", "maximize")}
-    same |= {"foreach": False, "capturable": parameters[0].is_cuda}
-    if isinstance(optimiser, torch.optim.Adam):
-        moments = state["exp_avg"], state["exp_avg_sq"]
-        (beta1, beta2), amsgrad = group["betas"], group["amsgrad"]
-        adam(parameters, gradients, *moments, [], state["step"], amsgrad=amsgrad, beta1=beta1, beta2=beta2, **same)
+    settings: dict[str, Any] = {key: group[key] for key in ("lr", "eps", "weight_decay", "maximize")}
+    settings |= {"foreach": False, "capturable": parameters[0].is_cuda}
+    if isinstance(optimiser, torch.optim.Adam):  # compiled, PyTorch's functions need all lists by position
+        moments: tuple[list[Tensor], list, list] = (state["exp_avg"], state["exp_avg_sq"], [])
+        beta1, beta2 = group["betas"]
+        settings |= {"amsgrad": group["amsgrad"], "beta1": beta1, "beta2": beta2}
+        adam(parameters, gradients, *moments, state["step"], **settings)
     else:
-        more = {key: group[key] for key in ("alpha", "momentum", "centered")}
-        rmsprop(parameters, gradients, state["square_avg"], [], [], state["step"], **more, **same)
+        averages: tuple[list[Tensor], list, list] = (state["square_avg"], [], [])
+        settings |= {key: group[key] for key in ("alpha", "momentum", "centered")}
+        rmsprop(parameters, gradients, *averages, state["step"], **settings)

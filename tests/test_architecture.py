@@ -80,9 +80,6 @@ NOT_YET: dict[str, list[str]] = {
     "up": [
         "ctgraph_rl.visualize.arguments -> ctgraph_rl.cli",
     ],
-    "circles": [
-        "baselines.learner <-> baselines.methods.method <-> baselines.methods.wearing",
-    ],
     "by name": [
         "baselines.__main__: baselines.",
         "baselines.benchmark: ?",
@@ -102,7 +99,6 @@ NOT_YET: dict[str, list[str]] = {
         "ctgraph_rl.run",
     ],
     "long calls": [
-        "baselines.compiled: rmsprop",
         "ctgraph_rl.batch.rollout: cls",
         "ctgraph_rl.batch.rows: RowParams",
         "ctgraph_rl.batch.rows: dynamics.step_or_reset",
@@ -121,13 +117,10 @@ NOT_YET: dict[str, list[str]] = {
         "more than 10",
     ],
     "imports without a reason": [
-        "baselines.benchmark",
         "ctgraph_rl.run",
         "hydra_plugins.ctgraph_rl_sweeper",
     ],
     "folders": [
-        "baselines",
-        "baselines.methods",
         "curricula",
     ],
 }

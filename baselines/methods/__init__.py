@@ -1,1 +1,5 @@
-"""Lifelong-learning methods, which any agent that derives from `baselines.learner.Learner` can wear."""
+"""Lifelong-learning methods, one in each file, and their base classes.
+
+They import `baselines`' hooks, learner and networks, and no agent by name; runs build them by the ``_target_`` of
+``conf/method``.
+"""
