@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.kill_runs import command, differences
+from helpers.sweeping import command_line
 
 from ctgraph_rl.runs.checkpoints import Checkpoints
 
@@ -45,17 +46,9 @@ def start(run_dir: Path, checkout: Path) -> subprocess.Popen:
     )
 
 
-@pytest.fixture(scope="module")
-def whole(checkout, tmp_path_factory) -> Path:
-    """The run that was never stopped."""
-    run_dir = tmp_path_factory.mktemp("whole") / "run"
-    assert start(run_dir, checkout).wait(120) == 0
-    return run_dir
-
-
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
-def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, whole, name, code):
-    run_dir = tmp_path / "run"
+def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, monkeypatch, name, code):
+    run_dir, whole = tmp_path / "run", tmp_path / "whole"
     process = start(run_dir, checkout)
     while process.poll() is None and not Checkpoints(run_dir / "checkpoints").files():
         time.sleep(0.01)
@@ -67,5 +60,5 @@ def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, whole, 
     assert line in process.stderr.read().splitlines()
     assert not (run_dir / "metrics.json").exists() and not (run_dir / ".lock").exists()
 
-    assert start(run_dir, checkout).wait(120) == 0
+    assert [command_line(monkeypatch, *command("a2c", each)) for each in (run_dir, whole)] == [0, 0]
     assert differences(whole, run_dir) == []

@@ -74,23 +74,30 @@ def plain_agreement(one: Task, other: Task, gamma: float, num_actions: int) -> f
     return sum(sets[0][key] == sets[1][key] for key in shared) / len(shared)
 
 
+def as_bytes(images: torch.Tensor) -> list[bytes]:
+    """The bytes of each row."""
+    rows = images.flatten(1).contiguous().numpy()
+    return rows.view(f"V{rows.shape[1] * rows.itemsize}").ravel().tolist()
+
+
 def images_of_states(task: Task) -> dict:
     """What the environment shows at each state, by kind and decisions; recorded in many random episodes."""
     b, d = task.graph.branching_factor, task.graph.depth
     first = {path: number for number, (_, path) in enumerate(s for s in tree_states(b, d) if s[0] == WAIT)}
     paths = {number: path for path, number in first.items()}
-    env, seen = CTGraphEnv([task] * 512, seed=3), {}
+    env, shown = CTGraphEnv([task] * 512, seed=3), set()
     data = env.reset()
     for action in scripts(200, 512, b + 1):
         data = env.step(data.set("action", action))["next"]
-        for kind, node, image in zip(env.state_type.tolist(), env.node.tolist(), data["observation"], strict=True):
-            path = paths[node] if kind in (WAIT, DECISION, StateType.END) else ()
-            seen.setdefault((StateType(kind), path), set()).add(image.numpy().tobytes())
+        shown.update(zip(env.state_type.tolist(), env.node.tolist(), as_bytes(data["observation"]), strict=True))
         done = data["done"].squeeze(-1)
         if done.any():
             data = env.reset(data.set("_reset", data["done"].clone()))
-            for image in data["observation"][done]:
-                seen.setdefault((StateType.HOME, ()), set()).add(image.numpy().tobytes())
+            shown.update((StateType.HOME, 0, image) for image in as_bytes(data["observation"][done]))
+    seen: dict = {}
+    for kind, node, image in shown:
+        path = paths[node] if kind in (WAIT, DECISION, StateType.END) else ()
+        seen.setdefault((StateType(kind), path), set()).add(image)
     return seen
 
 
