@@ -30,7 +30,7 @@ from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.benchmark import machine
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.learn.collect import collect
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 
 ROWS = 256

@@ -5,11 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from difflib import get_close_matches
-from importlib import import_module
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.packages import command
 
 COMMANDS = {
     "agents": "baselines.__main__",
@@ -53,32 +50,15 @@ def _call() -> None:
     """Go to what the first word names."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in COMMANDS:
-        _require_ours(COMMANDS[word])
         sys.argv = [f"ctgraph-rl {word}", *sys.argv[2:]]
-        import_module(COMMANDS[word]).main()
+        try:
+            main = command(COMMANDS[word])
+        except ValueError as error:
+            sys.exit(f"error: {error}")
+        main()
     elif word.isidentifier():  # settings have a sign: seed=1, ~logger, -m
         near = [f"; did you mean {match!r}?" for match in get_close_matches(word, COMMANDS, 1)]
         choices = f"Commands: {', '.join(COMMANDS)}; or settings of a run, such as seed=1"
         sys.exit(f"error: unknown command {word!r}{''.join(near)} {choices}")
     else:
-        import_module("ctgraph_rl.run").main()
-
-
-def curriculum_named(name: str) -> Curriculum:
-    """A curriculum by name; the package that has them is only known here, where names meet.
-
-    Raises:
-        ValueError: for an unknown name; lists the choices.
-    """
-    _require_ours("curricula")
-    return import_module("curricula").load(name)
-
-
-def _require_ours(module: str) -> None:
-    """Refuse a package of the working directory that has the name of ours."""
-    if module.startswith("ctgraph_rl."):
-        return
-    try:
-        import_module("ctgraph_rl.run").check_packages()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+        command("ctgraph_rl.run")()

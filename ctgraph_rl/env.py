@@ -8,11 +8,12 @@ from typing import Any
 import torch
 from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
+from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Shown
@@ -99,35 +100,13 @@ class CTGraphEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        n, device, shape = self.batch_size[0], self.device, self.rows.image_shape
-        white = 255 if len(shape) == 3 else self.rows.white
-        self.observation_spec = Composite(
-            observation=Bounded(0, white, shape=(n, *shape), dtype=torch.uint8),
-            is_init=Binary(1, shape=(n, 1), dtype=torch.bool),
-            **self._info_specs(),
-            shape=(n,),
-            device=device,
-        )
-        if self.num_task_ids:
-            self.observation_spec["task_id"] = Bounded(
-                0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8, device=device
-            )
-        self.action_spec = Categorical(self.rows.max_branching + 1, shape=(n,), dtype=torch.int64, device=device)
+        n, device = self.batch_size[0], self.device
+        specs = specs_of(self.rows.pool, (n,), self.num_task_ids, self.info)
+        self.observation_spec, self.action_spec = (spec.to(device) for spec in specs)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32, device=device)
         flag = Binary(1, shape=(n, 1), dtype=torch.bool, device=device)
         truncated = {"truncated": flag.clone()} if self.info else {}
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), **truncated, shape=(n,), device=device)
-
-    def _info_specs(self) -> dict[str, Bounded | Unbounded]:
-        if not self.info:
-            return {}
-        shape = (self.batch_size[0], 1)
-        return {
-            "step_count": Unbounded(shape=shape, dtype=torch.int64),
-            "episode_reward": Unbounded(shape=shape, dtype=torch.float32),
-            "outcome": Bounded(dynamics.OUTCOME_RUNNING, dynamics.OUTCOME_GOAL, shape=shape, dtype=torch.uint8),
-            "leaf": Unbounded(shape=shape, dtype=torch.int64),
-        }
 
     @property
     def tasks(self) -> tuple[Task, ...]:

@@ -19,8 +19,9 @@ from helpers.sweeping import UNLUCKY
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from ctgraph_rl import run
+from ctgraph_rl import packages
 from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.runs import config, job
 from ctgraph_rl.tasks.task import Task
 
 
@@ -53,7 +54,7 @@ def one_thread() -> None:
 def compose() -> Iterator[Callable[..., DictConfig]]:
     """Composes a configuration from overrides, as the command line does."""
     GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(run.conf_dir(), version_base="1.3"):
+    with hydra.initialize_config_dir(packages.conf_dir(), version_base="1.3"):
         yield lambda *overrides, **how: hydra.compose("config", overrides=list(overrides), **how)
 
 
@@ -65,7 +66,7 @@ def build_agent(compose: Callable[..., DictConfig]) -> Callable[..., Any]:
         cfg = compose(f"agent={name}", *overrides)
         env = CTGraphEnv(tasks)
         torch.manual_seed(cfg.seed)
-        return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+        return config.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
 
     return build
 
@@ -101,12 +102,12 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 
     def learn(cfg, run_dir, interrupt):
         cells.append(run_dir)
-        first = {"kind": "run", "config": run.plain(cfg)}
+        first = {"kind": "run", "config": config.plain(cfg)}
         (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
         if cfg.seed == UNLUCKY:
             raise FloatingPointError("the loss is NaN")
         (run_dir / "metrics.json").write_text("{}")
 
-    monkeypatch.setattr(run, "learn", learn)
+    monkeypatch.setattr(job, "learn", learn)
     monkeypatch.chdir(tmp_path)
     return cells

@@ -17,10 +17,12 @@ from helpers.sweeping import command_line
 
 import curricula
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
-from ctgraph_rl import run as run_module
 from ctgraph_rl.log.provenance import named
 from ctgraph_rl.metrics import definitions
-from ctgraph_rl.run import run, target, with_changes
+from ctgraph_rl.run import run
+from ctgraph_rl.runs import job
+from ctgraph_rl.runs.config import target
+from ctgraph_rl.runs.job import with_changes
 from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
@@ -124,7 +126,7 @@ def test_the_same_seed_gives_the_same_log_and_another_seed_another(finished, com
 def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, tmp_path):
     seeds = []
     learn = "ctgraph_rl.runs.train.learn_curriculum"
-    monkeypatch.setattr(learn, lambda curriculum, agent, seed, log, *_: seeds.append(seed))
+    monkeypatch.setattr(learn, lambda curriculum, agent, seed, log, *_, **how: seeds.append(seed))
 
     run(compose("seed=7"), tmp_path)
 
@@ -132,7 +134,7 @@ def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, t
 
 
 def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, monkeypatch):
-    monkeypatch.setattr(run_module, "learn", lambda *args: pytest.fail("ran again"))
+    monkeypatch.setattr(job, "learn", lambda *args: pytest.fail("ran again"))
     before = {name: (copy_of / name).read_bytes() for name in RESULTS}
 
     run(compose(*SHORT), copy_of)

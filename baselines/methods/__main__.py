@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from baselines.methods.method import Method
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
 
 
 def methods() -> Iterator[tuple[str, type[Method], str, str]]:

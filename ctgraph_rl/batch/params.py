@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -154,8 +154,8 @@ class Bank(NamedTuple):
     noise_levels: tuple[int, ...]  # the different values of ``read_noise``
 
 
-def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
-    """The bank of a pool.
+def observation_shape(pool: Sequence[Task], num_rows: int) -> tuple[int, ...]:
+    """Return the shape of a row's observation; one-hot vectors are as long as the longest of the pool.
 
     Raises:
         ValueError: for observations of different shapes, and for more than the machine can hold.
@@ -163,15 +163,24 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     shapes = list(dict.fromkeys(task.images.shape for task in pool))
     one_hot = all(len(shape) == 1 for shape in shapes)
     require((one_hot or len(shapes) == 1, f"all tasks of a batch must show observations of one shape, got {shapes}"))
-    shape = max(shapes)
-    needed = bank_bytes(pool) + 2 * num_rows * math.prod(shape)  # a step holds two observations of every row
+    needed = bank_bytes(pool) + 2 * num_rows * math.prod(max(shapes))  # a step holds two observations of every row
     require_memory("images and observations", needed, "images or rows")
+    return max(shapes)
+
+
+def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
+    """Return the bank of a pool.
+
+    Raises:
+        ValueError: see `observation_shape`.
+    """
+    shape = observation_shape(pool, num_rows)
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(bank_key, pool)):
         images, rotation = key
         bank = images.bank(rotation)
-        if one_hot:
+        if len(shape) == 1:
             bank = torch.nn.functional.pad(bank, (0, shape[0] - bank.shape[1]))
         banks.append(bank)
         starts[key] = rows

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ctgraph_rl.batch.specs import Specs, specs_of
 from ctgraph_rl.checks import at_least_one, is_int, require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -32,16 +33,31 @@ Step = dict[Any, Tensor]
 def make_env(
     curriculum: Curriculum, tasks: Sequence[Task], seed: int, device: torch.device | str = "cpu"
 ) -> CTGraphEnv:
-    """An environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
+    """Return an environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
 
     Held-out tasks have no id, which shows as zeros.
     """
-    how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    pool, length = _pool_and_ids(curriculum)
     place: dict[str, Any] = {"task_pool": pool, "device": device}
-    if how.task_id != "one_hot":
-        return CTGraphEnv(tasks, seed, **place)
-    length = how.length(len(curriculum.tasks))
-    return CTGraphEnv(tasks, seed, task_ids=curriculum.task_ids, num_task_ids=length, **place)
+    if length:
+        place |= {"task_ids": curriculum.task_ids, "num_task_ids": length}
+    return CTGraphEnv(tasks, seed, **place)
+
+
+def agent_specs(curriculum: Curriculum) -> Specs:
+    """Return the unbatched specs of `make_env`, which agents are built from, without building an environment.
+
+    Raises:
+        ValueError: if the tasks cannot be rows of one environment.
+    """
+    pool, length = _pool_and_ids(curriculum)
+    return specs_of(pool, num_task_ids=length)
+
+
+def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[Task, ...], int]:
+    """Return all tasks of a curriculum, held-out ones too, and the length of the task ids in observations or 0."""
+    how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
 
 
 def collect(

@@ -85,7 +85,8 @@ def learn_curriculum(
             if progress is not None:
                 progress.update(curriculum.block_at(frames), frames, episode_return)
             if checkpoint is not None:
-                checkpoint(partial(_state, frames, agent, env, carried, log), frames in curriculum.ends)
+                state = partial(_state, frames, agent, env, carried=carried, log=log)
+                checkpoint(state, frames in curriculum.ends)
         agent.end_task()
         evaluator.evaluate_if_due(agent, frames)
     return log

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import tensordict
@@ -13,11 +12,12 @@ import torchrl
 
 from ctgraph_rl import __version__
 from ctgraph_rl.log.run_log import SCHEMA
+from ctgraph_rl.packages import is_published
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of what computes its numbers."""
+    """Return the versions of this package and of what computes its numbers."""
     return {
         "ctgraph_rl": __version__,
         "torch": torch.__version__,
@@ -28,16 +28,14 @@ def versions() -> dict[str, str]:
 
 
 def named(curriculum: Curriculum) -> Curriculum:
-    """The curriculum, with ``(modified)`` behind its name if it is not what is published under that name."""
-    published = import_module("curricula")
-    known = curriculum.name in published.names()
-    if not known or published.load(curriculum.name).fingerprint == curriculum.fingerprint:
-        return curriculum
-    return replace(curriculum, name=f"{curriculum.name} (modified)")
+    """Return the curriculum, with ``(modified)`` behind its name if another one is published under that name."""
+    return (
+        replace(curriculum, name=f"{curriculum.name} (modified)") if is_published(curriculum) is False else curriculum
+    )
 
 
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
-    """Curriculum, versions and machine; plain values for JSON. Tasks are counted from 1."""
+    """Return curriculum, versions and machine as plain values for JSON. Tasks are counted from 1."""
     return {
         "schema": SCHEMA,
         "curriculum": named(curriculum).name,
@@ -52,6 +50,6 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
+    """Return what besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
     kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
     return {"machine": kind, "num_threads": torch.get_num_threads()}

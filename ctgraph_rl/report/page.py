@@ -28,7 +28,8 @@ from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
 from ctgraph_rl.report.trees import Trees, find_trees
-from ctgraph_rl.runs.read import Problem, Run, find_runs, flat
+from ctgraph_rl.runs.read import Problem, Run, find_runs
+from ctgraph_rl.runs.settings import flat
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""

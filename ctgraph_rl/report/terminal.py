@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -15,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctgraph_rl.log.files import METRICS
-from ctgraph_rl.runs.read import Curve, read_run
+from ctgraph_rl.checks import require
+from ctgraph_rl.runs.read import Curve, History, read_run
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
 WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
@@ -36,13 +34,13 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     """Print the performance matrix, the evaluation curves and the metrics of a finished run."""
     console = Console() if console is None else console
     bars = BARS if console.encoding.lower().startswith("utf") else ASCII_BARS
-    history = read_run(Path(run_dir)).history
-    curves = sparklines(history.evaluations, bars) if history is not None else {}
-    with open(Path(run_dir) / "performance.csv", newline="", encoding="utf-8") as file:
-        header, *rows = list(csv.reader(file))
-    many = len(header) > 2 + MOST_COLUMNS
-    tables = [_task_table(run_dir, header, rows, curves)] if many else [_matrix(run_dir, header, rows), _curves(curves)]
-    for table in (*tables, metrics_table(run_dir)):
+    run = read_run(Path(run_dir))
+    require((run.history is not None, f"{run_dir} cannot be shown: {run.reason}"))
+    assert run.history is not None
+    name, curves = Path(run_dir).name, sparklines(run.history.evaluations, bars)
+    many = len(run.history.labels) > MOST_COLUMNS
+    tables = [_task_table(name, run.history, curves)] if many else [_matrix(name, run.history), _curves(curves)]
+    for table in (*tables, metrics_table(run.metrics)):
         console.print(table)
 
 
@@ -69,13 +67,13 @@ def _shared(curve: Curve) -> list[list[float]]:
     return [[value for _, value in curve[start:end]] for start, end in pairwise(cuts)]
 
 
-def _matrix(run_dir: Path | str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """The performance matrix: mean return on each task after each block."""
-    table = Table(title=Text(f"{Path(run_dir).name}: mean return on each task after each block"))
-    for name in header:
-        table.add_column(Text(name), justify="right")
-    for block, frames, *values in rows:
-        table.add_row(block, f"{int(frames):,}", *(_shown(float(value)) for value in values))
+def _matrix(name: str, history: History) -> Table:
+    """Return the performance matrix: mean return on each task after each block."""
+    table = Table(title=Text(f"{name}: mean return on each task after each block"))
+    for heading in ("block", "frames", *history.labels):
+        table.add_column(Text(heading), justify="right")
+    for block, (frames, values) in enumerate(_blocks(history)):
+        table.add_row(str(block), f"{frames:,}", *map(_shown, values))
     return table
 
 
@@ -88,19 +86,17 @@ def _curves(curves: Mapping[str, str]) -> Table:
     return table
 
 
-def _task_table(
-    run_dir: Path | str, header: Sequence[str], rows: Sequence[Sequence[str]], curves: Mapping[str, str]
-) -> Table:
-    """A line for each task: its return before training, the best one after a block, the last one, and its curve.
+def _task_table(name: str, history: History, curves: Mapping[str, str]) -> Table:
+    """Return a line for each task: its return before training, the best one after a block, the last one, and its curve.
 
     The block of a best that is not above 0 is left out: that is of no block.
     """
-    where = f"performance.csv has it after each of {len(rows) - 1} blocks"
-    table = Table(title=Text(f"{Path(run_dir).name}: mean return on each task; {where}"))
+    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
+    table = Table(title=Text(f"{name}: mean return on each task; {where}"))
     for heading in ("task", "before", "best", "best after block", "at the end", "curve"):
         table.add_column(heading, justify="left" if heading in ("task", "curve") else "right")
-    for column, label in enumerate(header[2:], 2):
-        values = [float(row[column]) for row in rows]
+    by_task = zip(*(values for _, values in _blocks(history)), strict=True)
+    for label, values in zip(history.labels, by_task, strict=True):
         known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
         best, block = max(known, default=(math.nan, 0))
         after = str(-block) if best > 0 else "-"
@@ -109,13 +105,17 @@ def _task_table(
     return table
 
 
+def _blocks(history: History) -> list[tuple[int, list[float]]]:
+    """Return the frames at the end of each block so far, and the mean return on each task then."""
+    return list(zip(history.ends, history.performance, strict=False))
+
+
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2f}"
 
 
-def metrics_table(run_dir: Path | str) -> Table:
-    """The main metrics with their definitions; an undefined one shows why. Those against experts only where defined."""
-    metrics: dict[str, dict[str, Any]] = json.loads((Path(run_dir) / METRICS).read_text(encoding="utf-8"))
+def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return the main metrics with their definitions, or why one is undefined; those against experts if defined."""
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]

@@ -61,7 +61,8 @@ def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
     else:
         told = Protocol()
     evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
-    return Curriculum(EXPERT, 1, "-", (Block((task,), block.num_frames),), evaluation, told)
+    blocks = (Block((task,), block.num_frames),)
+    return Curriculum(EXPERT, 1, "-", blocks, evaluation=evaluation, protocol=told)
 
 
 def find_or_train(
@@ -86,7 +87,10 @@ def find_or_train(
         ValueError: before any training, for a block with several tasks.
     """
     alone = [expert_curriculum(curriculum, task) for task in curriculum.tasks]
-    experts = [Expert(number, each.fingerprint, folder / _key(each, settings)) for number, each in enumerate(alone, 1)]
+    names = [directory_name(each, settings) for each in alone]
+    experts = [
+        Expert(i, each.fingerprint, folder / name) for i, (each, name) in enumerate(zip(alone, names, strict=True), 1)
+    ]
     for expert, each, label in zip(experts, alone, curriculum.labels, strict=True):
         found = _is_trained(expert.run_dir)
         state = "found in" if found else "learns into"
@@ -108,6 +112,7 @@ def _is_trained(run_dir: Path) -> bool:
     return (run_dir / METRICS).exists()
 
 
-def _key(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:
+def directory_name(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:
+    """Return the hash of all that an expert's numbers depend on: 16 hexadecimal digits."""
     text = json.dumps([curriculum.fingerprint, settings], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -8,8 +8,6 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,9 @@ from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.packages import class_named
 from ctgraph_rl.runs.checkpoints import Checkpoints, read_plain
+from ctgraph_rl.runs.settings import parameters_of, with_added
 from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -126,10 +126,13 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     ours = OURS[part].fullmatch(name)
     if ours is None:
         raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=), in Python")
-    kind: Any = getattr(import_module(ours[1]), ours[2], None) if find_spec(ours[1]) is not None else None
-    defined = isinstance(kind, type) and issubclass(kind, torch.nn.Module) and kind.__module__ == ours[1]
+    kind: Any = class_named(ours[1], ours[2])
+    defined = kind is not None and issubclass(kind, torch.nn.Module)
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
-    return partial(kind, **{key: value for key, value in settings.items() if key != "_target_"})
+    return partial(
+        kind,
+        **with_added(part, {key: value for key, value in settings.items() if key != "_target_"}, parameters_of(kind)),
+    )
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:

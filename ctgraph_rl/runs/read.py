@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from ctgraph_rl.log.files import FAILURE, LOG, METRICS
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.runs.experts import EXPERT
+from ctgraph_rl.runs.settings import as_before, flat
 
 MODIFIED = " (modified)"
 """What the name of a curriculum ends with that is not what is published under the name."""
@@ -71,12 +72,12 @@ class Run:
     agent: str | None
     settings: Mapping[str, Any]
     seed: int
-    reason: str | None
-    metrics: Mapping[str, Mapping[str, Any]]
-    success: Mapping[str, float | None]
-    returns: Mapping[str, float | None]
-    tasks: Sequence[str]
-    history: History | None
+    reason: str | None = None
+    metrics: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    success: Mapping[str, float | None] = field(default_factory=dict)
+    returns: Mapping[str, float | None] = field(default_factory=dict)
+    tasks: Sequence[str] = ()
+    history: History | None = None
 
     @property
     def curriculum(self) -> tuple[str, str]:
@@ -147,18 +148,25 @@ def read_run(path: Path) -> Run:
     if _called(config.get("method")) == NO_METHOD:
         del config["method"]
     seed, agent = config.pop("seed"), _agent(config)
-    settings = {**dict(flat(config)), **({"directory": str(path.resolve())} if agent is None else {})}
+    settings = {**dict(flat(as_before(config))), **({"directory": str(path.resolve())} if agent is None else {})}
     try:
         log = RunLog.read(file)
         history = _history(log)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
-        return Run(path, about, agent, settings, seed, reason, {}, {}, {}, (), None)
+        return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
     ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if metrics else []
     success, returns = ({m["label"]: m.get(name) for m in ends} for name in ("success_rate", "return_mean"))  # the last
     tasks = list(dict.fromkeys(m["label"] for m in ends if not m.get("held_out")))
-    return Run(path, about, agent, settings, seed, why, metrics, success, returns, tasks, history)
+    results: dict[str, Any] = {
+        "metrics": metrics,
+        "success": success,
+        "returns": returns,
+        "tasks": tasks,
+        "history": history,
+    }
+    return Run(path, about, agent, settings, seed, reason=why, **results)
 
 
 def _about(file: Path) -> dict[str, Any]:
@@ -195,15 +203,6 @@ def _called(part: Any) -> str | None:
     if isinstance(part, Mapping) and "_target_" in part:
         return str(part["_target_"]).rpartition(".")[2]
     return part if isinstance(part, str) and part else None
-
-
-def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of a nested configuration by dotted names."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
@@ -245,8 +244,15 @@ def _history(log: RunLog) -> History:
         if m["return_mean"] is not None:
             training.setdefault(m["block"], []).append((m["frames"], m["return_mean"]))
     seconds = log.measurements[-1].get("seconds", 0.0)
-    labels, trained = _labels(log, own, len(performance[0])), _trained(log)
-    return History(labels, trained, tuple(log.ends()), performance, evaluations, training, seconds)
+    return History(
+        labels=_labels(log, own, len(performance[0])),
+        trained=_trained(log),
+        ends=tuple(log.ends()),
+        performance=performance,
+        evaluations=evaluations,
+        training=training,
+        seconds=seconds,
+    )
 
 
 def _labels(log: RunLog, own: Iterable[Mapping[str, Any]], count: int) -> tuple[str, ...]:

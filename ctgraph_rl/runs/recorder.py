@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from inspect import Parameter, signature
 from itertools import takewhile
 from pathlib import Path
@@ -19,11 +18,11 @@ from tensordict.nn import TensorDictModuleBase
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
-from ctgraph_rl.log.files import CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.provenance import provenance
-from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
-from ctgraph_rl.log.tables import write_tables
+from ctgraph_rl.runs.train import write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -159,11 +158,8 @@ class Recorder:
         """Write tables and metrics, and close the log."""
         self.log.close()
         if self.run_dir is not None:
-            with suppress(ValueError):  # parts of a user's own classes have no JSON
-                self.curriculum.to_json(self.run_dir / CURRICULUM)
-            write_tables(self.log, self.run_dir, parquet=False)
-            write_performance(self.run_dir / "performance.csv", self.log, self.curriculum.labels)
-            write_metrics(self.run_dir / METRICS, self.metrics)
+            write_curriculum(self.curriculum, self.run_dir)
+            write_results(self.log, self.curriculum, self.run_dir)
 
     def __enter__(self) -> Recorder:
         return self

@@ -1,172 +1,172 @@
-"""The cells of a sweep: where each stands, as its directory says; one line while they run; what is left at the end."""
+"""A sweep: only the cells that are not done are launched, a failed cell stops no other, and all are reported."""
 
 from __future__ import annotations
 
-import math
+import io
 import os
-import socket
-import threading
+import signal
+import sys
 import time
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from datetime import timedelta
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf
 
-from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS
+from ctgraph_rl.checks import require
+from ctgraph_rl.runs.status import DONE, SHOWN, SweepProgress, report, status_of
 
-DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
+if TYPE_CHECKING:
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper as Base
+else:
+    Base = object  # Hydra may load its plugins again: `hydra_plugins`, which it loads then too, names the present class
 
-SHOWN = 20
-"""Cells that the report at a sweep's end names."""
+Overrides = Sequence[str]
+"""The settings of one cell, as on the command line."""
 
-SECONDS_BETWEEN_LINES = 60.0
-"""Where no terminal shows one line that changes."""
+ALL_CORES = -1
+"""Of joblib's number of processes."""
 
-
-class Standing(NamedTuple):
-    """Where a cell stands, and why it is not done."""
-
-    state: str
-    reason: str = ""
-
-
-def standing(folder: Path, since: float = 0.0, error: str | None = None) -> Standing:
-    """Where the cell of a run directory stands.
-
-    Args:
-        folder: the directory; need not exist.
-        since: results and failures that are older do not count, in seconds since 1970.
-        error: what it raised, where that is known.
-    """
-    if _is_younger(folder / METRICS, since):
-        return Standing(DONE)
-    user = lock_holder(folder)
-    if user is not None:
-        return Standing(IN_USE, f"by {user}")
-    if error is not None:
-        return Standing(FAILED, error)
-    if _is_younger(folder / FAILURE, since):
-        return Standing(FAILED, (folder / FAILURE).read_text(encoding="utf-8", errors="replace"))
-    return Standing(MISSING, "stopped; the next start goes on" if (folder / LOG).exists() else "not begun")
+SUBDIR = "${run_name:}"
+"""Names a directory after the configuration; a cell can then be found before it is run."""
 
 
-def _is_younger(path: Path, since: float) -> bool:
-    try:
-        return path.stat().st_mtime >= since
-    except OSError:
-        return False
-
-
-def lock_holder(folder: Path) -> str | None:
-    """Who works in a run directory; None for nobody, or a process of this machine that is no more."""
-    try:
-        holder = (folder / LOCK).read_text(encoding="utf-8")
-    except OSError:
-        return None
-    _, number, _, host, *_ = [*holder.split(), *[""] * 4]
-    if host == socket.gethostname():
-        try:
-            os.kill(int(number), 0)
-        except ProcessLookupError:
-            return None
-        except PermissionError:  # another user's
-            pass
-    return holder or "another process"
-
-
-def report(standings: Mapping[str, Standing], repeated: int = 0, most: int | None = SHOWN) -> str:
-    """How many cells stand where, and those that are not done with their reasons.
+class Sweeper(Base):
+    """Sweeps over all combinations of choices, with any launcher; to be mixed into Hydra's ``BasicSweeper``.
 
     Args:
-        standings: each cell by its settings.
-        repeated: cells that are left out, as they are there twice.
-        most: cells that are named; None: all.
-    """
-    counts = Counter(found.state for found in standings.values())
-    numbers = ", ".join(f"{counts[state]} {state}" for state in (DONE, FAILED, IN_USE, MISSING))
-    twice = f" ({repeated} more are the same as others)" if repeated else ""
-    lines = [f"sweep of {len(standings)} cells{twice}: {numbers}"]
-    left = [(name, found) for name, found in standings.items() if found.state != DONE]
-    lines += [f"  {state:<7}  {name}  {' '.join(reason.split())}" for name, (state, reason) in left[:most]]
-    if most is not None and len(left) > most:
-        lines.append(f"  and {len(left) - most} more")
-    if left:
-        lines.append("the same command runs what is not done; with hydra.sweeper.status=true it only says what that is")
-    return "\n".join(lines)
-
-
-class SweepProgress:
-    """Shows how many cells are done, failed and running on standard error; use it as a context manager.
-
-    Whoever runs them and where, it looks at their directories: every second, or less often where that takes long.
-
-    Args:
-        folders: the cells' run directories.
-        since: see `standing`.
-        console: where it shows; default: standard error.
+        max_batch_size: cells that are given to the launcher at a time; None: all.
+        params: what is swept, beside the command line.
+        status: only report the status of each cell.
     """
 
-    def __init__(self, folders: Sequence[Path], since: float = 0.0, console: Console | None = None) -> None:
-        self.total, self.since = len(folders), since
-        self.console = Console(stderr=True) if console is None else console
-        self._left = list(folders)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
-        self._task = self._bar.add_task("starting", total=self.total)
+    def __init__(self, max_batch_size: int | None, params: dict[str, str] | None, status: bool) -> None:
+        super().__init__(max_batch_size, params)
+        self.status = status
+        self._values: dict[str, tuple[str, Any] | None] = {}
 
-    def __enter__(self) -> SweepProgress:
-        if self.console.is_terminal:
-            self._bar.start()
-        self._thread.start()
-        return self
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Set up as Hydra does; a launcher for all cores gets as many processes as have ``num_threads`` each."""
+        if config.hydra.launcher.get("n_jobs") == ALL_CORES:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            config.hydra.launcher.n_jobs = max(1, cores // config.num_threads)
+        super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-        if self.console.is_terminal:
-            self._bar.stop()
+    def sweep(self, arguments: list[str]) -> None:
+        """Run the cells that are not done, then report the status of all.
 
-    def _watch(self) -> None:
-        start = last_line = time.perf_counter()
-        ended_before = sum(self.look()[:2])
-        pause = 1.0
-        while not self._stop.wait(pause):
-            now = time.perf_counter()
-            done, failed, running = self.look()
-            pause = max(1.0, 20 * (time.perf_counter() - now))
-            text = self.describe(done, failed, running, done + failed - ended_before, now - start)
-            if self.console.is_terminal:
-                self._bar.update(self._task, completed=done, description=text)
-            elif now - last_line >= SECONDS_BETWEEN_LINES:
-                last_line = now
-                self.console.print(text, highlight=False, soft_wrap=True)
-
-    def look(self) -> tuple[int, int, int]:
-        """The numbers of cells that are done, failed and running."""
-        found = {folder: standing(folder, self.since).state for folder in self._left}
-        self._left = [folder for folder, state in found.items() if state != DONE]
-        counts = Counter(found.values())
-        return self.total - len(self._left), counts[FAILED], counts[IN_USE]
-
-    def describe(self, done: int, failed: int, running: int, ended: int, seconds: float) -> str:
-        """One line: cells done, failed and running, rate and time left.
-
-        Args:
-            done: cells that are done, also before.
-            failed: cells that failed.
-            running: cells that run.
-            ended: cells that ended in `seconds`, done or failed.
-            seconds: time of this start.
+        Raises:
+            SystemExit: with code 1 if some are not done.
         """
-        rate = ended / seconds
-        left = (self.total - done - failed) / rate if rate else math.inf
-        shown = timedelta(seconds=round(left)) if math.isfinite(left) else "?"
-        return f"{done}/{self.total} cells done  {failed} failed  {running} running  {60 * rate:.3g}/min  {shown} left"
+        assert self.config is not None
+        overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
+        [batch] = self.split_arguments(overrides, None)
+        cells = self.cells(batch)
+        since = time.time() if self.config.overwrite else 0.0
+        left = [folder for folder in cells if status_of(folder, since).state != DONE]
+        errors: dict[Path, str] = {}
+        try:
+            if left and not self.status:
+                with sigterm_exits(), SweepProgress(list(cells), since):
+                    self._launch({folder: cells[folder] for folder in left}, errors)
+        finally:
+            found = {folder: status_of(folder, since, errors.get(folder)) for folder in cells}
+            names = shortened(list(cells.values()))
+            statuses = dict(zip(names, found.values(), strict=True))
+            print(report(statuses, len(batch) - len(cells), None if self.status else SHOWN))
+        if any(state != DONE for state, _ in found.values()):
+            sys.exit(1)
+
+    def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
+        """Return the cells by their run directories; of equal ones only the first.
+
+        Cells that choose the same files differ in values alone, so only the first of them is composed.
+
+        Raises:
+            ValueError: if directories are not named after the configuration.
+            HydraException: for what cannot be composed.
+        """
+        assert self.config is not None and self.hydra_context is not None
+        subdir = OmegaConf.to_container(self.config.hydra.sweep)["subdir"]  # type: ignore[call-overload,index]
+        require((subdir == SUBDIR, f"hydra.sweep.subdir must be {SUBDIR}, got {subdir}; change hydra.sweep.dir"))
+        composed: dict[Overrides, DictConfig] = {}
+        found: dict[Path, Overrides] = {}
+        for overrides in batch:
+            values = {setting: self._value(setting) for setting in overrides}
+            choices = tuple(setting for setting, value in values.items() if value is None)
+            if choices not in composed:
+                composed[choices] = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+            for key, value in filter(None, values.values()):
+                OmegaConf.update(composed[choices], key, value)
+            sweep = composed[choices].hydra.sweep
+            found.setdefault(Path(sweep.dir).absolute() / sweep.subdir, overrides)
+        return found
+
+    def _value(self, setting: str) -> tuple[str, Any] | None:
+        """Return key and value of a setting that changes a value; None for one that chooses a file, adds or removes."""
+        if setting not in self._values:
+            [parsed] = OverridesParser.create().parse_overrides([setting])
+            self._values[setting] = (parsed.key_or_group, parsed.value()) if self._is_value(parsed) else None
+        return self._values[setting]
+
+    def _is_value(self, parsed: Override) -> bool:
+        assert self.hydra_context is not None
+        key = parsed.key_or_group
+        plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(parsed.value(), dict)
+        is_file = self.hydra_context.config_loader.get_group_options(key) or key.startswith("hydra")
+        return plain and not is_file
+
+    def _launch(self, cells: Mapping[Path, Overrides], errors: dict[Path, str]) -> None:
+        """Let the launcher run the cells; collect what they raise by directory."""
+        assert self.config is not None and self.launcher is not None
+        folder = Path(self.config.hydra.sweep.dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, folder / "multirun.yaml")
+        folders, size = list(cells), self.max_batch_size or len(cells)
+        for first in range(0, len(folders), size):
+            batch = folders[first : first + size]
+            try:
+                jobs = self.launcher.launch([cells[cell] for cell in batch], initial_job_idx=first)
+            except Exception as error:  # such as a worker that was killed: the cells' directories say how far they are
+                print(f"the launcher stopped: {type(error).__name__}: {error}", file=sys.stderr)
+                return
+            failed = [(cell, job) for cell, job in zip(batch, jobs, strict=True) if job.status == JobStatus.FAILED]
+            errors.update({cell: why(job) for cell, job in failed})
+
+
+@contextmanager
+def sigterm_exits() -> Iterator[None]:
+    """Let SIGTERM end the sweep as Ctrl-C does, so that a launcher can end its processes."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGTERM) == leave:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def why(job: JobReturn) -> str:
+    """Return what a failed job raised."""
+    try:
+        with redirect_stderr(io.StringIO()):  # Hydra prints the settings
+            job.return_value  # noqa: B018 - it raises
+    except Exception as error:
+        return str(error)
+    return ""
+
+
+def shortened(cells: Sequence[Overrides]) -> list[str]:
+    """Return the cells' settings without those that all of them have."""
+    common = set.intersection(*map(set, cells)) if len(cells) > 1 else set()
+    return [" ".join(setting for setting in cell if setting not in common) for cell in cells]

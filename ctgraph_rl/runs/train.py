@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
-from ctgraph_rl.learn.collect import make_env
+from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS, append_line, write_whole
 from ctgraph_rl.log.provenance import machine, provenance
@@ -50,25 +49,25 @@ RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performan
 ``curriculum.json`` where the curriculum has only parts of this package's classes."""
 
 RESTARTS = "restarts.jsonl"
-"""Says, for a run that was stopped, where it went on and on which machine."""
+"""Says, for a run that was stopped, where it was resumed and on which machine."""
 
 
 def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: torch.device | str = "cpu") -> Agent:
-    """An agent whose weights come from the seed, which sets torch's global generator.
+    """Build an agent with weights that come from the seed, which sets torch's global generator.
 
     Raises:
         ValueError: if it cannot learn the curriculum.
     """
     torch.manual_seed(seed)
-    env = make_env(curriculum, curriculum.tasks, seed)
-    agent: Agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched)
+    specs = agent_specs(curriculum)
+    agent: Agent = make_agent(*specs)
     missing = [name for name in MEMBERS if not hasattr(agent, name)]
     require(
         (not missing, f"{type(agent).__name__} is no agent, it lacks {', '.join(missing)}: see ctgraph_rl.agent.Agent")
     )
     frames = agent.num_envs * agent.num_steps
     batch = f"batches of num_envs={agent.num_envs} x num_steps={agent.num_steps} frames"
-    require_memory(batch, 2 * frames * env.observation_spec_unbatched["observation"].shape.numel(), "of either")
+    require_memory(batch, 2 * frames * specs.observation["observation"].shape.numel(), "of either")
     agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
     return agent
@@ -83,10 +82,11 @@ def with_method(make_agent: MakeAgent, make_method: Callable[[], Method], curric
 
 def train(
     curriculum: Curriculum,
-    make_agent: MakeAgent,
+    agent: Agent,
     run_dir: Path,
     seed: int,
     device: torch.device | str = "cpu",
+    *,
     config: Mapping[str, Any] | None = None,
     experts: Sequence[Expert] | None = None,
     checkpoints: Checkpoints | None = None,
@@ -95,24 +95,23 @@ def train(
 ) -> None:
     """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
 
-    A run that was stopped there goes on from its last checkpoint, and ends as if it had never been stopped.
+    A run that was stopped there is resumed from its last checkpoint, and ends as if it had never been stopped.
 
     Args:
         curriculum: what is learned.
-        make_agent: builds the agent.
+        agent: just built by `new_agent`, so that torch's global generator is as its construction left it.
         run_dir: an existing directory.
         seed: decides the run, in [0, 2**63).
-        device: where environment and agent live.
+        device: where the environment lives, and the agent.
         config: what else the first line of the log should hold.
-        experts: for each task, who learned it alone; they are named in the log.
+        experts: the single-task expert of each task; they are named in the log.
         checkpoints: default: those in the directory, every five minutes.
         listeners: are called with every measurement.
         console: where progress shows; default: standard error.
 
     Raises:
-        ValueError: if the directory holds a run that cannot be gone on with.
+        ValueError: if the directory holds a run that cannot be resumed.
     """
-    agent = new_agent(curriculum, make_agent, seed, device)
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
     checkpoints.tidy()
     saved = checkpoints.newest()
@@ -121,26 +120,39 @@ def train(
     log.listeners.extend(listeners)
     if saved is None:
         log.append("run", **about, config=config)
-        with suppress(ValueError):  # parts of a user's own classes have no JSON
-            curriculum.to_json(run_dir / CURRICULUM)
+        write_curriculum(curriculum, run_dir)
         if experts is not None:
             log.append("experts", experts=[expert.about for expert in experts])
     done = 0 if saved is None else saved["frames"]
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
-        learn_curriculum(curriculum, agent, seed, log, progress, device, saved, checkpoints.offer)
+        learn_curriculum(
+            curriculum, agent, seed, log, progress, device=device, saved=saved, checkpoint=checkpoints.offer
+        )
     log.close()
     weights = io.BytesIO()
     torch.save(agent.state_dict(), weights)
     write_whole(run_dir / AGENT, weights.getvalue())
-    write_tables(log, run_dir, parquet=False)
-    write_performance(run_dir / "performance.csv", log, curriculum.labels)
-    logs = None if experts is None else [expert.log for expert in experts]
-    write_metrics(run_dir / METRICS, scores(log, curriculum, logs))
+    write_results(log, curriculum, run_dir, None if experts is None else [expert.log for expert in experts])
     checkpoints.clear()
 
 
+def write_curriculum(curriculum: Curriculum, run_dir: Path) -> None:
+    """Write ``curriculum.json``, or say why it cannot be written: parts of a user's own classes have no JSON."""
+    try:
+        curriculum.to_json(run_dir / CURRICULUM)
+    except ValueError as error:
+        print(f"note: {CURRICULUM} is not written, so loading this run needs the curriculum: {error}")
+
+
+def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
+    """Write the tables of a log and, last of all, its metrics."""
+    write_tables(log, run_dir, parquet=False)
+    write_performance(run_dir / "performance.csv", log, curriculum.labels)
+    write_metrics(run_dir / METRICS, scores(log, curriculum, experts))
+
+
 def _new_log(run_dir: Path) -> RunLog:
-    """A log in place of what a run left that was stopped before its first checkpoint."""
+    """Return a new log in place of what a run left that was stopped before its first checkpoint."""
     remove_results(run_dir)
     return RunLog(run_dir / LOG)
 
@@ -152,7 +164,7 @@ def remove_results(run_dir: Path) -> None:
 
 
 def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
-    """The log as it was at a checkpoint; another machine or other versions are told, or refused if ``strict``.
+    """Return the log as it was at a checkpoint; warn of another machine or versions, or refuse them if ``strict``.
 
     Raises:
         ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.

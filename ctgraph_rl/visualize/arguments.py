@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.cli import curriculum_named
 from ctgraph_rl.learn.collect import InitialState, Policy
+from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 import curricula
 from ctgraph_rl import CTGraph, Gradient, Needle
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_posr_b1, ct_su_b1
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol

@@ -27,7 +27,8 @@ from baselines.methods.l2 import L2
 from baselines.methods.method import Method
 from baselines.methods.weights import flat
 from ctgraph_rl import CTGraphEnv, Protocol, RunLog, cli, load
-from ctgraph_rl.run import conf_dir, target
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent
 from curricula.paper import ct_su_b1
 

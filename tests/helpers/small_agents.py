@@ -10,9 +10,10 @@ import torch
 from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType
 
-from ctgraph_rl import CTGraph, CTGraphEnv, OneHot, Task, run
+from ctgraph_rl import CTGraph, CTGraphEnv, OneHot, Task
 from ctgraph_rl.learn.collect import collect
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs import config
 from helpers.scripted import OBSERVATIONS
 
 YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
@@ -61,7 +62,7 @@ def agent_of(compose, name: str, env, *overrides: str):
     """A small agent for the specs of any environment; equal weights for every call."""
     cfg = compose(f"agent={name}", *SMALL_AGENT[name], *overrides)
     torch.manual_seed(0)
-    return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+    return config.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
 
 
 def saved_and_loaded(state: dict) -> dict:

@@ -14,9 +14,9 @@ from omegaconf import OmegaConf
 
 from baselines.a2c import A2C
 from ctgraph_rl import Block, Curriculum, Evaluation
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.train import train
+from ctgraph_rl.runs.train import new_agent, train
 from helpers.scripted import ONE, TWO
 
 SETTINGS = {
@@ -52,9 +52,10 @@ def make_agent(observation_spec, action_spec) -> A2C:
 
 
 def learn_into(run_dir: Path, checkpoints: Checkpoints | None = None) -> Path:
-    """A short run in a directory, which is made or gone on with."""
+    """A short run in a directory, which is made or resumed."""
     run_dir.mkdir(exist_ok=True)
-    train(LEARNED, make_agent, run_dir, 3, config={"agent": SETTINGS, "seed": 3}, checkpoints=checkpoints)
+    agent = new_agent(LEARNED, make_agent, 3)
+    train(LEARNED, agent, run_dir, 3, config={"agent": SETTINGS, "seed": 3}, checkpoints=checkpoints)
     return run_dir
 
 

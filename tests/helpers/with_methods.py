@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from baselines.learner import Learner
 from baselines.methods.method import AgentWithMethod, Method
-from ctgraph_rl import Block, CTGraphEnv, run
+from ctgraph_rl import Block, CTGraphEnv
+from ctgraph_rl.runs import config
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import SMALL_AGENT, batches
 
@@ -23,7 +24,7 @@ def made(compose, group: str, name: str, *overrides: str) -> Any:
     """What builds the choice of a group of the configuration, which is composed once."""
     choice = (f"{group}={name}", *overrides)
     if choice not in COMPOSED:
-        COMPOSED[choice] = run.target(compose(*choice), group)
+        COMPOSED[choice] = config.target(compose(*choice), group)
     return COMPOSED[choice]
 
 

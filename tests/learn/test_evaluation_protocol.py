@@ -17,10 +17,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 import curricula
-from ctgraph_rl import Block, Curriculum, Evaluation, OneHot, RunLog, evaluate, learn_curriculum, run
+from ctgraph_rl import Block, Curriculum, Evaluation, OneHot, RunLog, evaluate, learn_curriculum
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL
 from ctgraph_rl.learn.collect import make_env
 from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.runs import config
 from ctgraph_rl.tasks.curriculum import Protocol
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
@@ -340,7 +341,7 @@ def test_agents_learn_the_same_weights_with_and_without_evaluation(compose, name
         cfg = compose(f"agent={name}", *SMALL_AGENT[name])
         env = make_env(curriculum, [TWO], 0)
         torch.manual_seed(1)
-        return run.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
+        return config.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
 
     with no_evaluation():
         first = trained(build, curriculum)

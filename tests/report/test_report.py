@@ -6,6 +6,7 @@ import io
 import math
 
 import pytest
+from helpers.made_runs import write_run
 from rich.console import Console
 
 from ctgraph_rl import RunLog, metrics
@@ -53,25 +54,22 @@ def test_the_summary_shows_the_performance_matrix_and_every_metric(run_dir):
     assert ["forgetting", "0.25", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])"] in rows
 
 
-def test_many_tasks_are_a_line_each(run_dir):
+def test_many_tasks_are_a_line_each(tmp_path):
     labels = [f"goal{number}" for number in range(7)]
-    lines = [[0, 0, *[0.0] * 7], [1, 64, 1.0, *[0.25] * 6], [2, 128, 0.5, *[0.25] * 5, "nan"]]
-    text = [["block", "frames", *labels], *lines]
-    (run_dir / "performance.csv").write_text("\n".join(",".join(map(str, line)) for line in text), encoding="utf-8")
+    returns = [[0.0] * 7, [1.0, *[0.25] * 6], [0.5, *[0.25] * 5, math.nan]]
 
-    rows = shown(run_dir, 90)
+    rows = shown(write_run(tmp_path / "run", performance=returns, labels=labels), 90)
 
     assert ["task", "before", "best", "best after block", "at the end", "curve"] in rows
-    assert ["goal0", "0.00", "1.00", "1", "0.50", ""] in rows
-    assert ["goal1", "0.00", "0.25", "1", "0.25", ""] in rows
-    assert ["goal6", "0.00", "0.25", "1", "-", ""] in rows
+    assert ["goal0", "0.00", "1.00", "1", "0.50", "▁█▅"] in rows
+    assert ["goal1", "0.00", "0.25", "1", "0.25", "▁▃▃"] in rows
+    assert ["goal6", "0.00", "0.25", "1", "-", "▁▃"] in rows
 
 
-def test_a_task_that_is_never_above_0_has_no_best_block(run_dir):
-    text = ["block,frames," + ",".join(f"goal{number}" for number in range(7)), "0,0" + ",0.0" * 7, "1,64" + ",0.0" * 7]
-    (run_dir / "performance.csv").write_text("\n".join(text), encoding="utf-8")
+def test_a_task_that_is_never_above_0_has_no_best_block(tmp_path):
+    run_dir = write_run(tmp_path / "run", performance=[[0.0] * 7] * 2, labels=[f"goal{i}" for i in range(7)])
 
-    assert ["goal0", "0.00", "0.00", "-", "0.00", ""] in shown(run_dir, 90)
+    assert ["goal0", "0.00", "0.00", "-", "0.00", "▁▁"] in shown(run_dir, 90)
 
 
 def test_an_undefined_metric_shows_why(run_dir):

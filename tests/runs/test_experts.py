@@ -13,9 +13,9 @@ from helpers.sweeping import command_line
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog
 from ctgraph_rl.log import files
 from ctgraph_rl.log.provenance import versions
-from ctgraph_rl.run import run, train_experts
-from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.experts import _key, expert_curriculum, find_or_train
+from ctgraph_rl.run import run
+from ctgraph_rl.runs import job
+from ctgraph_rl.runs.experts import directory_name, expert_curriculum, find_or_train
 
 SETTINGS = {"agent": {"gamma": 0.9}, "seed": 0}
 
@@ -129,7 +129,7 @@ def test_a_run_trains_its_experts_and_says_which_it_used(monkeypatch, capsys, tm
 def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_again(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "SECONDS_BETWEEN_ATTEMPTS", 0.01)
     alone = expert_curriculum(curriculum(Block(ONE, 12)), ONE)
-    run_dir = tmp_path / _key(alone, SETTINGS)
+    run_dir = tmp_path / directory_name(alone, SETTINGS)
     run_dir.mkdir()
     waited = []
 
@@ -149,12 +149,17 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
     assert (expert.run_dir / "metrics.json").read_text() == "theirs"
 
 
-def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch):
+def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr("ctgraph_rl.runs.experts.find_or_train", lambda *arguments: asked.append(arguments[3]))
 
-    cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3")
-    train_experts(cfg, curriculum(), Checkpoints)
+    def find(*arguments, **_):
+        asked.append(arguments[3])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job, "find_or_train", find)
+    cfg = compose("agent=dqn", "agent.gamma=0.5", "seed=3", "experts=true")
+    with pytest.raises(KeyboardInterrupt):
+        job.learn(cfg, tmp_path)
 
     agent = {**asked[0].pop("agent")}
     assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)

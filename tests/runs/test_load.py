@@ -19,10 +19,10 @@ from omegaconf import OmegaConf
 from baselines.a2c import A2C
 from baselines.methods.l2 import L2
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, evaluate, learn_curriculum
-from ctgraph_rl.run import conf_dir
+from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
-from ctgraph_rl.runs.train import new_agent, train
+from ctgraph_rl.runs.train import new_agent, train, with_method
 
 METHODS = sorted(path.stem for path in Path(conf_dir(), "method").glob("*.yaml"))
 
@@ -79,14 +79,9 @@ def test_loading_leaves_the_callers_random_state_and_the_directory(runs):
 def learn_with(method: dict, run_dir: Path):
     """An agent as a run left it that wears a method and sees task ids."""
     told = instantiate(method).prepare(replace(LEARNED, protocol=Protocol("one_hot")))
-    made = []
-
-    def make_attached(*specs):
-        made.append(instantiate(method).attach(make_agent(*specs), told))
-        return made[-1]
-
-    train(told, make_attached, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
-    return made[-1]
+    agent = new_agent(told, with_method(make_agent, lambda: instantiate(method), told), 3)
+    train(told, agent, run_dir, 3, config={"agent": SETTINGS, "method": method, "seed": 3})
+    return agent
 
 
 def test_an_agent_that_reads_task_ids_is_refused_where_none_are_shown():

@@ -16,8 +16,8 @@ from helpers.small_agents import MINIBATCHES, REPLAY, TINY, TWO_GOALS
 
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.lifelong import OfferCheckpoint
-from ctgraph_rl.run import target
 from ctgraph_rl.runs.checkpoints import decoded, encoded
+from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 

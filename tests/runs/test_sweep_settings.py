@@ -9,6 +9,7 @@ import pytest
 from helpers.sweeping import UNLUCKY, configs, sweep
 
 from ctgraph_rl import run as run_module
+from ctgraph_rl.runs import config, job
 
 
 @pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
@@ -37,7 +38,7 @@ def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag
         "other.num_envs=3",
     ]
 
-    assert run_module.sweepable(
+    assert config.sweepable(
         [flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]
     ) == [
         flag,
@@ -46,7 +47,7 @@ def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag
         "agent.layers=choice([8, 8])",
         *as_they_are,
     ]
-    assert run_module.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
+    assert config.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
 
 
 def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
@@ -149,10 +150,10 @@ def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, 
 def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
     (tmp_path / "failed.txt").write_text("ValueError: before\n")
 
-    with pytest.raises(ValueError), run_module.marked_if_it_fails(tmp_path):
+    with pytest.raises(ValueError), job.marked_if_it_fails(tmp_path):
         raise ValueError("again")
     assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
-    with run_module.marked_if_it_fails(tmp_path):
+    with job.marked_if_it_fails(tmp_path):
         pass
 
     assert not (tmp_path / "failed.txt").exists()

@@ -21,11 +21,11 @@ from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from ctgraph_rl import run as run_module
 from ctgraph_rl.log.files import locked
-from ctgraph_rl.run import explain
-from ctgraph_rl.runs.sweep import SHOWN, Standing, SweepProgress, lock_holder, report, standing
-from hydra_plugins.ctgraph_rl_sweeper import shortened, sigterm_exits, why
+from ctgraph_rl.runs import job
+from ctgraph_rl.runs.config import explain
+from ctgraph_rl.runs.status import SHOWN, Status, SweepProgress, lock_holder, report, status_of
+from ctgraph_rl.runs.sweep import shortened, sigterm_exits, why
 
 SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
 ALL_DONE = "sweep of {0} cells: {0} done, 0 failed, 0 in use, 0 missing\n"
@@ -125,7 +125,7 @@ def test_a_sweep_that_is_interrupted_says_where_it_stands(learned, monkeypatch, 
     def stop(cfg, run_dir, interrupt):
         raise SystemExit(130)
 
-    monkeypatch.setattr(run_module, "learn", stop)
+    monkeypatch.setattr(job, "learn", stop)
 
     code = sweep(monkeypatch, "seed=0,1")
 
@@ -266,21 +266,22 @@ def test_a_failed_job_says_why_and_hydra_prints_nothing(capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_where_a_cell_stands_is_read_from_its_directory(tmp_path):
-    found = [standing(tmp_path / "none")]
+def test_the_status_of_a_cell_is_read_from_its_directory(tmp_path):
+    found = [status_of(tmp_path / "none")]
     (tmp_path / "run.jsonl").touch()
-    found.append(standing(tmp_path))
+    found.append(status_of(tmp_path))
     (tmp_path / "failed.txt").write_text("ValueError: no\n")
-    found.append(standing(tmp_path))
+    found.append(status_of(tmp_path))
     with locked(tmp_path):
-        found.append(standing(tmp_path))
+        found.append(status_of(tmp_path))
     (tmp_path / "metrics.json").touch()
-    found.append(standing(tmp_path))
+    found.append(status_of(tmp_path))
 
     assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
-    assert [reason for _, reason in found[:3]] == ["not begun", "stopped; the next start goes on", "ValueError: no\n"]
+    reasons = ["not begun", "stopped; the next start resumes it", "ValueError: no\n"]
+    assert [reason for _, reason in found[:3]] == reasons
     later = (tmp_path / "metrics.json").stat().st_mtime + 1
-    assert standing(tmp_path, since=later).state == "missing"
+    assert status_of(tmp_path, since=later).state == "missing"
 
 
 def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
@@ -297,9 +298,9 @@ def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
 
 
 def test_a_report_names_the_first_cells_that_are_not_done():
-    cells = {f"seed={seed}": Standing("missing", "not\nbegun") for seed in range(SHOWN + 5)}
+    cells = {f"seed={seed}": Status("missing", "not\nbegun") for seed in range(SHOWN + 5)}
 
-    lines = report({"seed=-1": Standing("done"), **cells}).splitlines()
+    lines = report({"seed=-1": Status("done"), **cells}).splitlines()
 
     assert lines[0] == f"sweep of {SHOWN + 6} cells: 1 done, 0 failed, 0 in use, {SHOWN + 5} missing"
     assert lines[1] == "  missing  seed=0  not begun"
@@ -328,7 +329,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
 
 def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     shown = io.StringIO()
-    monkeypatch.setattr("ctgraph_rl.runs.sweep.SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
 
     (tmp_path / "metrics.json").touch()  # done before, so it tells nothing of the rate
 

@@ -13,7 +13,8 @@ import torch
 from torchrl.record.loggers.common import Logger
 
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.run import plain, run, run_name, target
+from ctgraph_rl.run import run
+from ctgraph_rl.runs.config import plain, run_name, target
 from ctgraph_rl.runs.read import flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker, csv_logger, scalars
 
@@ -62,7 +63,7 @@ def runs(tmp_path_factory) -> dict[str, Path]:
     """Directories of the same short run, without a tracker and with CSV files."""
     from hydra import compose, initialize_config_dir
 
-    from ctgraph_rl.run import conf_dir
+    from ctgraph_rl.packages import conf_dir
 
     folders = {name: tmp_path_factory.mktemp(name) for name in ("none", "csv")}
     with initialize_config_dir(conf_dir(), version_base="1.3"):

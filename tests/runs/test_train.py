@@ -140,7 +140,7 @@ def test_a_curriculum_whose_code_has_changed_is_refused(stopped):
     other = replace(LEARNED, blocks=(Block(LEARNED.tasks[1], 96), LEARNED.blocks[1]))
 
     with pytest.raises(ValueError, match="was begun with another curriculum of this name, whose code has changed"):
-        train(other, make_agent, stopped, 3)
+        train(other, new_agent(other, make_agent, 3), stopped, 3)
 
 
 @pytest.mark.parametrize("log", [None, b"", b'{"kind": "run'])

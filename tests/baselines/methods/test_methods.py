@@ -15,7 +15,8 @@ from helpers.with_methods import made, weights_for
 
 from baselines.methods.importance import Samples
 from baselines.methods.method import Method
-from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum, run
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
+from ctgraph_rl.runs import job
 from ctgraph_rl.runs.train import new_agent
 
 AGENTS = {"a2c": [], "dqn": REPLAY, "drqn": REPLAY, "lstm_ppo": MINIBATCHES, "ppo": MINIBATCHES}
@@ -156,7 +157,7 @@ def test_a_refused_pair_leaves_no_file(compose, tmp_path):
     cfg = compose("curriculum=fo_b1_4tasks", "agent=ppo", "method=mask_lc")
 
     with pytest.raises(ValueError, match="MaskLC needs task ids, which are hidden"):
-        run.learn(cfg, tmp_path)
+        job.learn(cfg, tmp_path)
 
     assert list(tmp_path.iterdir()) == []
 

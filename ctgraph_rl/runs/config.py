@@ -1,0 +1,179 @@
+"""Hydra's side of a run: what its configuration says, its name, and what its settings build."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from inspect import Parameter
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ctgraph_rl.checks import is_int, positive, require
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs.settings import digest, parameters_of
+
+SPECS = ("observation_spec", "action_spec", "folder")
+"""Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
+
+PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
+"""The groups that change a curriculum, each with an example."""
+
+RESUME = ("warn", "strict")
+
+LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
+"""Configurations that come with other packages, and the extras that install these."""
+
+NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report")
+"""Keys of the configuration that do not change results."""
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """Return the configuration as plain values, without Hydra's own and what does not change results."""
+    kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
+    return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
+
+
+def run_name(*, _root_: DictConfig) -> str:
+    """Name a run's directory: curriculum, agent, method if there is one, seed and a hash of the configuration."""
+    choices = _root_.hydra.runtime.choices
+    learner = "-".join([choices.agent, *([choices.method] if choices.method != "finetune" else [])])
+    seed = re.sub(r"\W", "_", str(_root_.seed))  # one that is refused later must not lead elsewhere
+    return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(_root_))}"
+
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def in_sweep() -> bool:
+    """Return whether this run is a cell of a sweep, which reports on its cells itself."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def check_one_cell() -> None:
+    """Refuse to run one cell in place of a sweep.
+
+    Raises:
+        ValueError: without ``-m``, for what only a sweeper can do.
+    """
+    if in_sweep():
+        return
+    chosen = HydraConfig.get()
+    given = {setting.partition("=")[0].lstrip("+") for setting in chosen.overrides.task}
+    swept = {key: value for key, value in (chosen.sweeper.get("params") or {}).items() if key not in given}
+    shown = " ".join(f"{key}={value}" for key, value in swept.items())
+    require(
+        (not swept, f"this configuration is a sweep, {shown}: add -m to run it, or give one value of each"),
+        (not chosen.sweeper.get("status"), "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+    )
+
+
+def check_values(cfg: DictConfig) -> None:
+    """Refuse values of the run's own keys.
+
+    Raises:
+        ValueError: for one out of range.
+    """
+    require((is_int(cfg.seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {cfg.seed!r}"))
+    cores = os.cpu_count() or 1
+    threads_rule = f"num_threads must be in 1..{cores}, the cores of this machine, got {cfg.num_threads!r}"
+    require((is_int(cfg.num_threads, 1, cores), threads_rule))
+    folder = cfg.experts_dir
+    require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
+    for switch in ("overwrite", "experts", "report"):
+        require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
+    require(
+        (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
+        *positive(checkpoint_seconds=cfg.checkpoint_seconds),
+    )
+
+
+def changes_of(cfg: DictConfig, part: str) -> dict[str, Any]:
+    """Return what ``evaluation`` or ``protocol`` of a configuration changes; null changes nothing.
+
+    Raises:
+        ValueError: for a part without keys.
+    """
+    message = f"{part} must have keys, such as {part}.{PARTS[part]}, got {cfg[part]}"
+    require((isinstance(cfg[part], DictConfig), message))
+    return {str(key): value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
+
+
+def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
+    """Return what builds a group of the configuration, with its arguments bound.
+
+    Raises:
+        ValueError: for an argument that the target does not take; lists the choices.
+    """
+    given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
+    parameters = parameters_of(hydra.utils.get_object(cfg[group]["_target_"]))
+    choices = [name for name in parameters if name not in SPECS]
+    unknown = [name for name in given if name not in choices]
+    missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
+    require(
+        (not unknown, f"{group} has no {', '.join(unknown)}. Choices: {', '.join(choices)}"),
+        (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
+    )
+    return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
+
+
+def write_configuration(cfg: DictConfig, folder: Path) -> None:
+    """Write the files that Hydra writes, but only after all checks."""
+    folder.mkdir(exist_ok=True)
+    OmegaConf.save(cfg, folder / "config.yaml")
+    if HydraConfig.initialized():
+        OmegaConf.save(HydraConfig.instance().cfg, folder / "hydra.yaml")
+        OmegaConf.save(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+
+
+def explain(error: BaseException) -> str:
+    """Return one message for a user's error: its cause within Hydra's errors, and the choices for an unknown key."""
+    cause = error
+    while cause.__cause__ is not None and not _says_what_to_do(cause):
+        cause = cause.__cause__
+    message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
+    extra = LAUNCHERS.get(cause.missing_cfg_file or "") if isinstance(cause, MissingConfigException) else None
+    if extra is not None:
+        return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
+    node = getattr(cause, "parent_node", None)
+    if isinstance(node, DictConfig):
+        message += f"\nChoices: {', '.join(sorted(map(str, node)))}"
+    return message
+
+
+def _says_what_to_do(error: BaseException) -> bool:
+    """Return whether an error says more than what caused it."""
+    return isinstance(error, (ValueError, OSError)) and not isinstance(error, OmegaConfBaseException)
+
+
+def sweepable(arguments: Sequence[str]) -> list[str]:
+    """Write settings of groups, such as ``agent.compile=true``, as choices of one value in the command line of a sweep.
+
+    Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
+    a setting that this default lacks.
+    """
+    if not any(each == "-m" or (each.startswith("--m") and "--multirun".startswith(each)) for each in arguments):
+        return list(arguments)
+    groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
+    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")
+    return [_as_choice(*match.groups()) if (match := setting.fullmatch(each)) else each for each in arguments]
+
+
+def _as_choice(key: str, value: str) -> str:
+    """Return a setting as the choice of its one value; unchanged, if it has several, or would be read differently."""
+    setting, choice = f"{key}={value}", f"{key}=choice({value})"
+    parse = OverridesParser.create().parse_override
+    try:
+        before = parse(setting).value()
+        after = [parse(f"{key}={text}").value() for text in parse(choice).sweep_string_iterator()]
+    except HydraException:  # which Hydra reports, if the setting itself is at fault
+        return setting
+    return choice if after == [before] else setting

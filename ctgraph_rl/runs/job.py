@@ -1,0 +1,230 @@
+"""One run of a configuration: its objects are built once, learn, and leave files."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
+from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
+from ctgraph_rl.log.provenance import versions
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.experts import Expert, expert_curriculum, find_or_train
+from ctgraph_rl.runs.interrupt import Interrupt
+from ctgraph_rl.runs.settings import as_before, differences, flat
+from ctgraph_rl.runs.trackers import FOLDER, Tracker
+from ctgraph_rl.runs.train import RESULTS, MakeAgent, new_agent, remove_results, train, with_method
+from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
+
+OF_AN_EXPERT = ("agent", "seed", "device", "num_threads")
+"""Settings that a single-task expert shares with the run that needs it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """The objects of a configuration.
+
+    Args:
+        cfg: the composed configuration.
+        curriculum: what is learned, with all changes of the configuration and the method.
+        agent: the learner with its method; torch's global generator is as its construction left it.
+        make_alone: builds the agent without a method, for single-task experts.
+        device: where environment and agent live.
+        interrupt: notices when the process is asked to stop.
+    """
+
+    cfg: DictConfig
+    curriculum: Curriculum
+    agent: Agent
+    make_alone: MakeAgent
+    device: torch.device
+    interrupt: Interrupt
+
+    @classmethod
+    def of(cls, cfg: DictConfig, interrupt: Interrupt) -> Job:
+        """Build the objects of a configuration, the agent last.
+
+        Raises:
+            ValueError: for values out of range, and parts that do not go together.
+        """
+        device = checked_device(cfg.device)
+        torch.set_num_threads(cfg.num_threads)
+        torch.set_flush_denormal(True)
+        make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
+        curriculum = make_method().prepare(with_changes(config.target(cfg, "curriculum")(), cfg))
+        if cfg.experts:
+            _check_experts(curriculum, make_alone, cfg.seed)
+        agent = new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, device)
+        return cls(cfg, curriculum, agent, make_alone, device=device, interrupt=interrupt)
+
+    def learn(self, run_dir: Path) -> None:
+        """Learn into a directory; the single-task experts first, where the configuration asks for them."""
+        cfg, saved = self.cfg, self._checkpoints(run_dir)
+        with self._tracking(run_dir) as listeners:
+            if cfg.overwrite:
+                saved.clear()
+                remove_results(run_dir)
+            config.write_configuration(cfg, run_dir / ".hydra")
+            with torch.random.fork_rng():
+                experts = self._experts() if cfg.experts else None
+            self._train(self.curriculum, self.agent, run_dir, config.plain(cfg), experts=experts, listeners=listeners)
+
+    def _experts(self) -> list[Expert]:
+        """Return the experts of the curriculum, found or trained with the run's own agent, seed and threads."""
+        settings = {key: value for key, value in config.plain(self.cfg).items() if key in OF_AN_EXPERT}
+
+        def learn_alone(alone: Curriculum, run_dir: Path) -> None:
+            agent = new_agent(alone, self.make_alone, self.cfg.seed, self.device)
+            self._train(alone, agent, run_dir, settings)
+
+        folder, key = Path(self.cfg.experts_dir), {**as_before(settings), "versions": versions()}
+        return find_or_train(self.curriculum, learn_alone, folder, key, print, waiting=self.interrupt.check)
+
+    def _train(
+        self, curriculum: Curriculum, agent: Agent, run_dir: Path, settings: Mapping[str, Any], **more: Any
+    ) -> None:
+        """Train into a directory, with checkpoints; a sweep shows no progress of its runs."""
+        console = Console(quiet=True) if config.in_sweep() else None
+        how = {"config": settings, "checkpoints": self._checkpoints(run_dir), "console": console, **more}
+        train(curriculum, agent, run_dir, self.cfg.seed, self.device, **how)
+
+    def _checkpoints(self, run_dir: Path) -> Checkpoints:
+        strict = self.cfg.resume == "strict"
+        return Checkpoints(run_dir / CHECKPOINTS, self.cfg.checkpoint_seconds, strict, self.interrupt)
+
+    @contextmanager
+    def _tracking(self, run_dir: Path) -> Iterator[list[Tracker]]:
+        """Open the tracker that ``logger`` names, if it names one, and close it at the end."""
+        if "logger" not in self.cfg:
+            if self.cfg.overwrite:
+                shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
+            yield []
+            return
+        settings = dict(flat(config.plain(self.cfg)))
+        with Tracker(config.target(self.cfg, "logger"), run_dir, settings) as tracker:
+            yield [tracker]
+
+
+def run_job(cfg: DictConfig, run_dir: Path) -> None:
+    """Run a configuration in an existing directory, unless its results are there.
+
+    Raises:
+        ValueError: before any work, for a value out of range.
+        FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    with locked(run_dir):
+        with marked_if_it_fails(run_dir) if config.in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
+            config.check_values(cfg)
+            finished = is_finished(cfg, run_dir)
+        if finished:
+            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+            return
+        with Interrupt() as interrupt, marked_if_it_fails(run_dir):
+            learn(cfg, run_dir, interrupt)
+
+
+def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> None:
+    """Build the objects of a configuration and let them learn into a directory."""
+    job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
+    if cfg.experts and not job.curriculum.evaluation.every:
+        print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
+    job.learn(run_dir)
+
+
+def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
+    """Return whether the directory already holds the results of this configuration, complete.
+
+    Raises:
+        FileExistsError: if it holds a run, finished or not, of another configuration; shows the difference.
+    """
+    stored = None if cfg.overwrite else stored_settings(run_dir)
+    if stored is None:
+        return False
+    changed = differences(stored, config.plain(cfg))
+    if changed:
+        advice = "choose another hydra.run.dir, or overwrite=true to replace it"
+        raise FileExistsError(f"{run_dir} holds a run with {', '.join(changed)}; {advice}")
+    finished = (run_dir / METRICS).exists()
+    if finished:
+        print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
+    return finished
+
+
+def stored_settings(run_dir: Path) -> Mapping[str, Any] | None:
+    """Return the settings of the run that a directory holds; None without a run.
+
+    Raises:
+        FileExistsError: if it holds files that a run would replace, and that are of no run.
+    """
+    there = [name for name in RESULTS if (run_dir / name).exists()]
+    log = RunLog.read(run_dir / LOG) if LOG in there else RunLog()
+    runs = log.of_kind("run")
+    if runs:
+        return runs[0].get("config") or {}
+    if not there or (there == [LOG] and not log.measurements):  # stopped while its first line was written
+        return None
+    advice = "choose another hydra.run.dir, or overwrite=true to replace them"
+    raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
+
+
+@contextmanager
+def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
+    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
+    mark = run_dir / FAILURE
+    failed_before = mark.exists()
+    mark.unlink(missing_ok=True)
+    try:
+        yield
+    except Exception as error:
+        if failed_before or (run_dir / LOG).exists() or config.in_sweep():
+            with suppress(OSError):
+                mark.write_text(f"{type(error).__name__}: {config.explain(error)}\n", encoding="utf-8")
+        raise
+
+
+def checked_device(name: str) -> torch.device:
+    """Return the torch device of a name.
+
+    Raises:
+        ValueError: if there is no such device on this machine; lists the choices.
+    """
+    choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    require((name in choices, f"device must be one of {', '.join(choices)} on this machine, got {name!r}"))
+    return torch.device(name)
+
+
+def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
+    """Return the curriculum with what ``evaluation`` and ``protocol`` of the configuration change.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+    made = type(curriculum).__name__
+    require((isinstance(curriculum, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {made}"))
+    evaluation, protocol = (config.changes_of(cfg, part) for part in config.PARTS)
+    how = curriculum.protocol
+    if protocol.get("task_id") == "hidden":
+        how = Protocol(boundaries=how.boundaries)  # hidden ids have no length and no numbers
+    return replace(
+        curriculum, evaluation=replace(curriculum.evaluation, **evaluation), protocol=replace(how, **protocol)
+    )
+
+
+def _check_experts(curriculum: Curriculum, make_alone: MakeAgent, seed: int) -> None:
+    """Refuse a curriculum whose tasks the agent cannot learn alone."""
+    for task in curriculum.tasks:
+        new_agent(expert_curriculum(curriculum, task), make_alone, seed)

@@ -1,0 +1,172 @@
+"""The status of a sweep's cells, read from their directories: one line while they run, and what is left at the end."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from datetime import timedelta
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS
+
+DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
+
+SHOWN = 20
+"""Cells that the report at a sweep's end names."""
+
+SECONDS_BETWEEN_LINES = 60.0
+"""Where no terminal shows one line that changes."""
+
+
+class Status(NamedTuple):
+    """The state of a cell, and why it is not done."""
+
+    state: str
+    reason: str = ""
+
+
+def status_of(folder: Path, since: float = 0.0, error: str | None = None) -> Status:
+    """Return the status of the cell of a run directory.
+
+    Args:
+        folder: the directory; need not exist.
+        since: results and failures that are older do not count, in seconds since 1970.
+        error: what it raised, where that is known.
+    """
+    if _is_younger(folder / METRICS, since):
+        return Status(DONE)
+    user = lock_holder(folder)
+    if user is not None:
+        return Status(IN_USE, f"by {user}")
+    if error is not None:
+        return Status(FAILED, error)
+    if _is_younger(folder / FAILURE, since):
+        return Status(FAILED, (folder / FAILURE).read_text(encoding="utf-8", errors="replace"))
+    return Status(MISSING, "stopped; the next start resumes it" if (folder / LOG).exists() else "not begun")
+
+
+def _is_younger(path: Path, since: float) -> bool:
+    try:
+        return path.stat().st_mtime >= since
+    except OSError:
+        return False
+
+
+def lock_holder(folder: Path) -> str | None:
+    """Return which process has locked a run directory; None for none, or one of this machine that has ended."""
+    try:
+        holder = (folder / LOCK).read_text(encoding="utf-8")
+    except OSError:
+        return None
+    _, number, _, host, *_ = [*holder.split(), *[""] * 4]
+    if host == socket.gethostname():
+        try:
+            os.kill(int(number), 0)
+        except ProcessLookupError:
+            return None
+        except PermissionError:  # another user's
+            pass
+    return holder or "another process"
+
+
+def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None = SHOWN) -> str:
+    """Report the number of cells in each state, and those that are not done with their reasons.
+
+    Args:
+        statuses: each cell by its settings.
+        repeated: cells that are left out, as they are there twice.
+        most: cells that are named; None: all.
+    """
+    counts = Counter(found.state for found in statuses.values())
+    numbers = ", ".join(f"{counts[state]} {state}" for state in (DONE, FAILED, IN_USE, MISSING))
+    twice = f" ({repeated} more are the same as others)" if repeated else ""
+    lines = [f"sweep of {len(statuses)} cells{twice}: {numbers}"]
+    left = [(name, found) for name, found in statuses.items() if found.state != DONE]
+    lines += [f"  {state:<7}  {name}  {' '.join(reason.split())}" for name, (state, reason) in left[:most]]
+    if most is not None and len(left) > most:
+        lines.append(f"  and {len(left) - most} more")
+    if left:
+        lines.append("the same command runs what is not done; with hydra.sweeper.status=true it only lists it")
+    return "\n".join(lines)
+
+
+class SweepProgress:
+    """Shows how many cells are done, failed and running on standard error; use it as a context manager.
+
+    It looks at their directories every second, or less often where that takes long.
+
+    Args:
+        folders: the cells' run directories.
+        since: see `status_of`.
+        console: where it shows; default: standard error.
+    """
+
+    def __init__(self, folders: Sequence[Path], since: float = 0.0, console: Console | None = None) -> None:
+        self.total, self.since = len(folders), since
+        self.console = Console(stderr=True) if console is None else console
+        self._left = list(folders)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
+        self._task = self._bar.add_task("starting", total=self.total)
+
+    def __enter__(self) -> SweepProgress:
+        if self.console.is_terminal:
+            self._bar.start()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        if self.console.is_terminal:
+            self._bar.stop()
+
+    def _watch(self) -> None:
+        start = last_line = time.perf_counter()
+        ended_before = sum(self.look()[:2])
+        pause = 1.0
+        while not self._stop.wait(pause):
+            now = time.perf_counter()
+            done, failed, running = self.look()
+            pause = max(1.0, 20 * (time.perf_counter() - now))
+            text = self.describe(done, failed, running, done + failed - ended_before, now - start)
+            if self.console.is_terminal:
+                self._bar.update(self._task, completed=done, description=text)
+            elif now - last_line >= SECONDS_BETWEEN_LINES:
+                last_line = now
+                self.console.print(text, highlight=False, soft_wrap=True)
+
+    def look(self) -> tuple[int, int, int]:
+        """Return the numbers of cells that are done, failed and running."""
+        found = {folder: status_of(folder, self.since).state for folder in self._left}
+        self._left = [folder for folder, state in found.items() if state != DONE]
+        counts = Counter(found.values())
+        return self.total - len(self._left), counts[FAILED], counts[IN_USE]
+
+    def describe(self, done: int, failed: int, running: int, ended: int, seconds: float) -> str:
+        """Return one line: cells done, failed and running, rate and time left.
+
+        Args:
+            done: cells that are done, also before.
+            failed: cells that failed.
+            running: cells that run.
+            ended: cells that ended in `seconds`, done or failed.
+            seconds: time of this start.
+        """
+        rate = ended / seconds
+        left = (self.total - done - failed) / rate if rate else math.inf
+        shown = timedelta(seconds=round(left)) if math.isfinite(left) else "?"
+        return f"{done}/{self.total} cells done  {failed} failed  {running} running  {60 * rate:.3g}/min  {shown} left"
