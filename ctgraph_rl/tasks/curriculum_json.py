@@ -3,7 +3,8 @@
 Every field is written out, defaults too, under the names that the classes have. The different tasks are listed once,
 first those that blocks train, then those held out; blocks and ``held_out`` name them by position, from 0. ``type`` says
 which of several classes a part is. ``fingerprint`` is that of `Curriculum`; ``about`` holds numbers that follow from
-the rest and is not read.
+the rest and is not read. A field that was added later, ``field(default=..., metadata={"added": True})`` with a default
+that means "as before", may be missing: older files have none.
 """
 
 from __future__ import annotations
@@ -245,7 +246,8 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
 
 def _built(kind: type, content: Any, readers: Mapping[str, Callable[[Any], Any]]) -> Any:
     """An object of a class of ours from its fields; ``readers`` turn some of them into parts first."""
-    _check_keys(content, _names(kind))
+    added = [field.name for field in fields(kind) if field.metadata.get("added")]
+    _check_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = dict(content)
     for name, read in readers.items():
         with _within(name):

@@ -2,7 +2,8 @@
 
 import copy
 import json
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
+from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
 from types import ModuleType
@@ -130,6 +131,21 @@ def test_all_our_image_sets_rewards_and_switches_can_be_exchanged():
     assert set(images.IMAGE_SETS) == classes(*of_images) and len(of_images) >= 6
     assert set(rewards.REWARD_FNS) == classes(rewards)
     assert set(switch.SWITCHES) == classes(switch)
+
+
+def test_files_without_a_field_that_was_added_later_are_read():
+    @dataclass(frozen=True)
+    class Part:
+        old: int
+        new: int = field(default=3, metadata={"added": True})
+        also_old: int = 1
+
+    build = partial(curriculum_json._built, Part, readers={})
+
+    assert build({"old": 1, "also_old": 2}) == Part(1, 3, 2)
+    assert build({"old": 1, "also_old": 2, "new": 4}) == Part(1, 4, 2)
+    with pytest.raises(ValueError, match="missing keys: also_old"):
+        build({"old": 1})
 
 
 def test_a_user_s_images_come_back_with_their_hash(tmp_path):
