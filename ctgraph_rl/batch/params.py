@@ -16,7 +16,7 @@ from ctgraph_rl.core.rewards import RewardFn
 from ctgraph_rl.core.rotation import taps_of
 from ctgraph_rl.core.tree import TreeParams, tree_params
 from ctgraph_rl.tasks.images import white_level
-from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, require_memory, rotates_after_noise
+from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, require_memory, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
 
 MakeTensor = Callable[..., Tensor]
@@ -178,8 +178,7 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
     banks, starts, rows = [], {}, 0
     for key in dict.fromkeys(map(bank_key, pool)):
-        images, rotation = key
-        bank = images.bank(rotation)
+        bank = make_bank(key)
         if len(shape) == 1:
             bank = torch.nn.functional.pad(bank, (0, shape[0] - bank.shape[1]))
         banks.append(bank)

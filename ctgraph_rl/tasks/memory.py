@@ -6,6 +6,8 @@ import math
 import os
 from collections.abc import Iterable
 
+from torch import Tensor
+
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.images import ImageSet
 from ctgraph_rl.tasks.task import Task
@@ -22,6 +24,12 @@ def rotates_after_noise(task: Task) -> bool:
 def bank_key(task: Task) -> BankKey:
     """Return the images of a task and the rotation that is in the bank."""
     return task.images, 0 if rotates_after_noise(task) else task.observations.read_rotation
+
+
+def make_bank(key: BankKey) -> Tensor:
+    """Return all images of a key, uint8 [rows, *shape]; see `ImageSet.bank`."""
+    images, rotation = key
+    return images.bank(rotation)
 
 
 def bank_bytes(tasks: Iterable[Task]) -> int:

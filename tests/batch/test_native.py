@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,7 +25,9 @@ from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, rollout
 from ctgraph_rl.batch import native
 from ctgraph_rl.batch.native import Native
 from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core.dynamics import ObservationParams, RewardParams
 from ctgraph_rl.core.rewards import Arrival
+from ctgraph_rl.core.tree import TreeParams
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collect import collect, make_env
 from ctgraph_rl.policies import RandomPolicy
@@ -342,3 +346,12 @@ def test_a_run_steps_by_the_kernel_where_there_is_one_and_elsewhere_by_tensors(m
 def random_batches(env: CTGraphEnv) -> list[TensorDictBase]:
     torch.manual_seed(0)
     return list(collect(env, RandomPolicy(env), 480, 20))
+
+
+def test_the_kernel_reads_every_parameter_of_tasks_but_what_it_has_in_another_form():
+    in_another_form = {"first_kind", "bank_start", "first_move", "next_kind", "decides", "width", "by_action"}
+    source = inspect.getsource(native)
+
+    named = {name for part in (TreeParams, ObservationParams, RewardParams) for name in part._fields}
+
+    assert {name for name in named if not re.search(rf"\.{name}\b", source)} <= in_another_form
