@@ -1,4 +1,4 @@
-"""What a reader wants to know of a curriculum before any run, as tables for the terminal, Markdown and LaTeX.
+"""Descriptions of curricula before any run, as tables for the terminal, Markdown and LaTeX.
 
 ``python -m curricula`` lists all, ``python -m curricula describe NAME`` describes one.
 """
@@ -26,7 +26,7 @@ from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
 FRAMES_PER_SECOND = 18_000
-"""What the LSTM-PPO agent of this package learns from on one core, roughly; for estimates of time."""
+"""Rough speed of the LSTM-PPO agent of this package on one core, for estimates of time."""
 
 UNKNOWN = "-"
 
@@ -97,7 +97,7 @@ def _overview(curriculum: Curriculum, frames_per_second: float) -> Sheet:
 
 
 def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
-    """What the learner is told."""
+    """Return a protocol in words."""
     told = {
         "hidden": "The learner is not told its task.",
         "one_hot": f"Every observation comes with a one-hot task id of length {protocol.length(num_tasks)}.",

@@ -44,7 +44,7 @@ def load(name: str, **arguments: Any) -> Curriculum:
 
 
 def summary(name: str) -> str:
-    """What a curriculum is, in a sentence.
+    """Return a sentence on a curriculum.
 
     Raises:
         ValueError: for an unknown name; lists the choices.

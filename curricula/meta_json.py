@@ -194,7 +194,7 @@ def _named(path: Path) -> Iterator[None]:
 
 
 class FileError(ValueError):
-    """What is wrong with a file, its path in front."""
+    """The error of a file, its path in front."""
 
 
 def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:

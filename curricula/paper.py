@@ -40,7 +40,7 @@ KINDS = {
     "co_b1": "confounding",
     "posr_b1": "surjective",
 }
-"""How each configuration shows its states; see `curricula.axes.observability`."""
+"""The observability of each configuration; see `curricula.axes.observability`."""
 
 DEPTHS = (2, 3, 4, 5)
 DEEPEST_GOAL = (1, 2, 1, 2, 2)

@@ -1,4 +1,4 @@
-"""What the published sequences share: the labs' environments, task ids and evaluation; and what cannot be recovered.
+"""Common parts of the published sequences: the labs' environments, task ids and evaluation; and those lost.
 
 The labs write a goal as a string of 0 and 1, and a task with its image seed before it: ``2:110`` is the goal (2, 2, 1)
 with the images of seed 2. Environments are those of the authors' implementation, its switches on, as
@@ -237,4 +237,4 @@ MISSING = (
         "they were drawn anew in every generation; penn_a_swap draws by the same rule from a seed of its own",
     ),
 )
-"""What cannot be recovered, and why; nothing here is guessed."""
+"""Sequences that cannot be recovered, and why; nothing here is guessed."""

@@ -50,7 +50,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         ("seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"), (_is_number, "a number")
     ),
 }
-"""What a field must be where it is there."""
+"""Rules for the fields of a measurement."""
 
 NEEDED = {"training": ("block", "frames"), "evaluation": ("block", "frames", "task", "return_mean")}
 """Fields of the kinds that tables are made of."""

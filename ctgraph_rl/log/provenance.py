@@ -1,4 +1,4 @@
-"""What a run's numbers depend on, for the first line of its log."""
+"""Provenance: the versions and the machine that a run's numbers depend on, for the first line of its log."""
 
 from __future__ import annotations
 

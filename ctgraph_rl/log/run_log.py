@@ -86,7 +86,7 @@ class RunLog:
         return log
 
     def position(self) -> dict[str, float]:
-        """How far the file is, in bytes that have reached the disk, and the time of the run, in seconds."""
+        """Return the length of the file, in bytes that have reached the disk, and the time of the run, in seconds."""
         size = 0
         if self._file is not None and self._path is not None:
             size = self._file.tell()

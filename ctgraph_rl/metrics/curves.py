@@ -155,7 +155,7 @@ def relative_forgetting(curves: Curves) -> Tensor:
     inputs={"threshold": "mastered_returns"},
 )
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
-    """How many tasks are mastered right after the last block that trains them, forgotten later or not.
+    """Number of tasks that are mastered right after the last block that trains them, forgotten later or not.
 
     Ben-Iwhiwhu et al. report such a number without a formula; a later evaluation code of the labs (AMSC, 2026) counts
     tasks that are at 0.9 at the very end. A task that no block trains is none.

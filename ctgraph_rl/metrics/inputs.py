@@ -1,4 +1,4 @@
-"""What a run gives to metrics. A metric says by the names of its arguments which of these it takes."""
+"""The inputs of metrics that a run gives. The names of a metric's arguments say which of them it takes."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def smooth(values: Tensor) -> Tensor:
 
 
 def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | None = None) -> tuple[Regimes, Experts]:
-    """What l2metrics does before it measures: training is smoothed, and each task scaled to 1..101.
+    """Smooth training and scale each task to 1..101, as l2metrics does before it measures.
 
     Args:
         regimes: a run.

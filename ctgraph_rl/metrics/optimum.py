@@ -18,7 +18,7 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, defined, ratio
 PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
 
 STAGES = ("fails", "navigates", "solves")
-"""What an agent has reached on a task: it fails on the way, gets to end states, or gets to the goal."""
+"""Stages of an agent on a task: it fails on the way, gets to end states, or gets to the goal."""
 
 
 @defined(
@@ -42,7 +42,7 @@ def normalised_performance(performance: Tensor, best: Tensor, zero: Tensor | flo
 
 @defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE)
 def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MASTERED) -> Tensor:
-    """How far the agent got on each task, by `STAGES`; the terms are the tasks' stages.
+    """Mean of the stage that the agent reached on each task, by `STAGES`; the terms are the tasks' stages.
 
     Args:
         end_rates: share of a task's evaluation episodes that got to an end state, the goal's or another, [tasks].

@@ -24,7 +24,7 @@ Arguments = ParamSpec("Arguments")
 
 @dataclass(frozen=True)
 class Definition:
-    """What a metric is.
+    """The meaning of a metric.
 
     Args:
         id: short name of source and metric, such as ``lopez-paz2017/bwt``.

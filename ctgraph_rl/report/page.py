@@ -42,7 +42,7 @@ MOST_COLUMNS = 10
 
 
 class Report(NamedTuple):
-    """What was made."""
+    """The page that was written, its runs, and what could not be read."""
 
     page: Path
     runs: list[Run]
@@ -58,7 +58,7 @@ class Numbers(NamedTuple):
 
 
 class AgentPart(NamedTuple):
-    """What the page says of an agent."""
+    """The part of the page on an agent."""
 
     result: Result
     figures: list[Written]
@@ -68,7 +68,7 @@ class AgentPart(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What the page says of a curriculum."""
+    """The part of the page on a curriculum."""
 
     section: Section
     facts: list[tuple[str, Any]]
@@ -159,7 +159,7 @@ def _part(section: Section, gallery: Gallery) -> Part:
 
 
 def _facts(section: Section) -> Iterator[tuple[str, Any]]:
-    """What was learned."""
+    """Return the facts of the curriculum that was learned."""
     about = section.one.about
     yield "curriculum", about["curriculum"]
     for name in ("version", "fingerprint", "source"):
@@ -183,7 +183,7 @@ def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
 
 
 def _sentences(result: Result, trees: Trees | None) -> Iterator[str]:
-    """What is missing, and why."""
+    """Return sentences on what is missing, and why."""
     missing = [f"Seed {seed} has no run." for seed, run in result.by_seed.items() if run is None]
     missing += [f"Seed {run.seed} has no results: {run.reason}." for run in result.runs if run.reason is not None]
     yield from missing[:MOST_SENTENCES]

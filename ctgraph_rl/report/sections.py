@@ -30,7 +30,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """What an agent did on a curriculum.
+    """The runs of an agent on a curriculum.
 
     Args:
         agent: its name.
@@ -61,7 +61,7 @@ class Result:
         return self._over_seeds([history.performance for history in _histories(self.finished)])
 
     def transfer(self) -> Matrix:
-        """What each block's training did to each task: differences of successive rows of the performance matrix."""
+        """Changes of each task by each block: differences of successive rows of the performance matrix."""
         return self._over_seeds([_differences(history.performance) for history in _histories(self.finished)])
 
     def _over_seeds(self, matrices: Sequence[list[list[float]]]) -> Matrix:
@@ -75,7 +75,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Section:
-    """What happened on a curriculum.
+    """The results of all agents on a curriculum.
 
     Args:
         name: the curriculum's, different from that of every other section.

@@ -29,7 +29,7 @@ ROUNDING = 1e-12
 """Sums that differ by less are equal."""
 
 MOST_SEEDS = 2**20
-"""Where `seeds_needed` gives up."""
+"""Number of seeds at which `seeds_needed` gives up."""
 
 Values = Sequence[float | None]
 

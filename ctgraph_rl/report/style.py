@@ -1,4 +1,4 @@
-"""What all figures of the report share: one style, one colour and mark for each agent, and sizes in inches."""
+"""The style of all figures of the report: one style sheet, one colour and mark for each agent, and sizes in inches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 STYLE = Path(__file__).with_name("style.mplstyle")
 
 PACKAGES = ("matplotlib", "jinja2", "scipy")
-"""What the extra ``report`` installs."""
+"""Packages that the extra ``report`` installs."""
 
 WIDTH = 7.2
 """Of a figure: a page's text in print."""

@@ -99,7 +99,7 @@ class Curriculum:
         return bisect_left(self.ends, frames) + 1 if frames else 0
 
     def moment(self, frames: int) -> str | None:
-        """Which evaluation is due after ``frames`` frames: ``before``, ``during`` or ``after`` a block, or None."""
+        """Return the evaluation due after ``frames`` frames: ``before``, ``during`` or ``after`` a block, or None."""
         how = self.evaluation
         within = how.every > 0 and frames % how.every == 0
         if frames == 0:

@@ -145,7 +145,7 @@ def _within(place: str) -> Iterator[None]:
 
 
 def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-    """What to call the source in an error, and its content."""
+    """Return the name of the source for errors, and its content."""
     if isinstance(path_or_dict, Mapping):
         return "curriculum", path_or_dict
     is_path = isinstance(path_or_dict, (str, PathLike))

@@ -103,7 +103,7 @@ class Observations:
         return 0 if kind == StateType.END else graph.first_node(level)
 
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
-        """What must hold on a graph: unique ids need as many ids as there are states."""
+        """Return the rules on a graph: unique ids need as many ids as there are states."""
         return [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
 
     def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:

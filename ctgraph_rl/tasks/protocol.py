@@ -69,7 +69,7 @@ class Block:
         return list(self.tasks) * (num_envs // count)
 
     def frame_rule(self, num_envs: int, name: str) -> tuple[bool, str]:
-        """What must hold for ``num_envs`` rows: whole steps only. ``name`` says which block it is."""
+        """Return the rule for ``num_envs`` rows: whole steps only. ``name`` says which block it is."""
         below = self.num_frames - self.num_frames % num_envs
         near = f"{below} or {below + num_envs}" if below else f"{num_envs}"
         message = f"num_frames={self.num_frames} of {name} must be a multiple of num_envs={num_envs}; nearest: {near}"
@@ -122,7 +122,7 @@ class Evaluation:
         )
 
     def every_rule(self, num_envs: int) -> tuple[bool, str]:
-        """What must hold for ``num_envs`` rows: evaluations fall between steps of all rows."""
+        """Return the rule for ``num_envs`` rows: evaluations fall between steps of all rows."""
         near = max(self.every - self.every % num_envs, num_envs)
         message = f"evaluation.every={self.every} must be a multiple of num_envs={num_envs}, such as {near}"
         return self.every % num_envs == 0, message
@@ -145,13 +145,13 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Protocol:
-    """What the learner is told.
+    """The information that the learner is given on tasks and on boundaries between blocks.
 
     Args:
         task_id: ``hidden``; ``one_hot``: every observation comes with a one-hot ``task_id``; ``at_boundaries``: the
             agent is given the task's id where a block begins and where it is evaluated.
         boundaries: ``announced``: at the start of a block all episodes end and the agent is told; ``hidden``: each row
-            goes over to the next block's task when its episode ends, and nobody is told.
+            goes over to the next block's task when its episode ends, without notice to the agent.
         num_task_ids: length of the one-hot id; None: just enough.
         task_ids: the id of each of the curriculum's ``tasks``; None: their positions, from 0.
 

@@ -85,7 +85,7 @@ def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Seque
 
 
 def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-    """What to call the source in an error, and its content."""
+    """Return the name of the source for errors, and its content."""
     if isinstance(path_or_dict, Mapping):
         return "configuration", path_or_dict
     is_path = isinstance(path_or_dict, (str, PathLike))
@@ -114,7 +114,7 @@ def _dialect(content: Mapping[str, Any]) -> str:
 
 
 def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
-    """What keeps a file from being one of a dialect: sections and keys that are missing, unknown, or another's."""
+    """Return the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
     wanted, names = _places(dialect).values(), (*_SECTIONS, "general_seed")
     unknown = [f"unknown section {name!r}{_suggest(name, names)}" for name in content if name not in names]
     whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
@@ -141,7 +141,7 @@ def _says_nothing(section: str, key: str, content: Mapping[str, Any]) -> bool:
 
 
 def _surplus(section: str, key: str, dialect: str) -> str:
-    """What is wrong with a key that a dialect does not have."""
+    """Return the fault of a key that a dialect does not have."""
     here = _places(dialect)
     for other in _DIALECTS:
         for name, place in _places(other).items():
@@ -158,7 +158,7 @@ def _suggest(name: object, choices: Sequence[str]) -> str:
 
 
 def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[tuple[bool, str]]:
-    """What must hold for values before they become ours; all else is checked by what they become."""
+    """Return the rules for a file's values that the parts of a task do not check themselves."""
 
     def said(name: str) -> str:
         return f"{'.'.join(places[name])} must be"
@@ -237,7 +237,7 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
 
 
 def _expressible(task: Task) -> list[tuple[bool, str]]:
-    """What a task must have for a file of the 2023 dialect to say it, and what it has instead."""
+    """Return the rules for tasks that a file of the 2023 dialect can express."""
     x, images = task.observations, task.images
     unique = x.unique_waits or x.unique_decisions or x.unique_ends
     kinds = (ReferenceImages, ReferenceOneHot)

@@ -1,4 +1,4 @@
-"""How alike tasks are: exact measures of goals, optimal actions, images and graphs, as matrices.
+"""Similarity of tasks: exact measures of goals, optimal actions, images and graphs, as matrices.
 
 All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the decisions that lead to them, in
 the *common tree*: decisions and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
@@ -310,7 +310,7 @@ def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
 
 
 def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
-    """What the images behind ids are known by: equal for equal images of any set."""
+    """Return a digest of each image behind ids, equal for equal images of any set."""
     needed, variants = bank_bytes([task]), task.images.num_variants
     rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"
     require((needed <= MAX_COMPARED_BYTES, rule))

@@ -1,4 +1,4 @@
-"""How the task changes within a block: by the episode, at random times, or by drift. No boundary tells of it.
+"""Changes of the task within a block: by the episode, at random times, or by drift, without any boundary.
 
 A switch decides which of a block's tasks an episode has. Its clock counts episodes: those that a row has completed in
 the block, or, for all rows ``together``, the mean over the rows, rounded down. A change takes effect where a row starts
@@ -21,7 +21,7 @@ MOST_EPISODES = 2**31
 
 
 class Switch(Protocol):
-    """Which task comes next. A user's own is a frozen dataclass with these members."""
+    """A rule for the next task. A user's own is a frozen dataclass with these members."""
 
     @property
     def together(self) -> bool:

@@ -208,7 +208,7 @@ class Task:
 
     @property
     def label_parts(self) -> dict[str, str]:
-        """What tells tasks apart in tables: goal, depth, branching factor, wait probability and images."""
+        """Parts of a task's label in tables: goal, depth, branching factor, wait probability and images."""
         images = type(self.images).__name__.lower() if self.image_seed is None else f"img{self.image_seed}"
         return {
             "goal": f"goal{'.'.join(map(str, self.goal))}",

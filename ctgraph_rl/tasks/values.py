@@ -35,7 +35,7 @@ MAX_ENUMERATED_STATES = 2**21
 """Largest graph whose states are visited one by one; needles are computed without it where their docstrings say so."""
 
 SUM_TOLERANCE = 1e-6
-"""How far the probabilities of an observation may be from a sum of 1: float32 policies are welcome."""
+"""Largest distance of the sum of an observation's probabilities from 1, wide enough for float32 policies."""
 
 
 def optimal_value(task: Task, gamma: float) -> float:

@@ -11,7 +11,7 @@ from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.visualize.player import Player
 
 LAST = 3
-"""How many times as long as another the last picture stays."""
+"""Duration of the last picture, in durations of the others."""
 
 
 def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int = 192, most_frames: int = 200) -> None:

@@ -24,7 +24,7 @@ MOST_DIGITS = 14
 
 @dataclass(frozen=True)
 class Layout:
-    """What is drawn of a tree, and where.
+    """The nodes of a tree that are drawn, and their places.
 
     Args:
         graph: the tree.
@@ -58,7 +58,7 @@ class Layout:
 
     @property
     def left_out(self) -> dict[int, int]:
-        """How many branches are left out at each node where some are."""
+        """The number of branches left out at each node where some are."""
         b = self.graph.branching_factor
         return {node: b - len(drawn) for node, drawn in self._branches().items() if len(drawn) < b}
 

@@ -115,7 +115,7 @@ class Game:
         self._say(f"{self.score()}. r begins another, q quits.")
 
     def score(self) -> str:
-        """How often the goal was reached, and how often luck would."""
+        """Return how often the goal was reached, and how often random actions reach it."""
         share = f", {self.successes / self.episodes:.0%}" if self.episodes else ""
         luck = self.graph.reward_prob_random
         times = f", 1 in {1 / luck:,.0f}" if luck else ""

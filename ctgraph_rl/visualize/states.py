@@ -27,7 +27,7 @@ class Edge(NamedTuple):
 
 
 def kind_of(layout: Layout, node: int) -> StateType:
-    """What a node of the tree is."""
+    """Return whether a node is a decision or an end state."""
     return END if layout.level[node] == layout.graph.depth else DECISION
 
 

@@ -83,7 +83,7 @@ def draw_task(
 
 
 class _TaskPicture:
-    """What `draw_task` is given, laid out on the axes."""
+    """The arguments of `draw_task`, laid out on the axes."""
 
     def __init__(self, axes: Any, task: Task, visits: Counts, policy: PerAction, values: PerAction, ids: bool) -> None:
         self.axes, self.task, self.visits, self.ids = axes, task, visits, ids
@@ -115,7 +115,7 @@ class _TaskPicture:
         return -min(y for _, y in self.places.values())
 
     def _sizes(self) -> tuple[float, float]:
-        """How wide marks can be, and how far end states are from each other; in points."""
+        """Return the width of marks and the distance between end states, in points."""
         box, points = self.axes.get_window_extent(), 72 / self.axes.figure.dpi
         beside, below = points * box.width / len(self.layout.leaves), points * box.height / (self.height + 2)
         share = 0.52 if beside >= ROOM else 0.75
@@ -137,7 +137,7 @@ class _TaskPicture:
             self._draw_legend()
 
     def _left_out(self) -> str:
-        """What of the tree is not in the picture."""
+        """Return words on the part of the tree that is not drawn."""
         if self.layout.is_whole:
             return ""
         waits = "" if self.waits else ", wait states left out"
@@ -211,7 +211,7 @@ class _TaskPicture:
                 self.axes.text(*place, words, fontsize=fits, color=ink, ha="center", va="center", zorder=4)
 
     def _words(self, state: Key) -> str:
-        """What stands in a node."""
+        """Return the text within a node."""
         if self.visits:
             return _short(self.visits.get(state, 0))
         return ids_text(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
@@ -279,7 +279,7 @@ class _TaskPicture:
         self.axes.legend(handles=marks, ncols=len(marks), **style)
 
     def _meaning(self) -> str:
-        """What the numbers and widths stand for."""
+        """Return the meaning of numbers and widths."""
         nodes = "visits" if self.visits else "observation ids" if self.ids else ""
         numbers = [
             name for name, given in (("probability", self.policy), ("Q", self.values)) if given and self.has_numbers

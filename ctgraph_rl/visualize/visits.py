@@ -1,4 +1,4 @@
-"""How often a policy comes to each state of a task, and what it does there."""
+"""Visits of a policy to each state of a task, and the actions that it takes there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Visits(NamedTuple):
-    """What was seen in a number of episodes, by (state type, node); home and fail have node 0."""
+    """Counts over a number of episodes, by (state type, node); home and fail have node 0."""
 
     counts: dict[tuple[StateType, int], int]
     """Steps that began in a home, wait or decision state, and episodes that ended in an end state or in fail."""
@@ -37,7 +37,7 @@ def visits(
     episodes_per_row: int = 1,
     curriculum: Curriculum | None = None,
 ) -> Visits:
-    """Let a policy play episodes and count; ``draw_task(axes, task, visits=counts, policy=actions)`` draws it.
+    """Count visits and actions of a policy; ``draw_task(axes, task, visits=counts, policy=actions)`` draws it.
 
     Args:
         task: what is played.

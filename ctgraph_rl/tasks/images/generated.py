@@ -111,7 +111,7 @@ class GroupedImages(SquareImages):
         object.__setattr__(self, "between", float(self.between))
 
     def _distance_rules(self) -> list[tuple[bool, str]]:
-        """What distances can be reached; any up to that of unrelated images as long as the cells are in question."""
+        """Return the rules for reachable distances, up to that of unrelated images while cells are in question."""
         lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
         within_ok = is_real(self.within, lowest, UNRELATED)
         reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"

@@ -14,7 +14,7 @@ WHITE = 254
 
 
 class ImageSet(Protocol):
-    """What is behind the observation ids: a frozen dataclass, equal and hashable by value.
+    """The images behind the observation ids: a frozen dataclass, equal and hashable by value.
 
     An id has ``num_variants`` images. Every observation shows one of them, drawn uniformly together with its rotation.
     Two more attributes are optional: ``white``, the brightest level (254 if missing), and ``cue_element``, True for

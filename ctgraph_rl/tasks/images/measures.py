@@ -1,4 +1,4 @@
-"""How far apart the images of a set are, and how many repeat others."""
+"""Distances between the images of a set, and the number of repeats."""
 
 from __future__ import annotations
 
