@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.checks import require
-from ctgraph_rl.core.dynamics import STATE_DTYPES, ObservationParams, RewardParams, RowState, Shown, Uses
+from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown
 from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
-from ctgraph_rl.core.tree import TreeParams
-
-if TYPE_CHECKING:
-    from ctgraph_rl.batch.rows import Rows
-
+from ctgraph_rl.core.row_params import RowParams
 
 KERNELS = ("auto", "off", "required")
 """The values of ``kernel``, see `Rows`."""
@@ -63,44 +60,61 @@ class Native:
         return Native, ()
 
     def show(
-        self, rows: Rows, action: Tensor | None = None, mask: Tensor | None = None, shown: Tensor | None = None
+        self,
+        params: RowParams,
+        tables: Tables,
+        state: RowState,
+        *,
+        action: Tensor | None = None,
+        mask: Tensor | None = None,
+        shown: Tensor | None = None,
     ) -> tuple[RowState, Shown]:
-        """`dynamics.step`, `reset` or `step_or_reset`: the next states, and what they show.
+        """Return what `dynamics.step`, `reset` or `step_or_reset` do: the next states, and what they show.
 
         Args:
-            rows: the batch, which stays as it is.
+            params: the rows' parameters.
+            tables: those of their tasks.
+            state: where to start.
             action: int64 [N], or None for no step.
             mask: bool [N], the rows that start an episode instead, or None.
             shown: uint8 [N, *shape], what the rows that do neither show, if it is at hand.
         """
-        n, device = rows.num_rows, rows.device
+        n, device = len(tables.entry), params.row.device
         made = Shown(
-            torch.empty(n, *rows.image_shape, dtype=torch.uint8, device=device),
+            torch.empty(n, *params.bank.shape[1:], dtype=torch.uint8, device=device),
             torch.empty(n, dtype=torch.uint8, device=device),
             torch.empty(n, dtype=torch.int64, device=device),
             torch.empty(n, dtype=torch.bool, device=device),
         )
-        return self.run(rows, rows.state, action=action, mask=mask, shown=shown, **made._asdict()), made
+        return self.run(params, tables, state, action=action, mask=mask, shown=shown, **made._asdict()), made
 
     @torch.compiler.disable
     def run(
-        self, rows: Rows, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Tensor | None
+        self,
+        params: RowParams,
+        tables: Tables,
+        state: RowState,
+        *,
+        num_steps: int = 1,
+        restarts: bool = False,
+        **arrays: Tensor | None,
     ) -> RowState:
-        """Call the kernel: the states that it leads to.
+        """Call the kernel; return the states that it leads to.
 
         Args:
-            rows: the batch, which stays as it is.
+            params: the rows' parameters.
+            tables: those of their tasks.
             state: where to start.
             num_steps: T.
-            restarts: rows that a step finishes start anew within it.
+            restarts: rows that a step finishes start an episode within it.
             arrays: those of ``_ARRAYS``, filled or read.
 
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that are none of the rows' tasks.
         """
-        if self._params is not rows.params:
-            self._prepare(rows)
-        n, call = rows.num_rows, self._call
+        if self._params is not params:
+            self._prepare(params, tables)
+        n, call = len(tables.entry), self._call
         before = self._own(state)
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
@@ -139,16 +153,15 @@ class Native:
             require((fits, f"{name} of a state must be {dtype} {list(shape)} on the CPU, got {got}"))
         return RowState(*(value.contiguous() for value in state))
 
-    def _prepare(self, rows: Rows) -> None:
-        """All of a call that stays the same between two changes of tasks."""
-        require_kernel(rows.uses.reward_fns, rows.device)
-        (tree, x, g), index = rows.tables
-        params, uses, n = rows.params, rows.uses, rows.num_rows
+    def _prepare(self, params: RowParams, task_tables: Tables) -> None:
+        """Make all of a call that stays the same between two changes of tasks."""
+        uses, x, n = task_tables.uses, task_tables.x, len(task_tables.entry)
+        require_kernel(uses.reward_fns, params.row.device)
         streams = len(params.seed) in (1, n) and params.row.shape == (n,)
         require((streams, f"rows need a seed and a number each, got {len(params.seed)} and {len(params.row)} for {n}"))
         tables = {
-            "tasks": _packed(tree, x, g, uses),
-            "task": index,
+            "tasks": _packed(task_tables),
+            "task": task_tables.entry,
             "seed": params.seed,
             "row": params.row,
             "bank": params.bank,
@@ -175,11 +188,12 @@ class Native:
         self._params, self._state = params, None
 
 
-def _packed(tree: TreeParams, x: ObservationParams, g: RewardParams, uses: Uses) -> Tensor:
-    """The different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
+def _packed(tables: Tables) -> Tensor:
+    """Return the different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
+    tree, x, g = tables.tree, tables.x, tables.g
     count = len(tree.first_leaf)
     extra = torch.zeros(count) if tree.extra_end_step is None else tree.extra_end_step
-    reward_fn = torch.tensor([KERNEL_REWARDS.index(type(fn)) for fn in uses.reward_fns])[g.reward_fn]
+    reward_fn = torch.tensor([KERNEL_REWARDS.index(type(fn)) for fn in tables.uses.reward_fns])[g.reward_fn]
     legacy = torch.ones_like(x.num_ids) if x.legacy is None else x.legacy.num_ids
     plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra]
     plain += [x.num_views, x.num_angles, x.read_noise, x.reward_cue, x.cue_wraps, x.cue_element, x.noise_start]

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.core.dynamics import LegacyIndex, ObservationParams, RewardParams, Uses
 from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
 from ctgraph_rl.core.rotation import taps_of
+from ctgraph_rl.core.row_params import LegacyIndex, ObservationParams, RewardParams, Uses
 from ctgraph_rl.core.tree import TreeParams, tree_params
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, require_memory, rotates_after_noise
@@ -23,10 +23,32 @@ MakeTensor = Callable[..., Tensor]
 """Makes a tensor on the right device from a list with one entry per different task, and a dtype (int64)."""
 
 
-def make_params(
-    tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int
-) -> tuple[TreeParams, ObservationParams, RewardParams, Uses]:
-    """The parameters of different tasks, and what they have use for; `Rows` hands them out to the rows."""
+class Tables(NamedTuple):
+    """The parameters of different tasks, an entry for each of U, and which entry is each row's."""
+
+    tree: TreeParams
+    x: ObservationParams
+    g: RewardParams
+    goal_leaf: Tensor  # int64 [U]
+    uses: Uses
+    number: Tensor  # int64 [U], ascending: the tasks' numbers in a pool
+    entry: Tensor  # int64 [N]
+
+    def assigned(self, task: Tensor) -> Tables:
+        """Return the tables with other tasks for the rows, by their numbers in the pool, int64 [N]."""
+        return self._replace(entry=torch.searchsorted(self.number, task))
+
+    def of_rows(self) -> tuple[TreeParams, ObservationParams, RewardParams]:
+        """Return the parameters of each row."""
+        return _of_rows(self.tree, self.entry), _of_rows(self.x, self.entry), _of_rows(self.g, self.entry)
+
+
+def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank, noise_bank: int) -> Tables:
+    """Return the tables of different tasks with these numbers in their pool; no row has one yet."""
+
+    def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
+        return torch.tensor(values, dtype=dtype, device=number.device)
+
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
     observations = [task.observations for task in tasks]
     uses = Uses(
@@ -45,8 +67,15 @@ def make_params(
         max_depth=max(task.graph.depth for task in tasks),
         reward_fns=reward_fns,
     )
-    reward_params = _reward_params(tasks, each, reward_fns)
-    return _tree_params(tasks, each), _observation_params(tasks, each, bank, noise_bank), reward_params, uses
+    return Tables(
+        tree=_tree_params(tasks, each),
+        x=_observation_params(tasks, each, bank, noise_bank),
+        g=_reward_params(tasks, each, reward_fns),
+        goal_leaf=each([task.goal_leaf for task in tasks]),
+        uses=uses,
+        number=number,
+        entry=number[:0],
+    )
 
 
 def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
@@ -187,12 +216,12 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
     return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts, levels)  # one may be large
 
 
-def of_rows(part: Any, index: Tensor) -> Any:
-    """Parameters of rows from those of their tasks; what is a table of all tasks stays one."""
+def _of_rows(part: Any, index: Tensor) -> Any:
+    """Return parameters of rows from those of their tasks; what is a table of all tasks stays one."""
     rows = {}
     for name, value in part._asdict().items():
         if isinstance(value, LegacyIndex):
-            rows[name] = of_rows(value, index)
+            rows[name] = _of_rows(value, index)
         elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
             rows[name] = value.index_select(0, index)
     return part._replace(**rows)

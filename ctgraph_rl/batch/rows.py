@@ -9,14 +9,16 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.batch.draw_ahead import Stock
+from ctgraph_rl.batch.assignment import Assignment
+from ctgraph_rl.batch.draw_ahead import Draws
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
-from ctgraph_rl.batch.params import make_params, of_rows, shared_bank
+from ctgraph_rl.batch.params import make_tables, shared_bank
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.core import dynamics, philox, reading
-from ctgraph_rl.core.dynamics import ObservationParams, RewardParams, RowParams, RowState, Shown, TreeParams, Words
+from ctgraph_rl.core.dynamics import RowState, Shown, Words
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.kernel import is_available, is_traced
+from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
@@ -109,11 +111,9 @@ class Rows(nn.Module):
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field, dtype in dynamics.STATE_DTYPES.items():
             self.register_buffer(field, zeros.to(dtype, copy=True))
-        for field in _PLACES:
+        for field in _ASSIGNED:
             self.register_buffer(field, zeros.clone())
-        self._stock: Stock | None = None
-        self._now: Words | None = None
-        self._stock_ticks = min(MAX_STOCK // self.num_rows, MAX_STOCK_TICKS)
+        self._draws = Draws(self.num_rows)
         self.set_tasks(tasks)
 
     @property
@@ -141,8 +141,18 @@ class Rows(nn.Module):
 
     @state.setter
     def state(self, state: RowState) -> None:
-        self._stock = self._now = None
+        self._draws.forget()
         self._buffers.update(zip(RowState._fields, state, strict=True))
+
+    @property
+    def assignment(self) -> Assignment:
+        """Which task each row has, and its choices for the next episodes."""
+        return Assignment(self.task, self.choice, self.episodes, self._choices, self._switch)
+
+    @assignment.setter
+    def assignment(self, assignment: Assignment) -> None:
+        self.task, self.choice, self.episodes, self._choices, self._switch = assignment
+        self.tasks_change = assignment.may_change
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -162,7 +172,8 @@ class Rows(nn.Module):
         """
         tasks, n = require_all(Task, "tasks", tasks), self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
-        self._plan(self._whole_pool(), self._numbers(tasks), None, at_episode_end)
+        whole_pool = torch.arange(len(self.pool), device=self.device)
+        self._choose(whole_pool, self._numbers(tasks), None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
         """Let the rows change between tasks from episode to episode, all of them beginning with the first.
@@ -178,7 +189,7 @@ class Rows(nn.Module):
         choices = self._numbers(require_all(Task, "tasks", tasks))
         enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
         require(enough, switch_rule(switch))
-        self._plan(choices, torch.zeros_like(self.row), switch, at_episode_end)
+        self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)
 
     def _numbers(self, tasks: tuple[Task, ...]) -> Tensor:
         """Where tasks stand in the pool, int64."""
@@ -187,84 +198,65 @@ class Rows(nn.Module):
         require((not unknown, message))
         return torch.tensor([self._number[task] for task in tasks], device=self.device)
 
-    def _whole_pool(self) -> Tensor:
-        """The pool's numbers, int64: what rows choose from without a switch."""
-        return torch.arange(len(self.pool), device=self.device)
+    def _choose(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
+        """Give the rows choices from now on, or from their next episodes on."""
+        chosen = Assignment(self.task, choice, torch.zeros_like(choice), choices, switch)
+        if at_episode_end:
+            self.assignment = chosen
+            self._make_tables()
+        else:
+            self._restart(chosen)
 
-    def _plan(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
-        """Which of the choices the rows have from now on, or from their next episodes on."""
-        self._choices, self._switch = choices, switch
-        self.choice, self.episodes = choice, torch.zeros_like(choice)
-        if not at_episode_end:
-            self.task = self._planned()
-        self.tasks_change = self._may_change()
-        self._make_params()
-        self._stock = self._now = None
-        if not at_episode_end:
-            self._begin()
+    def _restart(self, assignment: Assignment) -> None:
+        """End all episodes; the next one of every row is the first with its choice and that task's goal."""
+        self.assignment = assignment.restarted()
+        self._make_tables()
+        self._end_episodes()
 
-    def _planned(self) -> Tensor:
-        """The pool's numbers of the tasks that the rows were last to have."""
-        return self._choices.index_select(0, self.choice)
-
-    def _may_change(self) -> bool:
-        """Whether a row that starts an episode may go over to another task."""
-        return self._switch is not None or bool((self.task != self._planned()).any())
-
-    def _make_params(self) -> None:
-        """The parameters of all tasks that the rows have or may go over to, and of each row."""
-        following = self._planned() if self._switch is None else self._choices
-        self._in_use = torch.cat([self.task, following]).unique()
-        different = tuple(self.pool[number] for number in self._in_use.tolist())
-
-        def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
-            return torch.tensor(values, dtype=dtype, device=self.device)
-
-        tree, x, g, self.uses = make_params(different, each, self._bank, self._noise_bank)
-        self._tables = tree, x, g
-        self._goals = each([task.goal_leaf for task in different])
+    def _make_tables(self) -> None:
+        """Make the parameters of all tasks that the rows have or may go over to, and of each row."""
+        number = self.assignment.in_use
+        tasks = tuple(self.pool[i] for i in number.tolist())
+        self.tables = make_tables(tasks, number, self._bank, self._noise_bank)
+        self.uses = self.tables.uses
         self._take_params()
+        self._draws.forget()
 
     def _take_params(self) -> None:
-        """Each row's parameters, from those of its task."""
-        tables, index = self.tables
-        self.params = self._row_params(*(of_rows(part, index) for part in tables))
-        self._task_goals = self._goals.index_select(0, index)
+        """Give each row the parameters of its task."""
+        self.tables = self.tables.assigned(self.task)
+        tree, x, g = self.tables.of_rows()
+        self.params = RowParams(
+            seed=self.seed,
+            row=self.row,
+            tree=tree,
+            x=x,
+            g=g,
+            bank=self.bank,
+            noise_bank=self.noises,
+            normal_table=self.normal_table,
+        )
 
     @property
-    def tables(self) -> tuple[tuple[TreeParams, ObservationParams, RewardParams], Tensor]:
-        """The parameters of the different tasks in use, and which of these each row has, int64 [N]."""
-        return self._tables, torch.searchsorted(self._in_use, self.task)
+    def _own_goals(self) -> Tensor:
+        """The goal of each row's task, int64 [N]."""
+        return self.tables.goal_leaf.index_select(0, self.tables.entry)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
-        """Before the rows of a mask, or all, start an episode: go over to the tasks that are planned for them.
+        """Before the rows of a mask, or all, start an episode: go over to the tasks that are chosen for them.
 
-        Only while a change is planned; the host then waits for the device.
+        Only while tasks may change; the host then waits for the device.
         """
         if not self.tasks_change:
             return
         mask = torch.ones_like(self.task, dtype=torch.bool) if mask is None else mask
-        begun = self.episodes + mask
-        if self._switch is not None:
-            self._change_choice(self._switch, begun)
-        task = torch.where(mask, self._planned(), self.task)
-        changed, self.task, self.episodes = task != self.task, task, begun
+        before = self.task
+        self.assignment = self.assignment.begin(mask, (self.seed, self.row, self.tick))
+        changed = self.task != before
         if changed.any():
             self._take_params()
-            self.goal_leaf = torch.where(changed, self._task_goals, self.goal_leaf)
+            self.goal_leaf = torch.where(changed, self._own_goals, self.goal_leaf)
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
-        self.tasks_change = self._may_change()
-
-    def _change_choice(self, switch: Switch, begun: Tensor) -> None:
-        """Ask a switch for the tasks of rows that have begun so many episodes."""
-        if switch.together:
-            clock, past = ((count.sum() // self.num_rows - 1).expand_as(count) for count in (begun, self.episodes))
-            place = self.seed[:1], self.row[:1], self.tick.amax(0, keepdim=True)
-        else:
-            clock, past, place = begun - 1, self.episodes - 1, (self.seed, self.row, self.tick)
-        words = philox.draw(*place, philox.STREAM_TASK)
-        following = switch.next_task(self.choice, clock.clamp_min(1), len(self._choices), words)
-        self.choice = torch.where((clock > past) & (clock > 0), following, self.choice)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
         """Give every row a goal at any time, in the middle of an episode too; the tree and all else stay.
@@ -305,27 +297,27 @@ class Rows(nn.Module):
         """
         self.seed, self.row = seed.clone(), row.clone()
         self.tick = torch.zeros_like(self.row)
-        self._stock = self._now = None
         if self.tasks_change:
-            start = self.choice if self._switch is None else torch.zeros_like(self.choice)
-            self._plan(self._choices, start, self._switch, at_episode_end=False)
-        self.params = self._row_params(self.params.tree, self.params.x, self.params.g)
-        self._begin()
+            self._restart(self.assignment)
+        else:
+            self.params = self.params._replace(seed=self.seed, row=self.row)
+            self._draws.forget()
+            self._end_episodes()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
         if self.uses_kernel:
-            return self._keep(*self.native.show(self, mask=mask), None)
-        words = self._draw(self.tick + mask)
+            return self._native(mask=mask)
+        words = self._draws.at(self.tick + mask, self.tick, self.params, self.uses)
         return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
         if self.uses_kernel:
-            return self._keep(*self.native.show(self, action), None)
-        words = self._draw_next()
+            return self._native(action)
+        words = self._draws.now_and_next(self.tick, self.params, self.uses)
         return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -336,7 +328,7 @@ class Rows(nn.Module):
         if self.uses_kernel:
             shown = self.step(action)
             return shown.observation, shown.done
-        now, then = self._draw_next()
+        now, then = self._draws.now_and_next(self.tick, self.params, self.uses)
         state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
         observation = dynamics.observe(state, then, self.params, self.uses)
         return self._keep(state, (observation, dynamics.is_done(state, self.params.tree)), then)
@@ -345,9 +337,10 @@ class Rows(nn.Module):
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         self._start_episodes(mask)
         if self.uses_kernel:
-            return self._keep(*self.native.show(self, action, mask), None)
-        words = self._draw_next()
-        return self._keep(*dynamics.step_or_reset(self.state, action, mask, self.params, self.uses, words), words[1])
+            return self._native(action, mask)
+        words = self._draws.now_and_next(self.tick, self.params, self.uses)
+        shown = dynamics.step_or_reset(self.state, action, mask, params=self.params, uses=self.uses, words=words)
+        return self._keep(*shown, words[1])
 
     def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
         """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
@@ -361,28 +354,21 @@ class Rows(nn.Module):
         self._start_episodes(mask)
         if self.uses_kernel:
             mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
-            return self._keep(*self.native.show(self, None, mask, shown), None).observation
-        words = self._draw(self.tick + (1 if mask is None else mask))
+            return self._native(None, mask, shown).observation
+        tick = self.tick + (1 if mask is None else mask)
+        words = self._draws.at(tick, self.tick, self.params, self.uses)
         return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
+
+    def _native(self, action: Tensor | None = None, mask: Tensor | None = None, shown: Tensor | None = None) -> Shown:
+        """Go over to the states that the kernel leads to; what all rows show."""
+        state, result = self.native.show(self.params, self.tables, self.state, action=action, mask=mask, shown=shown)
+        return self._keep(state, result, None)
 
     def _keep(self, state: RowState, result: T, words: Words | None) -> T:
         """Go over to a state and the draws of its ticks, if there are any; the result is passed on."""
         self._buffers.update(zip(RowState._fields, state, strict=True))
-        self._now = words
+        self._draws.present = words
         return result
-
-    def _draw_next(self) -> tuple[Words, Words]:
-        """The draws of the present and of the next tick."""
-        now = self._draw(self.tick) if self._now is None else self._now
-        return now, self._draw(self.tick + 1)
-
-    def _draw(self, tick: Tensor) -> Words:
-        """The draws of ticks, at most one ahead of the present."""
-        if self._stock_ticks < 2 or not (self.uses.draws or self.uses.reward_noise):
-            return dynamics.words_of(tick, self.params, self.uses)
-        if self._stock is None or self._stock.left == 0:
-            self._stock = Stock(self.params, self.uses, self.tick, self._stock_ticks)
-        return self._stock.at(tick)
 
     def show(self) -> Shown:
         """What all rows show now."""
@@ -438,49 +424,38 @@ class Rows(nn.Module):
                 (not finished.any(), f"rows {finished.nonzero().flatten()[:5].tolist()} are done: reset them first"),
             )
 
-    def _begin(self) -> None:
-        """End all episodes; the next one of every row is the first with its task's goal."""
-        self.goal_leaf = self._task_goals.clone()
+    def _end_episodes(self) -> None:
+        """End all episodes; the next one of every row has its task's goal."""
+        self.goal_leaf = self._own_goals
         self.state_type = torch.full_like(self.state_type, int(StateType.FAIL))
         self.episodes_left = torch.zeros_like(self.episodes_left)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Load into copies: a loaded buffer is written into, and someone may hold the present one."""
-        self.state = RowState(*(value.clone() for value in self.state))  # drops the stock of draws, too
-        self.seed, self.row = self.seed.clone(), self.row.clone()
-        for field in _PLACES:
-            setattr(self, field, getattr(self, field).clone())
+        for field in ("seed", "row", *_ASSIGNED, *RowState._fields):
+            self._buffers[field] = self._buffers[field].clone()  # type: ignore[union-attr]
         super()._load_from_state_dict(*args, **kwargs)
-        self.tasks_change = self._may_change()
-        self._make_params()
+        self.tasks_change = self.assignment.may_change
+        self._make_tables()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Rows:
         """Move what is no buffer along with the buffers."""
         super()._apply(fn, recurse)
-        self._stock = self._now = None
 
         def moved(part: Any) -> Any:
             if isinstance(part, tuple):
                 return type(part)(*map(moved, part)) if hasattr(part, "_fields") else tuple(map(moved, part))
             return fn(part) if isinstance(part, Tensor) else part
 
-        for name in ("_choices", "_in_use", "_goals", "_tables"):
-            setattr(self, name, moved(getattr(self, name)))
+        self._choices, self.tables = fn(self._choices), moved(self.tables)
         self._take_params()
+        self._draws.forget()
         self._choose_engine()
         return self
 
-    def _row_params(self, tree: TreeParams, x: ObservationParams, g: RewardParams) -> RowParams:
-        return RowParams(self.seed, self.row, tree, x, g, self.bank, self.noises, self.normal_table)
 
-
-_PLACES = ("task", "choice", "episodes")
-"""Where each row is among the tasks: its task's number in the pool, the place of the task that it is to have next among
-those that it changes between (without a switch, the pool), and the episodes that it has begun since the last change of
-plan; int64."""
-
-MAX_STOCK = 2**14
-MAX_STOCK_TICKS = 256
+_ASSIGNED = ("task", "choice", "episodes")
+"""The fields of `Assignment` that are buffers."""
 
 
 def seed_rule(seed: object) -> tuple[bool, str]:

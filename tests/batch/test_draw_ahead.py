@@ -1,4 +1,4 @@
-"""Draws: equal from a stock and from the bare core, however rows are run, and uniform where ids are drawn."""
+"""Draws: equal when drawn ahead and from the bare core, however rows are run, and uniform where ids are drawn."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from helpers.task_families import SWITCHED, VECTORS, calls, read, seen
 from torch import Tensor
 
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.batch.rows import MAX_STOCK, Rows
+from ctgraph_rl.batch.draw_ahead import MAX_WORDS
+from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core import dynamics
 
 NOISY = replace(confounding(p=0.5, read_rotation=5), reward_std=0.3, goal_change=(1, 3), step_reward=0.5)
@@ -41,7 +42,7 @@ def play(rows: Rows, twin: Rows, made: list) -> None:
 
 
 @pytest.mark.parametrize("tasks", [TASKS, VECTORS, PLAIN], ids=["images", "vectors", "plain"])
-def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps_with_resets(tasks):
+def test_draws_ahead_are_those_of_the_bare_core_through_hundreds_of_steps_with_resets(tasks):
     rows, twin = (tensor_rows(tasks, seed=3, first_row=2) for _ in range(2))
 
     made = calls(270, len(tasks))
@@ -51,15 +52,15 @@ def test_draws_from_a_stock_are_those_of_the_bare_core_through_hundreds_of_steps
 
 
 @pytest.mark.parametrize("room", [0, 5, 6, 11, 12, 18, 6 * 256 + 5, 6 * 500])
-def test_a_stock_of_any_size_gives_the_same_draws(monkeypatch, room):
-    monkeypatch.setattr("ctgraph_rl.batch.rows.MAX_STOCK", room)
+def test_any_number_of_draws_ahead_gives_the_same_draws(monkeypatch, room):
+    monkeypatch.setattr("ctgraph_rl.batch.draw_ahead.MAX_WORDS", room)
     rows, twin = (tensor_rows(TASKS, seed=4) for _ in range(2))
 
     play(rows, twin, calls(30, 6, seed=room))
 
 
-@pytest.mark.parametrize("num_rows", [MAX_STOCK // 3 + 1, MAX_STOCK // 2, MAX_STOCK // 2 + 1, MAX_STOCK, MAX_STOCK + 1])
-def test_batches_around_the_size_without_a_stock_have_the_draws_of_the_bare_core(num_rows):
+@pytest.mark.parametrize("num_rows", [MAX_WORDS // 3 + 1, MAX_WORDS // 2, MAX_WORDS // 2 + 1, MAX_WORDS, MAX_WORDS + 1])
+def test_batches_around_the_size_that_draws_nothing_ahead_have_the_draws_of_the_bare_core(num_rows):
     rows, twin = (tensor_rows([one_hot(p=0.5)] * num_rows, seed=5) for _ in range(2))
 
     play(rows, twin, calls(6, num_rows, seed=3))

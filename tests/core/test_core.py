@@ -13,6 +13,7 @@ from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 from ctgraph_rl import CTGraph, CTGraphEnv, Gradient, OneHot, ReferenceLinear
 from ctgraph_rl.core import dynamics
+from ctgraph_rl.core.row_params import Uses
 from ctgraph_rl.policies import OptimalPolicy
 
 EVERYTHING = replace(
@@ -74,7 +75,7 @@ def test_a_step_of_the_core_changes_nothing_in_place():
 def test_what_has_no_use_changes_nothing_when_it_is_computed_all_the_same():
     env = CTGraphEnv([surjective()] * 4)
     env.reset()
-    everything = dynamics.Uses(reward_fns=env.rows.uses.reward_fns)
+    everything = Uses(reward_fns=env.rows.uses.reward_fns)
 
     for action in scripts(12, 4):
         lean = dynamics.step(env.rows.state, action, env.rows.params, env.rows.uses)

@@ -340,7 +340,7 @@ def test_what_is_planned_moves_with_the_rows():
 
     rows.to("meta")
 
-    assert {part.device.type for part in (rows._choices, rows._in_use, rows._goals, rows.choice)} == {"meta"}
+    assert {part.device.type for part in (*rows.assignment[:4], rows.tables.number, rows.tables.goal_leaf)} == {"meta"}
 
 
 # Learning with what is told

@@ -1,0 +1,65 @@
+"""Which task each row has, and when it goes over to another; `Rows` keeps it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.core import philox
+from ctgraph_rl.tasks.switch import Switch
+
+Place = tuple[Tensor, Tensor, Tensor]
+"""The rows' seeds, numbers and ticks, which decide their draws."""
+
+
+class Assignment(NamedTuple):
+    """The task of each row, and the choices for its next episodes. Tasks are numbers in a pool, int64."""
+
+    task: Tensor  # [N]: the task that the row has
+    choice: Tensor  # [N]: place of the task of its next episode among the choices
+    episodes: Tensor  # [N]: episodes begun since the choices were made
+    choices: Tensor  # [C]: the tasks that rows change between; without a switch the whole pool
+    switch: Switch | None  # changes the choice from episode to episode
+
+    @property
+    def chosen(self) -> Tensor:
+        """The task of each row's choice, [N]."""
+        return self.choices.index_select(0, self.choice)
+
+    @property
+    def may_change(self) -> bool:
+        """Whether a row that starts an episode may go over to another task."""
+        return self.switch is not None or bool((self.task != self.chosen).any())
+
+    @property
+    def in_use(self) -> Tensor:
+        """The different tasks that rows have or may go over to, ascending."""
+        return torch.cat([self.task, self.chosen if self.switch is None else self.choices]).unique()
+
+    def restarted(self) -> Assignment:
+        """Return the assignment before the first episodes with these choices; all rows have their task at once."""
+        choice = self.choice if self.switch is None else torch.zeros_like(self.choice)
+        return self._replace(
+            task=self.choices.index_select(0, choice), choice=choice, episodes=torch.zeros_like(choice)
+        )
+
+    def begin(self, mask: Tensor, place: Place) -> Assignment:
+        """Return the assignment of the rows when those of a mask, bool [N], start an episode."""
+        following = self._replace(episodes=self.episodes + mask)
+        if self.switch is not None:
+            following = following._replace(choice=self._next_choice(self.switch, following.episodes, place))
+        return following._replace(task=torch.where(mask, following.chosen, self.task))
+
+    def _next_choice(self, switch: Switch, episodes: Tensor, place: Place) -> Tensor:
+        """Return the choices after so many episodes; the switch's clock is that of a row, or of all together."""
+        if switch.together:
+            clock, past = ((n.sum() // len(n) - 1).expand_as(n) for n in (episodes, self.episodes))
+            seed, row, tick = place
+            place = seed[:1], row[:1], tick.amax(0, keepdim=True)
+        else:
+            clock, past = episodes - 1, self.episodes - 1
+        words = philox.draw(*place, philox.STREAM_TASK)
+        following = switch.next_task(self.choice, clock.clamp_min(1), len(self.choices), words)
+        return torch.where((clock > past) & (clock > 0), following, self.choice)
