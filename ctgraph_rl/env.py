@@ -16,7 +16,7 @@ from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.core import dynamics
-from ctgraph_rl.core.dynamics import RowState, Shown
+from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
@@ -148,22 +148,22 @@ class CTGraphEnv(EnvBase):
     @property
     def branching_factor(self) -> Tensor:
         """b of each row, int64 [N]."""
-        return self.rows.branching_factor
+        return self.rows.params.tree.branching_factor
 
     @property
     def first_leaf(self) -> Tensor:
         """Heap index of each row's first end state, int64 [N]: ``node - first_leaf`` is the number of an end state."""
-        return self.rows.first_leaf
+        return self.rows.params.tree.first_leaf
 
     @property
     def num_end_states(self) -> Tensor:
         """b^d of each row, int64 [N]."""
-        return self.rows.num_end_states
+        return self.rows.params.g.num_leaves
 
     @property
     def max_depth(self) -> int:
         """The largest depth of the rows."""
-        return self.rows.max_depth
+        return self.rows.uses.max_depth
 
     def get_state(self) -> TensorDict:
         """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
@@ -187,7 +187,7 @@ class CTGraphEnv(EnvBase):
             shown = self.rows.reset(mask)
         is_init = self.rows.step_count == 0
         is_init = is_init if mask is None else is_init & mask
-        return self._tensordict(self._data(shown, done=shown.done.unsqueeze(-1), is_init=is_init.unsqueeze(-1)))
+        return self._tensordict(self._data(shown.observation, shown.done.unsqueeze(-1), is_init.unsqueeze(-1), shown))
 
     def _given_state(self, tensordict: TensorDictBase | None, mask: Tensor | None) -> RowState:
         """The state to go back to in the rows of a mask; refuses what no state of the rows' trees can be."""
@@ -273,7 +273,7 @@ class CTGraphEnv(EnvBase):
             self.rows.check_actions(action)
         shown = self.rows.step(action)  # type: ignore[arg-type]
         done = shown.done.unsqueeze(-1)
-        data = self._data(shown, done=done, is_init=torch.zeros_like(done))
+        data = self._data(shown.observation, done, torch.zeros_like(done), shown)
         data["reward"] = self.rows.reward.unsqueeze(-1)
         return data
 
@@ -284,20 +284,25 @@ class CTGraphEnv(EnvBase):
             done: bool [N, 1], after the last step.
             observation: uint8 [N, *shape], after the last step.
         """
-        running = torch.zeros_like(done)
-        leaf = torch.full_like(self.rows.row, dynamics.NO_LEAF)
-        shown = Shown(self.rows.restart(done.squeeze(-1), observation), running.to(torch.uint8), leaf, running)
-        return self._data(shown, done=running, is_init=done)
+        observation = self.rows.restart(done.squeeze(-1), observation)
+        return self._data(observation, torch.zeros_like(done), done, None)
 
-    def _data(self, shown: Shown, done: Tensor, is_init: Tensor) -> dict[str, Tensor]:
-        """Return what rows show and their counts by key, all but rewards; ``done`` and ``is_init`` are bool [N, 1]."""
-        data = {"observation": shown.observation, "is_init": is_init, "done": done, "terminated": done}
+    def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | None) -> dict[str, Tensor]:
+        """Return the rows' data by key, all but rewards.
+
+        Args:
+            observation: uint8 [N, *shape].
+            done: bool [N, 1].
+            is_init: bool [N, 1].
+            shown: says where the rows that are done arrived; None where none is.
+        """
+        data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
             data |= {
                 "step_count": self.rows.step_count.unsqueeze(-1),
                 "episode_reward": self.rows.episode_reward.unsqueeze(-1),
-                "outcome": shown.outcome.view(-1, 1),
-                "leaf": shown.leaf.view(-1, 1),
+                "outcome": done.to(torch.uint8) if shown is None else shown.outcome.unsqueeze(-1),
+                "leaf": (torch.full_like(self.rows.row, NO_LEAF) if shown is None else shown.leaf).unsqueeze(-1),
                 "truncated": torch.zeros_like(done),
             }
         if self.num_task_ids:

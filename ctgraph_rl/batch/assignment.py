@@ -1,14 +1,44 @@
-"""Which task each row has, and when it goes over to another; `Rows` keeps it."""
+"""Which task each row has, and when it changes to another; `Rows` keeps it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ctgraph_rl.checks import as_tuple, require, require_all
 from ctgraph_rl.core import philox
 from ctgraph_rl.tasks.switch import Switch
+from ctgraph_rl.tasks.task import Task
+
+
+def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
+    """Return the numbers of tasks in a pool.
+
+    Raises:
+        ValueError: for a task that is not in the pool.
+    """
+    tasks, number = require_all(Task, "tasks", tasks), {task: i for i, task in enumerate(pool)}
+    unknown = [task for task in dict.fromkeys(tasks) if task not in number]
+    require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
+    return [number[task] for task in tasks]
+
+
+def goal_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[int]:
+    """Return the numbers of the end states that goals, given by their decisions, are in tasks.
+
+    Raises:
+        ValueError: for another number of goals, and for one that is none of its task's tree.
+    """
+    goals, n = list(goals), len(tasks)
+    require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
+    flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
+    require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
+    return [replace(task, goal=tuple(goal)).goal_leaf for task, goal in zip(tasks, goals, strict=True)]
+
 
 Place = tuple[Tensor, Tensor, Tensor]
 """The rows' seeds, numbers and ticks, which decide their draws."""
@@ -30,12 +60,12 @@ class Assignment(NamedTuple):
 
     @property
     def may_change(self) -> bool:
-        """Whether a row that starts an episode may go over to another task."""
+        """Whether a row that starts an episode may change to another task."""
         return self.switch is not None or bool((self.task != self.chosen).any())
 
     @property
     def in_use(self) -> Tensor:
-        """The different tasks that rows have or may go over to, ascending."""
+        """The different tasks that rows have or may change to, ascending."""
         return torch.cat([self.task, self.chosen if self.switch is None else self.choices]).unique()
 
     def restarted(self) -> Assignment:

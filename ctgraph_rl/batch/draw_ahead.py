@@ -16,41 +16,57 @@ MAX_TICKS = 256
 
 
 class Draws:
-    """The draws of the rows' present and next ticks, see `dynamics.Words`.
+    """The draws of rows, see `dynamics.Words`, for the ticks that they are at and those that follow.
 
     Args:
-        num_rows: N.
+        params: the rows' parameters.
+        uses: what the rows have use for.
     """
 
-    def __init__(self, num_rows: int) -> None:
-        self._num_ticks = min(MAX_WORDS // num_rows, MAX_TICKS)
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget what was drawn ahead: streams, tasks or ticks are others now."""
-        self.present: Words | None = None
+    def __init__(self, params: RowParams, uses: Uses) -> None:
+        self._params, self._uses = params, uses
+        self._num_ticks = min(MAX_WORDS // len(params.row), MAX_TICKS)
+        self._draws_ahead = self._num_ticks > 1 and (uses.draws or uses.reward_noise)
         self._left = 0
+        self._tick: Tensor | None = None
 
-    def now_and_next(self, tick: Tensor, params: RowParams, uses: Uses) -> tuple[Words, Words]:
-        """Return the draws of the present ticks, int64 [N], and of the next ones."""
-        now = self.at(tick, tick, params, uses) if self.present is None else self.present
-        return now, self.at(tick + 1, tick, params, uses)
+    def serve(self, params: RowParams, uses: Uses) -> bool:
+        """Return whether rows with other parameters have the same draws."""
+        own = self._params
+        return params.seed is own.seed and params.row is own.row and uses is self._uses
 
-    def at(self, tick: Tensor, present: Tensor, params: RowParams, uses: Uses) -> Words:
-        """Return the draws of ticks that are at most one ahead of the present ones, int64 [N] both."""
-        if self._num_ticks < 2 or not (uses.draws or uses.reward_noise):
-            return dynamics.words_of(tick, params, uses)
+    def move(self, tick: Tensor, words: Words) -> None:
+        """Go on to ticks, int64 [N], at most one ahead, whose draws are known."""
+        self._tick, self._now = tick, words
+
+    def now(self, tick: Tensor) -> Words:
+        """Return the draws of the ticks that the rows are at."""
+        if tick is not self._tick:  # they were moved by others
+            self._left = 0
+            self.move(tick, self._at(tick, tick))
+        return self._now
+
+    def then(self, tick: Tensor, ahead: Tensor | int) -> Words:
+        """Return the draws of ticks that are ahead, by 0 or 1, of those that the rows are at."""
+        if tick is not self._tick:
+            self._tick, self._left = None, 0
+        return self._at(tick + ahead, tick)
+
+    def _at(self, tick: Tensor, present: Tensor) -> Words:
+        if not self._draws_ahead:
+            return dynamics.words_of(tick, self._params, self._uses)
         if self._left == 0:
-            self._draw(present, params, uses)
+            self._draw(present)
         self._left -= 1
         index = (tick - self._first) * len(tick) + self._place
         pairs = zip(self._words, self._used, strict=False)
         return tuple(word.take(index) if used else index for word, used in pairs)  # what has no use is any tensor
 
-    def _draw(self, first: Tensor, params: RowParams, uses: Uses) -> None:
+    def _draw(self, first: Tensor) -> None:
         """Make the draws of many ticks from the first ones on."""
+        uses = self._uses
         ticks = first + torch.arange(self._num_ticks, device=first.device).unsqueeze(-1)
-        self._first, self._left = first, self._num_ticks - 1  # a call may be one tick ahead
+        self._first, self._left = first, self._num_ticks - 1  # each call is at most one tick ahead of the last
         self._place = torch.arange(len(first), device=first.device)
-        self._words = [word.flatten() for word in dynamics.words_of(ticks, params, uses)]
+        self._words = [word.flatten() for word in dynamics.words_of(ticks, self._params, uses)]
         self._used = (uses.waits, uses.waits, uses.drawn_ids, uses.views, uses.reward_noise)

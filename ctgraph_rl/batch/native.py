@@ -50,60 +50,63 @@ def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
 
 
 class Native:
-    """The kernel for the rows of one batch; copies of it start without what it has prepared."""
+    """Takes the steps of one batch by the kernel; every method returns the next states and what `Rows` shows of them.
 
-    def __init__(self) -> None:
-        self._params: Any = None
+    Bind parameters before the first step.
+    """
+
+    params: RowParams
+    tables: Tables
+
+    def bind(self, params: RowParams, tables: Tables) -> None:
+        """Take the rows' parameters and those of their tasks."""
+        self.params, self.tables = params, tables
+        self._call: _Call | None = None
         self._state: RowState | None = None
 
-    def __reduce__(self) -> tuple[type[Native], tuple[()]]:
-        return Native, ()
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies start without what is prepared."""
+        return {"params": self.params, "tables": self.tables, "_call": None, "_state": None}
 
-    def show(
-        self,
-        params: RowParams,
-        tables: Tables,
-        state: RowState,
-        *,
-        action: Tensor | None = None,
-        mask: Tensor | None = None,
-        shown: Tensor | None = None,
-    ) -> tuple[RowState, Shown]:
-        """Return what `dynamics.step`, `reset` or `step_or_reset` do: the next states, and what they show.
+    def reset(self, state: RowState, mask: Tensor) -> tuple[RowState, Shown]:
+        """See `Rows.reset`."""
+        return self._show(state, mask=mask)
 
-        Args:
-            params: the rows' parameters.
-            tables: those of their tasks.
-            state: where to start.
-            action: int64 [N], or None for no step.
-            mask: bool [N], the rows that start an episode instead, or None.
-            shown: uint8 [N, *shape], what the rows that do neither show, if it is at hand.
-        """
-        n, device = len(tables.entry), params.row.device
+    def step(self, state: RowState, action: Tensor) -> tuple[RowState, Shown]:
+        """See `Rows.step`."""
+        return self._show(state, action=action)
+
+    def act(self, state: RowState, action: Tensor) -> tuple[RowState, tuple[Tensor, Tensor]]:
+        """See `Rows.act`."""
+        state, shown = self._show(state, action=action)
+        return state, (shown.observation, shown.done)
+
+    def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> tuple[RowState, Shown]:
+        """See `Rows.step_or_reset`."""
+        return self._show(state, action=action, mask=mask)
+
+    def restart(self, state: RowState, mask: Tensor | None, shown: Tensor | None) -> tuple[RowState, Tensor]:
+        """See `Rows.restart`."""
+        mask = torch.ones_like(state.node, dtype=torch.bool) if mask is None else mask
+        state, result = self._show(state, mask=mask, shown=shown)
+        return state, result.observation
+
+    def _show(self, state: RowState, **arrays: Tensor | None) -> tuple[RowState, Shown]:
+        """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
+        n, device = len(self.tables.entry), self.params.row.device
         made = Shown(
-            torch.empty(n, *params.bank.shape[1:], dtype=torch.uint8, device=device),
+            torch.empty(n, *self.params.bank.shape[1:], dtype=torch.uint8, device=device),
             torch.empty(n, dtype=torch.uint8, device=device),
             torch.empty(n, dtype=torch.int64, device=device),
             torch.empty(n, dtype=torch.bool, device=device),
         )
-        return self.run(params, tables, state, action=action, mask=mask, shown=shown, **made._asdict()), made
+        return self.run(state, **arrays, **made._asdict()), made
 
     @torch.compiler.disable
-    def run(
-        self,
-        params: RowParams,
-        tables: Tables,
-        state: RowState,
-        *,
-        num_steps: int = 1,
-        restarts: bool = False,
-        **arrays: Tensor | None,
-    ) -> RowState:
+    def run(self, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Tensor | None) -> RowState:
         """Call the kernel; return the states that it leads to.
 
         Args:
-            params: the rows' parameters.
-            tables: those of their tasks.
             state: where to start.
             num_steps: T.
             restarts: rows that a step finishes start an episode within it.
@@ -112,56 +115,40 @@ class Native:
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that are none of the rows' tasks.
         """
-        if self._params is not params:
-            self._prepare(params, tables)
-        n, call = len(tables.entry), self._call
-        before = self._own(state)
+        call = self._call = self._call or self._prepare()
+        n, before = call.num_rows, self._own(state, call)
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
         call.num_steps, call.restarts = num_steps, restarts
         call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
-        kept = [self._set(name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
+        kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
         wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
         self._state = after
         return after
 
-    def _set(self, name: str, array: Tensor | None, num_steps: int) -> Tensor | None:
-        """Put an array into the call, if it fits; it must be kept until then."""
-        if array is None:
-            setattr(self._call, name, None)
-            return None
-        call, (dtype, is_image, is_read) = self._call, _ARRAYS[name]
-        array = array.contiguous() if is_read else array
-        length = call.num_rows * num_steps * (call.num_pixels if is_image else 1)
-        if array.dtype != dtype or array.numel() != length or not array.is_contiguous() or not array.is_cpu:
-            got = f"{array.dtype} {list(array.shape)} on {array.device}"
-            raise ValueError(f"{name} must be {dtype} with {length} elements in a row on the CPU, got {got}")
-        setattr(call, name, array.data_ptr())
-        return array
-
-    def _own(self, state: RowState) -> RowState:
+    def _own(self, state: RowState, call: _Call) -> RowState:
         """States that the kernel can read: its own are, others are checked."""
         last = self._state
         if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
             return state
-        shape = (self._call.num_rows,)
+        shape = (call.num_rows,)
         for (name, dtype), value in zip(STATE_DTYPES.items(), state, strict=True):
             got = f"{value.dtype} {list(value.shape)} on {value.device}"
             fits = value.dtype == dtype and value.shape == shape and value.is_cpu
             require((fits, f"{name} of a state must be {dtype} {list(shape)} on the CPU, got {got}"))
         return RowState(*(value.contiguous() for value in state))
 
-    def _prepare(self, params: RowParams, task_tables: Tables) -> None:
-        """Make all of a call that stays the same between two changes of tasks."""
-        uses, x, n = task_tables.uses, task_tables.x, len(task_tables.entry)
+    def _prepare(self) -> _Call:
+        """Return a call with all that stays the same between two changes of parameters."""
+        params, uses, x, n = self.params, self.tables.uses, self.tables.x, len(self.tables.entry)
         require_kernel(uses.reward_fns, params.row.device)
         streams = len(params.seed) in (1, n) and params.row.shape == (n,)
         require((streams, f"rows need a seed and a number each, got {len(params.seed)} and {len(params.row)} for {n}"))
         tables = {
-            "tasks": _packed(task_tables),
-            "task": task_tables.entry,
+            "tasks": _packed(self.tables),
+            "task": self.tables.entry,
             "seed": params.seed,
             "row": params.row,
             "bank": params.bank,
@@ -172,8 +159,8 @@ class Native:
             tables |= {"level_first": x.legacy.level_first, "level_shift": x.legacy.level_shift}
         if x.taps is not None:
             tables |= {"tap_index": x.taps[0], "tap_weight": x.taps[1]}
-        self._tables = {name: value.contiguous() for name, value in tables.items()}  # keeps them alive
-        self._call = _Call(
+        self._alive = {name: value.contiguous() for name, value in tables.items()}
+        return _Call(
             num_rows=n,
             num_tasks=len(tables["tasks"]),
             bank_rows=len(params.bank),
@@ -183,9 +170,23 @@ class Native:
             num_levels=0 if x.legacy is None else x.legacy.level_first.shape[1],
             own_seeds=len(params.seed) > 1,
             **{name: int(getattr(uses, name)) for name in _USES},
-            **{name: value.data_ptr() for name, value in self._tables.items()},
+            **{name: value.data_ptr() for name, value in self._alive.items()},
         )
-        self._params, self._state = params, None
+
+
+def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor | None:
+    """Put an array into the call, if it fits; it must be kept until then."""
+    if array is None:
+        setattr(call, name, None)
+        return None
+    dtype, is_image, is_read = _ARRAYS[name]
+    array = array.contiguous() if is_read else array
+    length = call.num_rows * num_steps * (call.num_pixels if is_image else 1)
+    if array.dtype != dtype or array.numel() != length or not array.is_contiguous() or not array.is_cpu:
+        got = f"{array.dtype} {list(array.shape)} on {array.device}"
+        raise ValueError(f"{name} must be {dtype} with {length} elements in a row on the CPU, got {got}")
+    setattr(call, name, array.data_ptr())
+    return array
 
 
 def _packed(tables: Tables) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.core import reading
 from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
 from ctgraph_rl.core.rotation import taps_of
@@ -38,12 +39,17 @@ class Tables(NamedTuple):
         """Return the tables with other tasks for the rows, by their numbers in the pool, int64 [N]."""
         return self._replace(entry=torch.searchsorted(self.number, task))
 
+    @property
+    def row_goals(self) -> Tensor:
+        """The goal of each row's task, int64 [N]."""
+        return self.goal_leaf.index_select(0, self.entry)
+
     def of_rows(self) -> tuple[TreeParams, ObservationParams, RewardParams]:
         """Return the parameters of each row."""
         return _of_rows(self.tree, self.entry), _of_rows(self.x, self.entry), _of_rows(self.g, self.entry)
 
 
-def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank, noise_bank: int) -> Tables:
+def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
     """Return the tables of different tasks with these numbers in their pool; no row has one yet."""
 
     def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
@@ -57,7 +63,7 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank, noise_bank:
         drawn_ids=any(x.draws_ids for x in observations),
         views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
         pixel_noise=any(x.read_noise for x in observations),
-        noise_bank=noise_bank if any(x.read_noise for x in observations) else 0,
+        noise_bank=bank.num_noises if any(x.read_noise for x in observations) else 0,
         reward_noise=any(task.reward_std for task in tasks),
         multiplicative=any(task.reward_std and task.reward_noise == "multiplicative" for task in tasks),
         fail_reward=any(task.fail_reward for task in tasks),
@@ -69,7 +75,7 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank, noise_bank:
     )
     return Tables(
         tree=_tree_params(tasks, each),
-        x=_observation_params(tasks, each, bank, noise_bank),
+        x=_observation_params(tasks, each, bank),
         g=_reward_params(tasks, each, reward_fns),
         goal_leaf=each([task.goal_leaf for task in tasks]),
         uses=uses,
@@ -88,7 +94,7 @@ def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
     )
 
 
-def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, noise_bank: int) -> ObservationParams:
+def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -> ObservationParams:
     observations = [task.observations for task in tasks]
     by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
     views, starts = [_num_views(task) for task in tasks], [bank.start[bank_key(task)] for task in tasks]
@@ -118,7 +124,7 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank, n
         cue_wraps=each([x.cue_wraps for x in observations], torch.bool),
         cue_element=each([task.images.shape[-1] - 1 for task in tasks]),
         white=each([white_level(task.images) for task in tasks], torch.float64),
-        noise_start=each([bank.noise_levels.index(x.read_noise) * noise_bank for x in observations]),
+        noise_start=each([bank.noise_levels.index(x.read_noise) * bank.num_noises for x in observations]),
         legacy=_legacy_index(tasks, each, table) if any(x.legacy_index for x in observations) else None,
         taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
     )
@@ -181,6 +187,8 @@ class Bank(NamedTuple):
     shape: tuple[int, ...]  # of an observation
     start: dict[BankKey, int]  # the first row of each image set and rotation
     noise_levels: tuple[int, ...]  # the different values of ``read_noise``
+    num_noises: int  # drawn in advance for each of them
+    noises: Tensor  # uint8 [noises, *shape], those of a level in a row
 
 
 def observation_shape(pool: Sequence[Task], num_rows: int) -> tuple[int, ...]:
@@ -197,8 +205,8 @@ def observation_shape(pool: Sequence[Task], num_rows: int) -> tuple[int, ...]:
     return max(shapes)
 
 
-def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
-    """Return the bank of a pool.
+def shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> Bank:
+    """Return the bank of a pool, with so many noises for each level drawn in advance.
 
     Raises:
         ValueError: see `observation_shape`.
@@ -213,7 +221,15 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int) -> Bank:
         banks.append(bank)
         starts[key] = rows
         rows += len(bank)
-    return Bank(banks[0] if len(banks) == 1 else torch.cat(banks), shape, starts, levels)  # one may be large
+    has_noise = num_noises > 0 and max(levels) > 0
+    return Bank(
+        images=banks[0] if len(banks) == 1 else torch.cat(banks),  # one may be large
+        shape=shape,
+        start=starts,
+        noise_levels=levels,
+        num_noises=num_noises,
+        noises=reading.noise_bank(levels, num_noises, shape) if has_noise else banks[0].new_empty(0, *shape),
+    )
 
 
 def _of_rows(part: Any, index: Tensor) -> Any:

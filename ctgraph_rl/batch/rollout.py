@@ -91,7 +91,7 @@ def _uses_kernel(rows: Rows, kernel: str) -> bool:
 def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
     """Fill buffers by the C kernel; the states that the last step led to."""
     start = rows.state
-    state = rows.native.run(rows.params, rows.tables, start, mask=rows.is_done, observation=steps.observation[0])
+    state = rows.native.run(start, mask=rows.is_done, observation=steps.observation[0])
     torch.eq(state.step_count, 0, out=steps.is_init[0])
     if isinstance(policy, Tensor):
         steps.action.copy_(policy)
@@ -106,9 +106,7 @@ def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
     """Take the steps of a part of the buffers, whose actions are there; the states that they lead to."""
     outputs = {name: getattr(steps, name)[part] for name in ("action", "reward", "done", "outcome")}
     seen, is_init = steps.observation[1:][part], steps.is_init[1:][part]
-    state = rows.native.run(
-        rows.params, rows.tables, state, num_steps=len(is_init), restarts=True, observation=seen, **outputs
-    )
+    state = rows.native.run(state, num_steps=len(is_init), restarts=True, observation=seen, **outputs)
     is_init.copy_(outputs["done"])
     return state
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.batch.assignment import Assignment
-from ctgraph_rl.batch.draw_ahead import Draws
+from ctgraph_rl.batch.assignment import Assignment, goal_leaves, numbers_in
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_tables, shared_bank
-from ctgraph_rl.checks import as_tuple, is_int, require, require_all
-from ctgraph_rl.core import dynamics, philox, reading
-from ctgraph_rl.core.dynamics import RowState, Shown, Words
+from ctgraph_rl.batch.tensor_engine import TensorEngine
+from ctgraph_rl.checks import is_int, require, require_all
+from ctgraph_rl.core import dynamics, philox
+from ctgraph_rl.core.dynamics import RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.kernel import is_available, is_traced
 from ctgraph_rl.core.row_params import RowParams
@@ -69,7 +68,7 @@ class Rows(nn.Module):
     choice: Tensor
     episodes: Tensor
     tasks_change: bool
-    """Whether rows go over to other tasks where they start episodes."""
+    """Whether rows may change to other tasks where they start episodes."""
 
     def __init__(
         self,
@@ -91,29 +90,25 @@ class Rows(nn.Module):
             kernel_rule(kernel),
         )
         super().__init__()
-        self.kernel, self.native = kernel, Native()
+        self.kernel = kernel
         self.pool = pool
-        self._number = {task: number for number, task in enumerate(pool)}
         self.max_branching = max(task.graph.branching_factor for task in pool)
         self.register_buffer("seed", torch.tensor([seed], device=device))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
-        bank = shared_bank(pool, self.num_rows)
+        bank = shared_bank(pool, self.num_rows, noise_bank)
         no_images = bank.images.new_empty(0, *bank.shape)
-        self._bank, self.image_shape = bank._replace(images=no_images), bank.shape
+        self._bank, self.image_shape = bank._replace(images=no_images, noises=no_images), bank.shape
         self.white = max(int(white_level(task.images)) for task in pool)
         self.register_buffer("bank", bank.images.to(device), persistent=False)
-        has_noise = noise_bank > 0 and max(bank.noise_levels) > 0
-        noises = reading.noise_bank(bank.noise_levels, noise_bank, bank.shape) if has_noise else no_images
-        self._noise_bank = noise_bank
-        self.register_buffer("noises", noises.to(device), persistent=False)
+        self.register_buffer("noises", bank.noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
         zeros = torch.zeros(self.num_rows, dtype=torch.int64, device=device)
         for field, dtype in dynamics.STATE_DTYPES.items():
             self.register_buffer(field, zeros.to(dtype, copy=True))
         for field in _ASSIGNED:
             self.register_buffer(field, zeros.clone())
-        self._draws = Draws(self.num_rows)
+        self.tensors, self.native = TensorEngine(), Native()
         self.set_tasks(tasks)
 
     @property
@@ -134,6 +129,11 @@ class Rows(nn.Module):
         return self.kernel == "required" or (self._kernel_fits and not is_traced() and is_available())
 
     @property
+    def engine(self) -> TensorEngine | Native:
+        """What takes the next step."""
+        return self.native if self.uses_kernel else self.tensors
+
+    @property
     def state(self) -> RowState:
         """The state of all rows."""
         buffers = self._buffers
@@ -141,7 +141,6 @@ class Rows(nn.Module):
 
     @state.setter
     def state(self, state: RowState) -> None:
-        self._draws.forget()
         self._buffers.update(zip(RowState._fields, state, strict=True))
 
     @property
@@ -173,7 +172,8 @@ class Rows(nn.Module):
         tasks, n = require_all(Task, "tasks", tasks), self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
         whole_pool = torch.arange(len(self.pool), device=self.device)
-        self._choose(whole_pool, self._numbers(tasks), None, at_episode_end)
+        numbers = torch.tensor(numbers_in(self.pool, tasks), device=self.device)
+        self._choose(whole_pool, numbers, None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
         """Let the rows change between tasks from episode to episode, all of them beginning with the first.
@@ -186,17 +186,10 @@ class Rows(nn.Module):
         Raises:
             ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
         """
-        choices = self._numbers(require_all(Task, "tasks", tasks))
+        choices = torch.tensor(numbers_in(self.pool, tasks), device=self.device)
         enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
         require(enough, switch_rule(switch))
         self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)
-
-    def _numbers(self, tasks: tuple[Task, ...]) -> Tensor:
-        """Where tasks stand in the pool, int64."""
-        unknown = [task for task in dict.fromkeys(tasks) if task not in self._number]
-        message = f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"
-        require((not unknown, message))
-        return torch.tensor([self._number[task] for task in tasks], device=self.device)
 
     def _choose(self, choices: Tensor, choice: Tensor, switch: Switch | None, at_episode_end: bool) -> None:
         """Give the rows choices from now on, or from their next episodes on."""
@@ -214,36 +207,28 @@ class Rows(nn.Module):
         self._end_episodes()
 
     def _make_tables(self) -> None:
-        """Make the parameters of all tasks that the rows have or may go over to, and of each row."""
+        """Make the parameters of all tasks that the rows have or may change to, and of each row."""
         number = self.assignment.in_use
         tasks = tuple(self.pool[i] for i in number.tolist())
-        self.tables = make_tables(tasks, number, self._bank, self._noise_bank)
+        self.tables = make_tables(tasks, number, self._bank)
         self.uses = self.tables.uses
         self._take_params()
-        self._draws.forget()
 
     def _take_params(self) -> None:
         """Give each row the parameters of its task."""
         self.tables = self.tables.assigned(self.task)
         tree, x, g = self.tables.of_rows()
-        self.params = RowParams(
-            seed=self.seed,
-            row=self.row,
-            tree=tree,
-            x=x,
-            g=g,
-            bank=self.bank,
-            noise_bank=self.noises,
-            normal_table=self.normal_table,
-        )
+        images = {"bank": self.bank, "noise_bank": self.noises, "normal_table": self.normal_table}
+        self._bind(RowParams(self.seed, self.row, tree, x, g, **images))
 
-    @property
-    def _own_goals(self) -> Tensor:
-        """The goal of each row's task, int64 [N]."""
-        return self.tables.goal_leaf.index_select(0, self.tables.entry)
+    def _bind(self, params: RowParams) -> None:
+        """Give both engines the parameters."""
+        self.params = params
+        self.tensors.bind(params, self.tables)
+        self.native.bind(params, self.tables)
 
     def _start_episodes(self, mask: Tensor | None) -> None:
-        """Before the rows of a mask, or all, start an episode: go over to the tasks that are chosen for them.
+        """Before the rows of a mask, or all, start an episode: change to the tasks that are chosen for them.
 
         Only while tasks may change; the host then waits for the device.
         """
@@ -255,7 +240,7 @@ class Rows(nn.Module):
         changed = self.task != before
         if changed.any():
             self._take_params()
-            self.goal_leaf = torch.where(changed, self._own_goals, self.goal_leaf)
+            self.goal_leaf = torch.where(changed, self.tables.row_goals, self.goal_leaf)
             self.episodes_left = torch.where(changed, 0, self.episodes_left)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
@@ -270,13 +255,7 @@ class Rows(nn.Module):
             ValueError: if a goal is not one of its row's tree.
         """
         if not isinstance(goals, Tensor):
-            goals = list(goals)
-            n = self.num_rows
-            require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
-            flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
-            require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
-            changed = [replace(task, goal=goal) for task, goal in zip(self.tasks, map(tuple, goals), strict=True)]
-            goals = torch.tensor([task.goal_leaf for task in changed], device=self.device)
+            goals = torch.tensor(goal_leaves(self.tasks, goals), device=self.device)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
         outside = (goals < 0) | (goals >= self.params.g.num_leaves)
@@ -284,63 +263,46 @@ class Rows(nn.Module):
         self.goal_leaf = goals.to(self.device, copy=True)
 
     def set_seed(self, seed: int) -> None:
-        """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
+        """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))
         self.set_streams(torch.tensor([seed], device=self.device), self.row)
 
     def set_streams(self, seed: Tensor, row: Tensor) -> None:
-        """Start all rows anew with random streams of their own.
+        """Restart all rows with random streams of their own.
 
         Args:
             seed: int64 [N], or [1] for all.
-            row: int64 [N], the numbers that tell rows of one seed apart.
+            row: int64 [N], the numbers that distinguish rows of one seed.
         """
         self.seed, self.row = seed.clone(), row.clone()
         self.tick = torch.zeros_like(self.row)
         if self.tasks_change:
             self._restart(self.assignment)
         else:
-            self.params = self.params._replace(seed=self.seed, row=self.row)
-            self._draws.forget()
+            self._bind(self.params._replace(seed=self.seed, row=self.row))
             self._end_episodes()
 
     def reset(self, mask: Tensor | None = None) -> Shown:
         """Start an episode in the rows of a mask, bool [N], or in all; what all rows show."""
         mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
         self._start_episodes(mask)
-        if self.uses_kernel:
-            return self._native(mask=mask)
-        words = self._draws.at(self.tick + mask, self.tick, self.params, self.uses)
-        return self._keep(*dynamics.reset(self.state, mask, self.params, self.uses, words), words)
+        return self._keep(*self.engine.reset(self.state, mask))
 
     def step(self, action: Tensor) -> Shown:
         """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        if self.uses_kernel:
-            return self._native(action)
-        words = self._draws.now_and_next(self.tick, self.params, self.uses)
-        return self._keep(*dynamics.step(self.state, action, self.params, self.uses, words), words[1])
+        return self._keep(*self.engine.step(self.state, action))
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
 
         `result` tells more.
         """
-        if self.uses_kernel:
-            shown = self.step(action)
-            return shown.observation, shown.done
-        now, then = self._draws.now_and_next(self.tick, self.params, self.uses)
-        state = dynamics.advance(self.state, action, now, self.params, self.uses, absorbing=False)
-        observation = dynamics.observe(state, then, self.params, self.uses)
-        return self._keep(state, (observation, dynamics.is_done(state, self.params.tree)), then)
+        return self._keep(*self.engine.act(self.state, action))
 
     def step_or_reset(self, action: Tensor, mask: Tensor) -> Shown:
         """Start an episode in the rows of a mask, whatever their action, and step the others; what all rows show."""
         self._start_episodes(mask)
-        if self.uses_kernel:
-            return self._native(action, mask)
-        words = self._draws.now_and_next(self.tick, self.params, self.uses)
-        shown = dynamics.step_or_reset(self.state, action, mask, params=self.params, uses=self.uses, words=words)
-        return self._keep(*shown, words[1])
+        return self._keep(*self.engine.step_or_reset(self.state, action, mask))
 
     def result(self, done: Tensor) -> tuple[Tensor, Tensor]:
         """Outcome, uint8 [N], and leaf, int64 [N], of the rows that are done; see `CTGraphEnv`."""
@@ -352,22 +314,11 @@ class Rows(nn.Module):
         ``shown``, uint8 [N, *shape], is what the rows observed last, where that is at hand.
         """
         self._start_episodes(mask)
-        if self.uses_kernel:
-            mask = torch.ones_like(self.row, dtype=torch.bool) if mask is None else mask
-            return self._native(None, mask, shown).observation
-        tick = self.tick + (1 if mask is None else mask)
-        words = self._draws.at(tick, self.tick, self.params, self.uses)
-        return self._keep(*dynamics.restart(self.state, mask, self.params, self.uses, words), words)
+        return self._keep(*self.engine.restart(self.state, mask, shown))
 
-    def _native(self, action: Tensor | None = None, mask: Tensor | None = None, shown: Tensor | None = None) -> Shown:
-        """Go over to the states that the kernel leads to; what all rows show."""
-        state, result = self.native.show(self.params, self.tables, self.state, action=action, mask=mask, shown=shown)
-        return self._keep(state, result, None)
-
-    def _keep(self, state: RowState, result: T, words: Words | None) -> T:
-        """Go over to a state and the draws of its ticks, if there are any; the result is passed on."""
+    def _keep(self, state: RowState, result: T) -> T:
+        """Change to a state; return the result."""
         self._buffers.update(zip(RowState._fields, state, strict=True))
-        self._draws.present = words
         return result
 
     def show(self) -> Shown:
@@ -383,26 +334,6 @@ class Rows(nn.Module):
     def is_done(self) -> Tensor:
         """bool [N]: rows whose episode is over."""
         return dynamics.is_done(self.state, self.params.tree)
-
-    @property
-    def branching_factor(self) -> Tensor:
-        """b of each row, int64 [N]."""
-        return self.params.tree.branching_factor
-
-    @property
-    def first_leaf(self) -> Tensor:
-        """Heap index of each row's first end state, int64 [N]."""
-        return self.params.tree.first_leaf
-
-    @property
-    def num_end_states(self) -> Tensor:
-        """b^d of each row, int64 [N]."""
-        return self.params.g.num_leaves
-
-    @property
-    def max_depth(self) -> int:
-        """The largest depth of the rows."""
-        return self.uses.max_depth
 
     def check_actions(self, action: Tensor | None) -> None:
         """Refuse actions of a wrong shape, dtype or range, and steps of finished rows.
@@ -426,7 +357,7 @@ class Rows(nn.Module):
 
     def _end_episodes(self) -> None:
         """End all episodes; the next one of every row has its task's goal."""
-        self.goal_leaf = self._own_goals
+        self.goal_leaf = self.tables.row_goals
         self.state_type = torch.full_like(self.state_type, int(StateType.FAIL))
         self.episodes_left = torch.zeros_like(self.episodes_left)
 
@@ -449,7 +380,6 @@ class Rows(nn.Module):
 
         self._choices, self.tables = fn(self._choices), moved(self.tables)
         self._take_params()
-        self._draws.forget()
         self._choose_engine()
         return self
 
