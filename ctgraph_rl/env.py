@@ -332,7 +332,8 @@ class CTGraphEnv(EnvBase):
         Returns:
             uint8 [N, size, 2 * size, 3] on the CPU.
         """
-        return render(self.tasks, self.state_type, self.node, self.goal_leaf, self.rows.show().observation, size)
+        observation = self.rows.show().observation
+        return render(self.tasks, self.state_type, self.node, self.goal_leaf, observation, size=size)
 
     def _set_seed(self, seed: int | None) -> None:
         """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""

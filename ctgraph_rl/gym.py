@@ -21,11 +21,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ctgraph_rl.batch.assignment import numbers_in
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
-from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.batch.text_render import as_text
+from ctgraph_rl.checks import as_tuple, is_int, require
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
-from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.task import Task
 
@@ -33,7 +34,6 @@ Frame = NDArray[np.uint8] | str
 Array = NDArray[Any]
 
 _RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
-_GREYS = " ░▒▓█"
 
 
 class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
@@ -72,8 +72,8 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
     ) -> None:
         with _one_thread():
             task = make_task(task, config, **changes)
-            self.task_pool = _pool([task], task_pool)
-            self.rows = Rows([task], task_pool=self.task_pool, kernel=kernel)
+            self.rows = Rows([task], task_pool=task_pool, kernel=kernel)
+        self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
         self.observation_space, self.action_space = _spaces(self.rows)
         self._number = self._next_number = self.task_pool.index(task)
@@ -82,7 +82,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
 
     def set_task(self, task: Task) -> None:
         """Change to another task of the pool at the next reset."""
-        (self._next_number,) = _numbers([task], self.task_pool)
+        (self._next_number,) = numbers_in(self.task_pool, [task])
 
     @torch.inference_mode()
     def reset(
@@ -115,12 +115,10 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             ValueError: for another action, and after the end of an episode.
         """
         number = _as_int(action)
-        if self._is_over or not 0 <= number < self._num_actions:
+        is_action = 0 <= number < self._num_actions
+        if self._is_over or not is_action:
             require(
-                (
-                    0 <= number < self._num_actions,
-                    f"action must be an integer in 0..{self._num_actions - 1}, got {action!r}",
-                ),
+                (is_action, f"action must be an integer in 0..{self._num_actions - 1}, got {action!r}"),
                 (not self._is_over, "no episode is running: reset first"),
             )
         observation, done = self.rows.act(_as_tensor(number))
@@ -178,22 +176,22 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         made = [make_task(one, config, **changes) for one in given]
         tasks = made if len(made) == num_envs else made * num_envs
         self.num_envs = num_envs
-        self.task_pool = _pool(tasks, task_pool)
-        self.rows = Rows(tasks, task_pool=self.task_pool, kernel=kernel)
+        self.rows = Rows(tasks, task_pool=task_pool, kernel=kernel)
+        self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = _spaces(self.rows)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._numbers = self._next_numbers = np.array(_numbers(tasks, self.task_pool))
+        self._numbers = self._next_numbers = np.array(numbers_in(self.task_pool, tasks))
         self._seeds = np.zeros(num_envs, np.int64)
         self._is_seeded = False
         self._is_over = np.ones(num_envs, np.bool_)
 
     def set_tasks(self, tasks: Iterable[Task]) -> None:
         """Give every row a task of the pool; a row changes to it at its next reset."""
-        numbers = np.array(_numbers(tasks, self.task_pool))
+        numbers = np.array(numbers_in(self.task_pool, tasks))
         require((len(numbers) == self.num_envs, f"set_tasks needs {self.num_envs} tasks, got {len(numbers)}"))
         self._next_numbers = numbers
 
@@ -277,13 +275,8 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]
         fits = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
-        require(
-            (
-                fits and bool(mask.any()),
-                f"reset_mask must be a bool array of shape [{self.num_envs}] with a row to reset, got {mask!r}",
-            ),
-            (self._is_seeded, "the first reset must be of all rows"),
-        )
+        rule = f"reset_mask must be a bool array of shape [{self.num_envs}] with a row to reset, got {mask!r}"
+        require((fits and bool(mask.any()), rule), (self._is_seeded, "the first reset must be of all rows"))
         return mask.copy()
 
     def _start_streams(self, mask: NDArray[np.bool_], seed: int | Sequence[int | None] | None) -> None:
@@ -333,19 +326,6 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
     def render(self) -> tuple[Frame, ...] | None:
         """The present state of every row as a picture, uint8 [192, 384, 3], or as text."""
         return _frames(self)
-
-
-def _pool(tasks: Iterable[Task], task_pool: Iterable[Task] | None) -> tuple[Task, ...]:
-    """The different tasks of a pool, by default of the rows."""
-    return tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
-
-
-def _numbers(tasks: Iterable[Task], pool: tuple[Task, ...]) -> list[int]:
-    """The places of tasks in a pool."""
-    tasks, places = require_all(Task, "tasks", tasks), {task: number for number, task in enumerate(pool)}
-    unknown = [task for task in tasks if task not in places]
-    require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
-    return [places[task] for task in tasks]
 
 
 def _spaces(rows: Rows) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
@@ -407,35 +387,7 @@ def _frames(env: CTGraphGymEnv | CTGraphVectorEnv) -> tuple[Frame, ...] | None:
     rows, observation = env.rows, env.rows.show().observation
     if env.render_mode == "rgb_array":
         return tuple(render(rows.tasks, rows.state_type, rows.node, rows.goal_leaf, observation).numpy())
-    states = (rows.state_type, rows.node, rows.goal_leaf, rows.step_count)
-    values = zip(*(state.tolist() for state in states), strict=True)
-    return tuple(
-        f"{_words(task, *value)}\n{_blocks(image, rows.white)}"
-        for task, value, image in zip(rows.tasks, values, observation.numpy(), strict=True)
-    )
-
-
-def _words(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
-    """Where a row is: ``wait state after 1 2, step 4, goal 1 1``."""
-    graph = task.graph
-    goal, way = (_decisions(graph, place) for place in (graph.num_decision_states + goal_leaf, node))
-    place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
-    return f"{place}, step {step_count}, goal {goal}"
-
-
-def _decisions(graph: CTGraph, node: int) -> str:
-    """The decisions from the root to a node."""
-    b, way = graph.branching_factor, []
-    while node > 0:
-        way.append((node - 1) % b + 1)
-        node = (node - 1) // b
-    return " ".join(map(str, reversed(way)))
-
-
-def _blocks(observation: NDArray[np.uint8], white: int) -> str:
-    """An image as lines of blocks of grey, two for each pixel; a vector as one line."""
-    levels = (observation.reshape(-1, observation.shape[-1]).astype(int) * 4 // white).clip(0, 4)
-    return "\n".join("".join(_GREYS[level] * 2 for level in line) for line in levels)
+    return as_text(rows.tasks, rows.state, observation, rows.white)
 
 
 for _name in ("CTGraph", *CONFIGURATIONS):

@@ -88,19 +88,6 @@ NOT_YET: dict[str, list[str]] = {
         "baselines.benchmark: ?",
         "baselines.methods.__main__: ?",
     ],
-    "long files": [
-        "ctgraph_rl.batch.rows",
-        "ctgraph_rl.core.dynamics",
-        "ctgraph_rl.gym",
-    ],
-    "long calls": [
-        "ctgraph_rl.batch.rollout: cls",
-        "ctgraph_rl.batch.rows: RowParams",
-        "ctgraph_rl.batch.rows: dynamics.step_or_reset",
-        "ctgraph_rl.core.dynamics: _paid",
-        "ctgraph_rl.core.tree: TreeParams",
-        "ctgraph_rl.env: render",
-    ],
     "imports without a reason": [
         "ctgraph_rl.run",
     ],

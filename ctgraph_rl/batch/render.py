@@ -123,7 +123,7 @@ def _draw_row(graph: CTGraph, kind: int, node: int, goal_leaf: int, size: int) -
     canvas, failed = base.copy(), kind == StateType.FAIL
     at_wait = kind == StateType.WAIT or (failed and node >= first_leaf)
     place = waits[node] if at_wait else marks[HOME_KEY if kind == StateType.HOME else node]
-    way = [marks[key] for key in (HOME_KEY, *_path(graph, node)[:-1])]
+    way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
     _lines(canvas, list(pairwise([*way, place])), 2 * unit, WAY)
     _star(canvas, marks[goal], unit)
     if failed:
@@ -140,7 +140,7 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
     home, fail = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap)), Mark(size * 0.925, size * 0.075, size / 25)
     marks = {HOME_KEY: home, FAIL_KEY: fail}
     stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
-    edges = {node: (marks[(node - 1) // graph.branching_factor], mark) for node, mark in marks.items() if node >= 0}
+    edges = {node: (marks[graph.parent(node)], mark) for node, mark in marks.items() if node >= 0}
     waits = {node: _middle(*edge) for node, edge in edges.items()}
     canvas = np.full((SCALE * size, SCALE * size), BACKGROUND, np.uint8)
     _lines(canvas, [*edges.values(), *stubs], size / 192, EDGE)
@@ -166,16 +166,16 @@ def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Lin
 def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[Line]:
     """Add the paths to two nodes, one column that parts where they do. Returns stubs for the other branches."""
     b, home, radius, fan = graph.branching_factor, marks[HOME_KEY], min(size / 32, 0.3 * gap), 1.6 * gap
-    paths, stubs = [_path(graph, node) for node in nodes], []
+    paths, stubs = [graph.nodes_to(node) for node in nodes], []
     marks[0] = Mark(home.x, home.y + gap, radius)
     for level in range(1, graph.depth + 1):
         drawn = sorted({path[level] for path in paths if len(path) > level})
         for child in drawn:
-            start = marks[(child - 1) // b]
+            start = marks[graph.parent(child)]
             column = start.x if len(drawn) == 1 else size * (0.28 if child == drawn[0] else 0.72)
             marks[child] = Mark(start.x + min(max(column - start.x, -fan), fan), start.y + gap, radius)
         for parent in {path[level - 1] for path in paths if len(path) >= level}:
-            children = {child - b * parent - 1: marks[child] for child in drawn if (child - 1) // b == parent}
+            children = {graph.decision(child) - 1: marks[child] for child in drawn if graph.parent(child) == parent}
             stubs += _stubs(b, marks[parent], children, gap, min(fan, size / 3 / (b - 1)))
     return stubs
 
@@ -193,11 +193,6 @@ def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> li
 
 def _middle(a: Mark, z: Mark) -> Mark:
     return Mark((a.x + z.x) / 2, (a.y + z.y) / 2, 0.6 * min(a.radius, z.radius))
-
-
-def _path(graph: CTGraph, node: int) -> list[int]:
-    """The nodes from the root to a node."""
-    return [*_path(graph, (node - 1) // graph.branching_factor), node] if node > 0 else [node]
 
 
 def _cross(mark: Mark, reach: float) -> list[Line]:

@@ -1,6 +1,7 @@
-"""The functional core: pure tensor functions, without TorchRL, that every face of the environment wraps.
+"""The tensor engine: pure functions, without TorchRL, that every face of the environment wraps.
 
-The tree's own dynamics are in `ctgraph_rl.core.tree`; here are observations, rewards, goals and episodes.
+In the order of the paper: transition, observation, reward, episode. Which state of the tree an action leads to is in
+`ctgraph_rl.core.tree`, what an image undergoes when it is read in `reading`. The C kernel has the same bits.
 
 Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is drawn by counter, see `philox`.
 """
@@ -68,85 +69,26 @@ OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)
 NO_LEAF = -1
 """Value of ``("next", "leaf")`` for a row that has not arrived at an end state."""
 
-
-def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
-    """X: the first view in the bank of the id that a state shows, by its node or drawn with a word."""
-    kind = state.state_type.long() if x.first_kind is None else x.first_kind + state.state_type
-    rows = x.first_view.index_select(0, kind)
-    if uses.unique_ids:
-        rows = rows + state.node * x.views_per_node.index_select(0, kind)
-    if x.legacy is not None:
-        level = (state.node.unsqueeze(-1) >= x.legacy.level_first).sum(-1, keepdim=True) - 1
-        number = state.node + x.legacy.level_shift.gather(-1, level).squeeze(-1)
-        rows = rows + number % x.legacy.num_ids.index_select(0, kind) * x.num_views
-    if uses.drawn_ids:
-        rows = rows + randint(word, x.num_ids.index_select(0, kind)) * x.num_views
-    return rows
-
-
-def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
-    """The ids that rows show, int64 [N]."""
-    rows = bank_rows(state, words_of(state.tick, params, uses)[2], params.x, uses)
-    return (rows - params.x.bank_start) // params.x.num_views
-
-
-def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Tensor:
-    """The images that rows show: a random view of the id, with noise, late rotation and reward cue. uint8 [N, *shape].
-
-    Args:
-        state: the rows' states.
-        words: the small draws of the states' ticks; word 2 draws the id and word 3 the view.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-    """
-    return read(look(state, words, params, uses), state, params, uses)
-
-
-class Seen(NamedTuple):
-    """What there is to see, before it is read from the bank; int64."""
-
-    rows: Tensor  # of the bank
-    angle: Tensor  # degrees by which the images are still to be turned
-    noise: Tensor  # start of the noise, or its row in the noise bank
-
-
-def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
-    """The view in the bank that each row sees and the draws of what is not in the bank; arguments as above."""
-    x, rows = params.x, bank_rows(state, words[2], params.x, uses)
-    angle = noise = torch.zeros_like(rows)
-    if uses.views:
-        view = randint(words[3], x.num_views * x.num_angles)
-        rows, angle = rows + view // x.num_angles, view % x.num_angles
-    if uses.pixel_noise:
-        upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
-        noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
-    return Seen(rows, angle, noise)
-
-
-def read(seen: Seen, state: RowState, params: RowParams, uses: Uses) -> Tensor:
-    """The images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
-    x, images = params.x, params.bank.index_select(0, seen.rows)
-    if uses.noise_bank:
-        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
-    elif uses.pixel_noise:
-        images = add_noise(images, seen.noise, x.read_noise)
-    if x.taps is not None:
-        images = turn(images, seen.angle, x.taps)
-    if uses.reward_cue:
-        level = cue_level(state.paid.double() / params.g.goal_reward, x.white, x.cue_wraps)
-        images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
-    return images
-
-
 Words = tuple[Tensor, ...]
 """The small draws of a tick: two for a wait that begins there, one for the id and one for the view that are shown
 there, and, where rewards have noise, a normal number for the reward of the step that begins there."""
 
 
+def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
+    """Return the small draws of a tick, of its shape; zeros without use."""
+    words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
+    if not uses.reward_noise:
+        return words
+    return *words, normal(draw(params.seed, params.row, tick, STREAM_REWARD)[0], params.normal_table)
+
+
+# Transition
+
+
 def step(
     state: RowState, action: Tensor, params: RowParams, uses: Uses, words: tuple[Words, Words] | None = None
 ) -> tuple[RowState, Shown]:
-    """One step of every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
+    """Take a step in every row: a pure function, under ``torch.vmap`` and ``torch.compile`` too.
 
     Args:
         state: the rows' states.
@@ -160,17 +102,17 @@ def step(
     """
     now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
     state = advance(state, action, now, params, uses)
-    return state, _show(state, then, params, uses)
+    return state, show(state, params, uses, then)
 
 
 def advance(
     state: RowState, action: Tensor, words: Words, params: RowParams, uses: Uses, absorbing: bool = True
 ) -> RowState:
-    """The step without what it shows, with the draws of the present tick: the next states, with the step's reward."""
+    """Return the next states, with the step's reward; the step without what it shows. Words are of the present tick."""
     stay = stays(words, params.tree) if uses.waits else None
     after = transition(State(state.state_type, state.node), action, stay, params.tree)
     entered = after.state_type != state.state_type if absorbing else None
-    paid = reward = _paid(after, entered, state.goal_leaf, words, params, uses)
+    paid = reward = _paid(after, entered, state.goal_leaf, words=words, params=params, uses=uses)
     if uses.step_reward:
         reward = (paid.double() + params.g.step_reward).float()
     return state._replace(
@@ -182,61 +124,6 @@ def advance(
         reward=reward,
         paid=paid,
     )
-
-
-def reset(
-    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
-) -> tuple[RowState, Shown]:
-    """Start an episode in the rows of a mask; a pure function like `step`.
-
-    Args:
-        state: the rows' states.
-        mask: bool, the rows that start anew; the others stay as they are.
-        params: the rows' tasks.
-        uses: what the rows have use for.
-        words: the draws of the ticks after the reset, if they are at hand.
-
-    Returns:
-        The states, and what all rows show (the others show what they showed before).
-    """
-    state = begin(state, mask, params, uses)
-    return state, show(state, params, uses, words)
-
-
-def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -> RowState:
-    """The reset without what it shows, in the rows of a mask or in all."""
-    if mask is None:
-        zeros = RowState(*map(torch.zeros_like, state))
-        state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
-        mask = torch.ones_like(state.node, dtype=torch.bool)
-    else:
-        state = _cleared(state, mask, uses)
-    return _count_episode(state, mask, params) if uses.goal_change else state
-
-
-def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
-    """Back to the home state in the rows of a mask."""
-    starts = mask.long()
-    goes_on, nothing = 1 - starts, torch.zeros_like(state.reward)
-    reward = torch.where(mask, nothing, state.reward)
-    return state._replace(
-        state_type=state.state_type * goes_on.to(torch.uint8),  # the home state is 0; faster than filling by a mask
-        node=state.node * goes_on,
-        tick=state.tick + starts,
-        step_count=state.step_count * goes_on,
-        episode_reward=torch.where(mask, nothing, state.episode_reward),
-        reward=reward,
-        paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
-    )
-
-
-def restart(
-    state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
-) -> tuple[RowState, Tensor]:
-    """`reset` when it leaves no row finished: the states, and the observations alone."""
-    state = begin(state, mask, params, uses)
-    words = words_of(state.tick, params, uses) if words is None else words
-    return state, observe(state, words, params, uses)
 
 
 def step_or_reset(
@@ -251,33 +138,92 @@ def step_or_reset(
     now, then = words or (words_of(tick, params, uses) for tick in (state.tick, state.tick + 1))
     stepped = advance(state, action, now, params, uses)
     state = begin(stepped._replace(tick=state.tick + ~mask), mask, params, uses)
-    return state, _show(state, then, params, uses)
+    return state, show(state, params, uses, then)
+
+
+# Observation
+
+
+def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Tensor:
+    """Return the images that rows show: a random view of the id, with noise, late rotation and reward cue.
+
+    Args:
+        state: the rows' states.
+        words: the small draws of the states' ticks.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+
+    Returns:
+        uint8 [N, *shape].
+    """
+    return read(look(state, words, params, uses), state, params, uses)
+
+
+class Seen(NamedTuple):
+    """The views that rows see, not yet read from the bank; int64."""
+
+    rows: Tensor  # of the bank
+    angle: Tensor  # degrees by which the images are still to be rotated
+    noise: Tensor  # start of the noise, or its row in the noise bank
+
+
+def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
+    """Choose each row's view, and draw what is not in the bank; arguments as above."""
+    x, rows = params.x, bank_rows(state, words[2], params.x, uses)
+    angle = noise = torch.zeros_like(rows)
+    if uses.views:
+        view = randint(words[3], x.num_views * x.num_angles)
+        rows, angle = rows + view // x.num_angles, view % x.num_angles
+    if uses.pixel_noise:
+        upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
+        noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
+    return Seen(rows, angle, noise)
+
+
+def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
+    """X: return the first view in the bank of the id that a state shows, by its node or drawn with a word."""
+    kind = state.state_type.long() if x.first_kind is None else x.first_kind + state.state_type
+    rows = x.first_view.index_select(0, kind)
+    if uses.unique_ids:
+        rows = rows + state.node * x.views_per_node.index_select(0, kind)
+    if x.legacy is not None:
+        level = (state.node.unsqueeze(-1) >= x.legacy.level_first).sum(-1, keepdim=True) - 1
+        number = state.node + x.legacy.level_shift.gather(-1, level).squeeze(-1)
+        rows = rows + number % x.legacy.num_ids.index_select(0, kind) * x.num_views
+    if uses.drawn_ids:
+        rows = rows + randint(word, x.num_ids.index_select(0, kind)) * x.num_views
+    return rows
+
+
+def read(seen: Seen, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """Return the images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
+    x, images = params.x, params.bank.index_select(0, seen.rows)
+    if uses.noise_bank:
+        images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
+    elif uses.pixel_noise:
+        images = add_noise(images, seen.noise, x.read_noise)
+    if x.taps is not None:
+        images = turn(images, seen.angle, x.taps)
+    if uses.reward_cue:
+        level = cue_level(state.paid.double() / params.g.goal_reward, x.white, x.cue_wraps)
+        images = add_cue(images, level, (state.state_type == _END) & x.reward_cue, x.cue_element)
+    return images
+
+
+def observation_id(state: RowState, params: RowParams, uses: Uses) -> Tensor:
+    """Return the ids that rows show, int64 [N]."""
+    rows = bank_rows(state, words_of(state.tick, params, uses)[2], params.x, uses)
+    return (rows - params.x.bank_start) // params.x.num_views
 
 
 def show(state: RowState, params: RowParams, uses: Uses, words: Words | None = None) -> Shown:
-    """What rows show in given states; a pure function like `step`."""
-    return _show(state, words_of(state.tick, params, uses) if words is None else words, params, uses)
+    """Return what rows show in given states; a pure function like `step`."""
+    done = is_done(state, params.tree)
+    words = words_of(state.tick, params, uses) if words is None else words
+    return Shown(observe(state, words, params, uses), *outcome(state, done, params), done)
 
 
-def words_of(tick: Tensor, params: RowParams, uses: Uses) -> Words:
-    """The small draws of a tick, of its shape; zeros without use."""
-    words = draw(params.seed, params.row, tick, STREAM_STEP) if uses.draws else (torch.zeros_like(tick),) * 4
-    if not uses.reward_noise:
-        return words
-    return *words, normal(draw(params.seed, params.row, tick, STREAM_REWARD)[0], params.normal_table)
-
-
-def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
-    """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
-    g, left = params.g, state.episodes_left
-    words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
-    span = g.change_last - g.change_first + 1
-    first, second = (g.change_first + randint(word, span) for word in (words[0], words[3]))
-    begins = mask & (left == 0)
-    left = torch.where(begins, first - g.legacy_change.long(), left - mask.long())
-    over = mask & (left == 0) & (g.change_first > 0)
-    goal = torch.where(over, randint_wide((words[1], words[2]), g.num_leaves), state.goal_leaf)
-    return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
+# Reward
 
 
 def _paid(
@@ -311,20 +257,85 @@ def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Te
     return share
 
 
-def _show(state: RowState, words: Words, params: RowParams, uses: Uses) -> Shown:
-    """Observation, outcome, leaf and done of states."""
-    done = is_done(state, params.tree)
-    return Shown(observe(state, words, params, uses), *outcome(state, done, params), done)
+# Episode
+
+
+def reset(
+    state: RowState, mask: Tensor, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Shown]:
+    """Start an episode in the rows of a mask; a pure function like `step`.
+
+    Args:
+        state: the rows' states.
+        mask: bool, the rows that start an episode; the others stay as they are.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+        words: the draws of the ticks after the reset, if they are at hand.
+
+    Returns:
+        The states, and what all rows show (the others show what they showed before).
+    """
+    state = begin(state, mask, params, uses)
+    return state, show(state, params, uses, words)
+
+
+def restart(
+    state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
+) -> tuple[RowState, Tensor]:
+    """`reset` that leaves no row finished: return the states, and the observations alone."""
+    state = begin(state, mask, params, uses)
+    words = words_of(state.tick, params, uses) if words is None else words
+    return state, observe(state, words, params, uses)
+
+
+def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -> RowState:
+    """Return the states after a reset of the rows of a mask, or of all."""
+    if mask is None:
+        zeros = RowState(*map(torch.zeros_like, state))
+        state = zeros._replace(tick=state.tick + 1, goal_leaf=state.goal_leaf, episodes_left=state.episodes_left)
+        mask = torch.ones_like(state.node, dtype=torch.bool)
+    else:
+        state = _cleared(state, mask, uses)
+    return _count_episode(state, mask, params) if uses.goal_change else state
+
+
+def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
+    """Return states with the rows of a mask at home."""
+    starts = mask.long()
+    keeps, nothing = 1 - starts, torch.zeros_like(state.reward)
+    reward = torch.where(mask, nothing, state.reward)
+    return state._replace(
+        state_type=state.state_type * keeps.to(torch.uint8),  # the home state is 0; faster than filling by a mask
+        node=state.node * keeps,
+        tick=state.tick + starts,
+        step_count=state.step_count * keeps,
+        episode_reward=torch.where(mask, nothing, state.episode_reward),
+        reward=reward,
+        paid=torch.where(mask, nothing, state.paid) if uses.step_reward else reward,
+    )
+
+
+def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
+    """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
+    g, left = params.g, state.episodes_left
+    words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
+    span = g.change_last - g.change_first + 1
+    first, second = (g.change_first + randint(word, span) for word in (words[0], words[3]))
+    begins = mask & (left == 0)
+    left = torch.where(begins, first - g.legacy_change.long(), left - mask.long())
+    over = mask & (left == 0) & (g.change_first > 0)
+    goal = torch.where(over, randint_wide((words[1], words[2]), g.num_leaves), state.goal_leaf)
+    return state._replace(goal_leaf=goal, episodes_left=torch.where(over, torch.where(begins, second, first), left))
 
 
 def outcome(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor]:
-    """The ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
+    """Return the ``OUTCOME_*`` of rows, uint8, and the end state that they arrived at, int64, else `NO_LEAF`."""
     result, arrived, leaf = arrivals(state, done, params)
     return result, leaf.masked_fill(~arrived, NO_LEAF)
 
 
 def arrivals(state: RowState, done: Tensor, params: RowParams) -> tuple[Tensor, Tensor, Tensor]:
-    """The ``OUTCOME_*`` of rows, uint8, whether they arrived at an end state, and if so at which."""
+    """Return the ``OUTCOME_*`` of rows, uint8, whether they arrived at an end state, and if so at which."""
     arrived = done & (state.state_type != _FAIL)
     leaf = state.node - params.tree.first_leaf
     hits = arrived & (leaf == state.goal_leaf)

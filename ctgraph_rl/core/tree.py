@@ -70,9 +70,16 @@ def tree_params(
     decides = torch.zeros_like(next_kind, dtype=torch.bool)
     decides[..., _DECISION, :] = next_kind[..., _DECISION, :] == _WAIT
     first_move = which * next_kind[0].numel() + 1
-    flat = next_kind.flatten(), decides.flatten()
     return TreeParams(
-        branching_factor, first_leaf, stay_below, extra_end_step, first_move, *flat, last_action + 2, by_action
+        branching_factor=branching_factor,
+        first_leaf=first_leaf,
+        stay_below=stay_below,
+        extra_end_step=extra_end_step,
+        first_move=first_move,
+        next_kind=next_kind.flatten(),
+        decides=decides.flatten(),
+        width=last_action + 2,
+        by_action=by_action,
     )
 
 

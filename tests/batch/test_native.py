@@ -25,8 +25,8 @@ from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, rollout
 from ctgraph_rl.batch import native
 from ctgraph_rl.batch.native import Native
 from ctgraph_rl.core import kernel as library
-from ctgraph_rl.core.dynamics import ObservationParams, RewardParams
 from ctgraph_rl.core.rewards import Arrival
+from ctgraph_rl.core.row_params import ObservationParams, RewardParams
 from ctgraph_rl.core.tree import TreeParams
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collect import collect, make_env

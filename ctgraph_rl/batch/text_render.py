@@ -1,0 +1,44 @@
+"""The rows of a batch as text: where each row is, and its observation in blocks of grey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ctgraph_rl.core.dynamics import RowState
+from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.tasks.task import Task
+
+GREYS = " ░▒▓█"
+
+
+def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: int) -> tuple[str, ...]:
+    """Return a text for every row.
+
+    Args:
+        tasks: the rows' tasks, N in all.
+        state: the rows' states.
+        observation: uint8 [N, 1, r, r], or [N, K] when one-hot.
+        white: the largest value of an observation.
+    """
+    fields = (state.state_type, state.node, state.goal_leaf, state.step_count)
+    values = zip(*(field.tolist() for field in fields), strict=True)
+    rows = zip(tasks, values, observation.numpy(), strict=True)
+    return tuple(f"{_place(task, *value)}\n{_blocks(image, white)}" for task, value, image in rows)
+
+
+def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
+    """Return where a row is: ``wait state after 1 2, step 4, goal 1 1``."""
+    graph = task.graph
+    goal, way = (" ".join(map(str, graph.path(at))) for at in (graph.num_decision_states + goal_leaf, node))
+    place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
+    return f"{place}, step {step_count}, goal {goal}"
+
+
+def _blocks(observation: NDArray[np.uint8], white: int) -> str:
+    """Return an image as lines of blocks of grey, two for each pixel; a vector as one line."""
+    levels = (observation.reshape(-1, observation.shape[-1]).astype(int) * 4 // white).clip(0, 4)
+    return "\n".join("".join(GREYS[level] * 2 for level in line) for line in levels)
