@@ -16,6 +16,7 @@ import torch
 from helpers.sweeping import command_line
 
 import curricula
+from baselines.lstm_ppo import LSTMPPO
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
 from ctgraph_rl.log.provenance import named
 from ctgraph_rl.metrics import definitions
@@ -131,6 +132,27 @@ def test_the_seed_decides_environment_and_evaluation_too(compose, monkeypatch, t
     run(compose("seed=7"), tmp_path)
 
     assert seeds == [7]
+
+
+def test_a_run_builds_one_agent_and_one_training_environment(compose, monkeypatch, tmp_path):
+    built = []
+
+    def counted(kind, name):
+        original = kind.__init__
+
+        def init(self, *arguments, **settings):
+            built.append(name(arguments[0]))
+            original(self, *arguments, **settings)
+
+        monkeypatch.setattr(kind, "__init__", init)
+
+    counted(LSTMPPO, lambda specs: "agent")
+    counted(CTGraphEnv, lambda tasks: len(tasks))
+    cfg = compose(*SHORT, "agent.num_envs=16", "evaluation.before=false", "evaluation.num_episodes=2")
+
+    run(cfg, tmp_path)
+
+    assert sorted(built, key=str) == [16, *[8] * 4, "agent"]  # an evaluation of 4 tasks after each of 4 blocks
 
 
 def test_a_finished_run_is_shown_and_not_run_again(copy_of, compose, capsys, monkeypatch):

@@ -52,8 +52,9 @@ def with_added(group: str, settings: Mapping[str, Any], names: Collection[str]) 
 def parameters_of(function: Any) -> dict[str, Parameter]:
     """Return the arguments of a function or class by name; those that a class takes as ``**`` are its base's."""
     own = signature(function).parameters
-    named = {name: parameter for name, parameter in own.items() if parameter.kind is not Parameter.VAR_KEYWORD}
-    hands_on = isinstance(function, type) and len(named) < len(own)
+    stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+    named = {name: parameter for name, parameter in own.items() if parameter.kind not in stars}
+    hands_on = isinstance(function, type) and stars[1] in {parameter.kind for parameter in own.values()}
     return parameters_of(function.__mro__[1]) | named if hands_on else named
 
 

@@ -1,0 +1,143 @@
+"""Settings of runs: one that is added later loses no earlier run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from ctgraph_rl import load, run
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS
+from ctgraph_rl.runs import job, read, settings
+from ctgraph_rl.runs.checkpoints import Checkpoints
+
+SHORT = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=64", "evaluation.num_episodes=2")
+YAML = """
+defaults:
+  - a2c
+  - _self_
+num_envs: 8
+num_steps: 4
+hidden_size: 4
+_target_: added_later.Agent
+"""
+CODE = """
+from baselines.a2c import A2C
+
+class Agent(A2C):
+    def __init__(self, *specs, {argument}**settings):
+        super().__init__(*specs, **settings)
+"""
+
+
+class Stopped(BaseException):
+    """As if the process had been killed."""
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """Runs ``ctgraph-rl`` with an own agent, whose yaml and class may have one setting more; the run's directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))  # to which a run adds the working directory
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "conf" / "agent").mkdir(parents=True)
+
+    def start(*overrides: str, added: str | None = None) -> Path:
+        more = "" if added is None else f"cell: {added}\n"
+        (tmp_path / "conf" / "agent" / "mine.yaml").write_text(YAML + more)
+        (tmp_path / "added_later.py").write_text(CODE.format(argument="cell, " if more else ""))
+        sys.modules.pop("added_later", None)
+        monkeypatch.setattr(settings, "ADDED", {} if added is None else {"agent.cell": "lstm"})
+        monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "--config-dir", "conf", *SHORT, "agent=mine", *overrides])
+        run.main()
+        return max((tmp_path / "runs").glob("*/*"), key=lambda folder: folder.stat().st_mtime)
+
+    return start
+
+
+def test_a_setting_that_is_added_with_the_value_for_as_before_is_the_same_run(command, capsys):
+    before = command()
+
+    assert command(added="lstm") == before
+    assert "this configuration was run before" in capsys.readouterr().out
+    assert command("agent.cell=gru", added="lstm") != before
+
+
+def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch):
+    whole = (command() / AGENT).read_bytes()
+    offer = Checkpoints.offer
+
+    def stop(self, state, at_block_end):
+        offer(self, state, at_block_end)
+        if at_block_end:
+            raise Stopped
+
+    monkeypatch.setattr(Checkpoints, "offer", stop)
+    with pytest.raises(Stopped):
+        command("overwrite=true")
+    monkeypatch.setattr(Checkpoints, "offer", offer)
+    (stopped,) = Path("runs").glob("*/*")
+    assert len(list((stopped / CHECKPOINTS).iterdir())) > 0
+
+    resumed = command(added="lstm")
+
+    assert (resumed / AGENT).read_bytes() == whole
+    assert (resumed / "restarts.jsonl").exists()
+
+
+def test_a_stored_run_of_another_value_is_another_run():
+    assert settings.differences({"agent": {"a": 1}, "seed": 0}, {"agent": {"a": 2}, "seed": 0}) == [
+        "agent.a=1 instead of 2"
+    ]
+    assert settings.as_before({"agent": {"cell": "lstm"}, "seed": 0}) == {"agent": {"cell": "lstm"}, "seed": 0}
+
+
+def test_settings_that_were_added_have_their_value_in_runs_without_them(monkeypatch):
+    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm", "device": "cpu"})
+    stored = {"agent": {"gamma": 0.9}, "seed": 0}
+
+    assert settings.differences(stored, {"agent": {"gamma": 0.9, "cell": "lstm"}, "seed": 0, "device": "cpu"}) == []
+    other = {"agent": {"gamma": 0.9, "cell": "gru"}, "seed": 0}
+    assert settings.differences(stored, other) == ["agent.cell='lstm' instead of 'gru'"]
+    assert settings.digest(stored) == settings.digest({**stored, "agent": {"gamma": 0.9, "cell": "lstm"}})
+    assert settings.digest(stored) != settings.digest(other)
+    assert settings.with_added("agent", {"gamma": 0.9}, {"gamma", "cell"}) == {"gamma": 0.9, "cell": "lstm"}
+    assert settings.with_added("agent", {"gamma": 0.9}, {"gamma"}) == {"gamma": 0.9}
+    assert settings.with_added("agent", {"cell": "gru"}, {"cell"}) == {"cell": "gru"}
+
+
+def test_runs_from_before_and_after_a_setting_was_added_are_one_group(tmp_path, monkeypatch):
+    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm"})
+    first = {"kind": "run", "curriculum": "c", "fingerprint": "f"}
+    for name, more in (("old", {}), ("new", {"cell": "lstm"}), ("other", {"cell": "gru"})):
+        (tmp_path / name).mkdir()
+        config = {"agent": {"_target_": "mine.Agent", **more}, "seed": 0}
+        (tmp_path / name / "run.jsonl").write_text(json.dumps({**first, "config": config}) + "\n")
+
+    old, new, other = (read.read_run(tmp_path / name).configuration for name in ("old", "new", "other"))
+
+    assert old == new != other
+
+
+def test_a_stored_agent_without_a_setting_that_was_added_is_loaded(tmp_path, monkeypatch, compose):
+    from baselines import a2c
+
+    small = ("agent.num_envs=8", "agent.num_steps=4", "agent.hidden_size=4")
+    job.learn(compose(*SHORT, "agent=a2c", *small), tmp_path)
+    original = a2c.A2C.__init__
+
+    class Later(a2c.A2C):
+        def __init__(self, *specs, cell, **arguments):
+            assert cell == "lstm"
+            original(self, *specs, **arguments)
+
+    Later.__module__ = "baselines.a2c"
+    monkeypatch.setattr(a2c, "A2C", Later)
+    with pytest.raises(ValueError, match="cell"):
+        load(tmp_path)
+
+    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm"})
+
+    assert load(tmp_path).frames == 256
