@@ -135,7 +135,9 @@ def test_a_folder_has_at_most_14_modules():
 
 
 def test_a_file_has_at_most_400_lines():
-    check("long files", architecture.long_files(modules_of_packages(), 400, LONG_FILES))
+    modules = [*modules_of_packages(), *modules_of_tests()]
+
+    check("long files", architecture.long_files(modules, 400, LONG_FILES))
 
 
 def test_a_call_has_at_most_five_positional_arguments():

@@ -6,14 +6,13 @@ import random
 from dataclasses import replace
 from itertools import product as pairs
 
-import hydra
 import pytest
 
 import curricula
 from ctgraph_rl import Block, CTGraph, Evaluation, OneHot, PaperImages, ReferenceImages
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_su_b1
 from ctgraph_rl.tasks.protocol import Protocol
-from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
+from ctgraph_rl.tasks.switch import Drift
 from curricula import axes
 from curricula.axes import (
     all_goals,
@@ -349,91 +348,3 @@ def test_a_sequence_has_a_block_for_each_item():
 
 def test_curricula_sequence_is_the_one_of_axes():
     assert curricula.sequence is axes.sequence
-
-
-def test_free_axes_build_a_named_curriculum_s_blocks(compose):
-    cfg = compose("curriculum=axes", "curriculum.configuration=fo_b2", "curriculum.num_frames=[1,2,3,4,5,6,7,8]")
-
-    built = hydra.utils.instantiate(cfg.curriculum)
-
-    assert built.tasks == curricula.load("fo_b2_8tasks").tasks
-    assert [block.num_frames for block in built.blocks] == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert built.name == "axes"
-
-
-def test_axes_are_set_on_the_command_line(compose):
-    cfg = compose(
-        "curriculum=axes",
-        "curriculum.configuration=fo_b1",
-        "curriculum.image_seeds=[1,2]",
-        "curriculum.goals=[[2,1],[1,2]]",
-        "curriculum.order=interleave",
-    )
-
-    built = hydra.utils.instantiate(cfg.curriculum)
-
-    assert built.labels == ("goal2.1-img1", "goal2.1-img2", "goal1.2-img1", "goal1.2-img2")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"depth": [1, 2], "goals": "nested"}, ["2", "22"]),
-        ({"depth": [1, 2]}, ["1", "2", "11", "12", "21", "22"]),
-        ({"depth": [1, 2], "order": "interleave"}, ["1", "11", "2", "12", "21", "22"]),
-        ({"depth": [1, 2], "goals": [[2], [1, 2]]}, ["2", "12"]),
-        ({"order": "reverse"}, ["22", "21", "12", "11"]),
-        ({"order": "shuffle", "seed": 1}, ["22", "12", "21", "11"]),
-        ({"goals": "random", "num_goals": 2, "repeats": 2}, ["22", "11", "22", "11"]),
-        ({"branching_factor": 3, "depth": 1}, ["1", "2", "3"]),
-    ],
-)
-def test_free_axes_give_the_goals_in_order(arguments, expected):
-    built = curricula.from_axes(**arguments)
-
-    assert goals(block.tasks[0] for block in built.blocks) == expected
-
-
-def test_free_axes_use_the_ids_of_the_deepest_graph():
-    built = curricula.from_axes("fo_b1", depth=[2, 4], goals="nested", wait_prob=[0, 0.5])
-
-    assert {task.observations for task in built.tasks} == {ct_graph(2, 4).observations}
-    assert [(task.graph.wait_prob, task.graph.depth) for task in built.tasks] == [(0, 2), (0, 4), (0.5, 2), (0.5, 4)]
-
-
-@pytest.mark.parametrize(
-    ("switch", "expected"),
-    [("by_episode", ByEpisode(50)), ("at_random", AtRandom(0.02)), ("drift", Drift(50))],
-)
-def test_a_switch_makes_one_block_of_all_tasks(switch, expected):
-    built = curricula.from_axes("su_b1", switch=switch, switch_episodes=50, num_frames=512)
-
-    assert built.blocks == (Block((A, B, C, D), 512, expected),)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"configuration": "su_b2"}, "configuration must be one of fo_b1, fo_b2, su_b1, co_b1, posr_b1, got 'su_b2'"),
-        ({"goals": "some"}, "goals must be one of all, random, nested, or a list of goals, got 'some'"),
-        ({"goals": 3}, r"goals must be one of all, random, nested, or a list such as \[\[1, 2\]\], got 3"),
-        ({"goals": [[1, 1, 1]]}, r"goals must have as many decisions as the depths, \[2\], and some for each"),
-        ({"goals": [[1, 1]], "depth": [2, 3]}, r"goals must have as many decisions as the depths, \[2, 3\]"),
-        ({"goals": [[1, 3]]}, r"goal must be 2 decisions in 1..2"),
-        ({"order": "random"}, "order must be one of product, interleave, shuffle, reverse, got 'random'"),
-        ({"depth": 0}, "depth must be an integer >= 1 or a list of them, got 0"),
-        ({"depth": []}, r"depth must be an integer >= 1 or a list of them, got \[\]"),
-        ({"branching_factor": 1}, "branching_factor must be an integer >= 2, got 1"),
-        ({"wait_prob": 1.0}, r"wait_prob must be in \[0, 1\), got 1.0"),
-        ({"image_seeds": "a"}, "seeds must be a list with at least one int, got str"),
-        ({"repeats": 0}, "times must be an integer >= 1, got 0"),
-        ({"goals": "random", "num_goals": 5}, r"num_goals must be in 1..4"),
-        ({"num_frames": 0}, "num_frames must be an integer >= 1, got 0"),
-        ({"switch": "slow"}, "switch must be one of by_episode, at_random, drift, or null, got 'slow'"),
-        ({"switch": "drift", "switch_episodes": 0}, "switch_episodes must be an integer >= 1, got 0"),
-        ({"configuration": "fo_b1", "depth": 30, "goals": "nested"}, "num_images must be in 1..43046721"),
-    ],
-)
-def test_free_axes_out_of_range_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        curricula.from_axes(**arguments)

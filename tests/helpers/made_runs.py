@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ctgraph_rl import RunLog, metrics
 from ctgraph_rl.log.run_log import write_metrics, write_performance
+from ctgraph_rl.runs.read import find_runs
 
 LABELS = ("goal1", "goal2")
 FRAMES = 1000
@@ -76,3 +77,35 @@ def learned(log: RunLog, trained=((1,), (2,))) -> RunLog:
         log.append("training", block=block, frames=start + 100, episodes=4, return_mean=block / 4)
         evaluate(log, "after", block, start + 100, *end, 0.0, held_out=1)
     return log
+
+
+def make_run(folder, seed: int, returns=(1.0, 0.5), finished: bool = True, curriculum: str = "two", **agent):
+    """A run of two tasks that ends with the returns."""
+    path = folder / f"{agent.get('name', 'ppo')}-{curriculum}-{seed}-{len(list(folder.iterdir()))}"
+    path.mkdir()
+    config = {"agent": {"_target_": f"baselines.{agent.pop('name', 'ppo')}.PPO", **agent}, "seed": seed}
+    log = RunLog(path / "run.jsonl")
+    log.append("run", schema=1, curriculum=curriculum, fingerprint="f", config=config, trained=[[1], [2]])
+    for block, values in ((0, (0.0, 0.0)), (1, (1.0, 0.0)), (2, returns)):
+        for task, value in enumerate(values, 1):
+            log.append(
+                *("evaluation",),
+                **{"moment": "after" if block else "before", "block": block, "frames": block, "task": task},
+                **{"label": f"goal{task}", "held_out": False, "return_mean": value, "success_rate": value},
+            )
+    log.close()
+    if finished:
+        write_metrics(path / "metrics.json", metrics.summary(log.performance(), [(0,), (1,)]))
+    return path
+
+
+def all_runs(paths):
+    """All runs of folders that hold nothing else."""
+    runs, problems = find_runs(paths)
+    assert problems == []
+    return runs
+
+
+def line(rows, measure: str, agent: str = "PPO"):
+    (found,) = [row for row in rows if (row.measure, row.agent) == (measure, agent)]
+    return found

@@ -23,12 +23,23 @@ from ctgraph_rl import (
     ReferenceImages,
     ReferenceLinear,
     ReferenceOneHot,
+    Rows,
     Task,
 )
-from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.tasks.switch import Switch
-from helpers.oracles import DECISION, END, FAIL, HOME, WAIT, confounding, fully_observable, one_hot, scripts, surjective
+from helpers.oracles import (
+    DECISION,
+    END,
+    FAIL,
+    HOME,
+    WAIT,
+    confounding,
+    fully_observable,
+    one_hot,
+    scripts,
+    surjective,
+)
 
 LEGACY = {"legacy_index": True, "noise_before_rotation": True, "reward_cue": True, "cue_wraps": True}
 
@@ -239,3 +250,19 @@ def tasks(draw: Any, size: int | None) -> Task:
 def batches(least: int = 1) -> Any:
     """Legal tasks whose observations have one shape, or are one-hot."""
     return st.sampled_from([None, 4, 8, 12, 16]).flatmap(lambda size: st.lists(tasks(size), min_size=least, max_size=4))
+
+
+def extra(task: Task, **fields) -> Task:
+    return replace(task, extra_end_step=True, **fields)
+
+
+def switching(tasks: list[Task], switch: Switch, num_rows: int, **arguments: Any) -> Rows:
+    """Rows that change between tasks."""
+    rows = Rows(tasks[:1] * num_rows, task_pool=tasks, **arguments)
+    rows.switch_tasks(tasks, switch)
+    return rows
+
+
+def started(rows: Rows, num_episodes: int) -> Tensor:
+    """The tasks' numbers in as many episodes, each ended by the start of the next: int64 [episodes, rows]."""
+    return torch.stack([(rows.restart(), rows.task)[1] for _ in range(num_episodes)])

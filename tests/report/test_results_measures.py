@@ -1,0 +1,131 @@
+"""Tables of several measures, and what is left out of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+from helpers.made_runs import all_runs, line, make_run
+
+from ctgraph_rl.report import results
+from ctgraph_rl.report.results import selected, table
+from ctgraph_rl.runs.read import grouped
+
+pytest.importorskip("scipy")
+
+
+def test_one_fingerprint_is_one_curriculum_though_one_name_says_modified(tmp_path):
+    make_run(tmp_path, 0)
+    make_run(tmp_path, 1, curriculum="two (modified)")
+
+    row = line(table(all_runs([tmp_path])), "average_performance")
+
+    assert (row.curriculum, row.estimate.n) == ("two", 2)
+
+
+def test_six_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_path):
+    path = make_run(tmp_path, 0)
+    always = ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
+    at_the_end = ["mean_final_return", "solved_rate"]
+    first = [row.measure for row in selected(table(all_runs([path])))]
+    scores = json.loads((path / "metrics.json").read_text())
+    for name, value in (("relative_performance", 1.5), ("sample_efficiency", None), ("regret", 2.0)):
+        scores[name] = {"value": value, "definition": name, "undefined": None if value else "no experts were given"}
+    (path / "metrics.json").write_text(json.dumps(scores))
+
+    make_run(tmp_path, 0, curriculum="other")
+
+    rows = table(all_runs([path]))
+    both = selected(table(all_runs([tmp_path])))
+
+    assert first == [*always, *at_the_end]
+    assert [row.measure for row in selected(rows)] == [*always, "relative_performance", *at_the_end]
+    assert [row.measure for row in both if row.curriculum == "other"] == [*always, *at_the_end]
+    assert [row.measure for row in selected(rows, ["solved", "regret"])] == ["regret", "solved goal1", "solved goal2"]
+
+
+def test_an_unknown_measure_lists_those_that_there_are(tmp_path):
+    make_run(tmp_path, 0)
+
+    with pytest.raises(
+        ValueError, match=r"no run has a measure 'accuracy'; there are: average_performance, .*, solved$"
+    ):
+        selected(table(all_runs([tmp_path])), ["accuracy", "forgetting"])
+
+
+def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
+    for seed in range(2):
+        make_run(tmp_path, seed, (seed / 2, 1.0), curriculum="a_b", name="ppo|x")
+    rows = selected(table(all_runs([tmp_path])), ["backward_transfer", "forward_transfer"])
+
+    page = results.markdown(rows).splitlines()
+    paper = results.latex(rows).splitlines()
+
+    assert page[0] == "### a_b" and page[4] == "| agent | measure | over seeds | n | note |"
+    assert page[6:] == [
+        "| PPO | forward transfer | 0.00 | 2 | 1 |",
+        "| PPO | backward transfer | -0.75 [-3.93, 2.43] | 2 |  |",
+        *("", "1. all seeds are equal: no spread to estimate"),
+    ]
+    assert paper[1].startswith(r"\caption{a\_b: mean {[}Student's 95 \% interval]")
+    assert paper[6:8] == [
+        r"PPO & forward transfer & 0.00$^{1}$ & 2 \\",
+        r"PPO & backward transfer & $-$0.75 [$-$3.93, 2.43] & 2 \\",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--difference", "0.1"], "give both"),
+        (["--compare", "regret", "--difference", "0"], "difference must be a number > 0"),
+    ],
+)
+def test_a_difference_that_means_nothing_is_refused_before_the_table(tmp_path, monkeypatch, capsys, arguments, message):
+    make_run(tmp_path, 0)
+    monkeypatch.setattr(sys, "argv", ["results", str(tmp_path), *arguments])
+
+    with pytest.raises(SystemExit):
+        results.main()
+
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.out == ""
+
+
+def test_what_is_left_out_is_named_after_the_table_with_exit_code_1(tmp_path, monkeypatch, capsys):
+    make_run(tmp_path, 0)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "run.jsonl").write_text("step,reward\n")
+    monkeypatch.setattr(sys, "argv", ["results", str(tmp_path)])
+
+    with pytest.raises(SystemExit) as end:
+        results.main()
+
+    said = capsys.readouterr()
+    assert end.value.code == 1
+    assert "average performance  0.75  n = 1" in said.out
+    assert said.err.startswith(f"left out: {tmp_path / 'foreign' / 'run.jsonl'} does not say what was run")
+
+
+def test_html_and_pipes_of_a_name_are_text_in_a_markdown_table(tmp_path):
+    path = make_run(tmp_path, 0, curriculum="<b>x|y")
+
+    page = results.markdown(table(all_runs([path])))
+
+    assert page.startswith("### &lt;b&gt;x\\|y\n")
+    assert "<b>" not in page
+
+
+def test_many_configurations_are_named_in_a_time_that_grows_with_their_number(tmp_path):
+    first = all_runs([make_run(tmp_path, 0, gamma=0)])[0]
+    runs = [replace(first, settings={**first.settings, "agent.gamma": number}) for number in range(2000)]
+    start = time.process_time()
+
+    groups = grouped(runs)
+
+    assert time.process_time() - start < 2
+    assert list(groups)[1999] == ("two", "PPO gamma=1999")
