@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.sweeping import command_line
+from helpers.sweeping import command_line, files_in
 
 import curricula
 from baselines.lstm_ppo import LSTMPPO
@@ -28,10 +27,6 @@ from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
-
-
-def files_in(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
 def measured(run_dir: Path) -> list[dict]:
@@ -263,101 +258,6 @@ def test_only_a_changed_curriculum_is_named_modified(compose):
     assert named(changed).name == "su_b1_4tasks (modified)"
     assert named(changed).fingerprint == changed.fingerprint
     assert named(own) == own
-
-
-REFUSED = [
-    (["curriculum=su_b2"], ["Could not find 'curriculum/su_b2'", "su_b1_4tasks"]),
-    (["agent=sarsa"], ["Could not find 'agent/sarsa'", "dqn", "lstm_ppo"]),
-    (["sed=1"], ["sed", "Choices: ", "seed", "num_threads", "overwrite"]),
-    (["agent.hidden=8"], ["hidden", "Choices: ", "hidden_size", "num_envs"]),
-    (["+agent.foo=1"], ["agent has no foo", "Choices: ", "hidden_size"]),
-    (["+curriculum.foo=1"], ["curriculum has no foo", "Choices: num_frames, image_seed"]),
-    (["seed=-1"], ["seed must be an integer in [0, 2**63), got -1"]),
-    (["seed=abc"], ["seed must be an integer in [0, 2**63), got 'abc'"]),
-    (["seed=1.5"], ["seed must be an integer in [0, 2**63), got 1.5"]),
-    (["device=bogus"], ["device must be one of cpu", "got 'bogus'"]),
-    (["num_threads=0"], ["num_threads must be in 1.."]),
-    (["overwrite=1"], ["overwrite must be true or false, got 1"]),
-    (
-        ["curriculum.num_frames=1000"],
-        ["num_frames=1000 of block 1, 2, 3, 4 must be a multiple of num_envs=64", "960 or 1024"],
-    ),
-    (["curriculum.num_frames=0"], ["num_frames must be an integer >= 1, got 0"]),
-    (["curriculum.image_seed=abc"], ["seed", "'abc'"]),
-    (["agent.gamma=2"], ["gamma must be in [0, 1], got 2"]),
-    (["agent._target_=torch.nn.Module"], ["agent has no"]),
-    (["experts_dir=null"], ["experts_dir must be the path of a folder, got None"]),
-    (["evaluation=null"], ["evaluation must have keys, such as evaluation.every=5120, got None"]),
-    (["protocol.task_id=shown"], ["task_id must be one of hidden, one_hot, at_boundaries, got 'shown'"]),
-    (["agent.hidden_size=wide"], ["hidden_size must be an integer >= 1, got 'wide'"]),
-    (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
-]
-
-
-@pytest.mark.parametrize(("overrides", "said"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
-def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_results(
-    monkeypatch, capsys, tmp_path, overrides, said
-):
-    monkeypatch.chdir(tmp_path)
-
-    code = command_line(monkeypatch, *SHORT, *overrides)
-
-    error = capsys.readouterr().err
-    assert code == 1
-    assert all(part in error for part in said), error
-    assert "Traceback" not in error
-    assert not any(Path(path).name in RESULTS for path in files_in(tmp_path))
-
-
-def test_an_argument_that_is_missing_is_one_message(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    code = command_line(monkeypatch, *SHORT, "~agent.gamma")
-
-    error = capsys.readouterr().err
-    assert code == 1
-    assert "gamma" in error and "Traceback" not in error
-
-
-def three_tasks_at_once() -> Curriculum:
-    return Curriculum("own", 1, "here", [Block((ct_su_b1((1, 1)), ct_su_b1((2, 2)), ct_su_b1((1, 2))), 1024)])
-
-
-def test_tasks_that_cannot_share_the_rows_leave_no_results(compose, tmp_path):
-    cfg = compose(*SHORT, "~curriculum.num_frames", "~curriculum.image_seed")
-    cfg.curriculum._target_ = f"{__name__}.three_tasks_at_once"
-
-    with pytest.raises(ValueError, match="num_envs=64 must be a multiple of the block's 3 tasks"):
-        run(cfg, tmp_path)
-
-    assert files_in(tmp_path) == set()
-
-
-def test_a_loss_that_is_not_finite_stops_the_run_and_names_block_and_loss(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    code = command_line(monkeypatch, *SHORT, "agent.learning_rate=1e38")
-
-    error = capsys.readouterr().err
-    assert code == 1
-    (said,) = re.findall(r"error: (\w+ is nan in block 1 after 512 frames; the run stops here)", error)
-    (mark,) = tmp_path.rglob("failed.txt")
-    assert mark.read_text() == f"FloatingPointError: {said}\n" and "Traceback" not in error
-
-
-def test_a_full_disk_is_one_message_with_sizes_after_the_first_update(monkeypatch, capsys, tmp_path):
-    def full(number):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.chdir(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr("ctgraph_rl.log.files.os.fsync", full)
-        code = command_line(monkeypatch, *SHORT, "hydra.run.dir=out")
-
-    error = capsys.readouterr().err
-    assert code == 1
-    assert re.search(r"No space left on device: cannot write 0\.0 MB to .*run\.jsonl, [\d.]+ MB are free\n", error)
-    assert "No space left on device: cannot write" in Path("out/failed.txt").read_text()
 
 
 def test_a_refused_configuration_does_not_change_what_is_recorded_of_a_run(finished, monkeypatch, tmp_path):

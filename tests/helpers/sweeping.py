@@ -32,3 +32,7 @@ def sweep(monkeypatch, *settings: str) -> int:
 def configs(runs: list[Path]) -> list[dict[str, Any]]:
     """What was run."""
     return [json.loads((path / "run.jsonl").read_text())["config"] for path in runs]
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}

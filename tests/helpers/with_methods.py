@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from baselines.learner import Learner
+from baselines.methods.importance import Importance
 from baselines.methods.method import AgentWithMethod, Method
 from ctgraph_rl import Block, CTGraphEnv
 from ctgraph_rl.runs import config
@@ -91,3 +92,11 @@ def same(one: Any, other: Any) -> bool:
     """Whether two lists or dictionaries of tensors are equal bit by bit."""
     pairs = zip(one, other, strict=True) if isinstance(one, list) else [(one[key], other[key]) for key in one]
     return all(torch.equal(*pair) for pair in pairs)
+
+
+CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
+
+
+def tiny(method: Importance, kind: type[Tiny] = Tiny) -> AgentWithMethod:
+    torch.manual_seed(0)
+    return AgentWithMethod(kind(), method, CURRICULUM)
