@@ -1,7 +1,7 @@
 """Named task sequences that a paper can cite; importable without Hydra, torchrl or a configuration file.
 
 ``curricula.load("ct8")`` and ``curricula.ct8()`` are the curriculum as published; both take arguments that change it,
-such as ``num_frames``. `names` lists all. ``curricula.axes`` has what own sequences are made of.
+such as ``num_frames``. `names` lists all, and ``curricula.axes`` has the functions that make other sequences.
 """
 
 from __future__ import annotations
