@@ -27,7 +27,7 @@ MakeEnv = Callable[[Task, int], VecEnv]
 
 
 def single_envs(task: Task, num_rows: int) -> VecEnv:
-    """Rows that are stepped one after the other, as Stable-Baselines3 makes them of any Gymnasium environment."""
+    """Return Stable-Baselines3's own batch of single environments, which are stepped one after the other."""
 
     def make() -> Env:
         return CTGraphGymEnv(task)
@@ -36,12 +36,12 @@ def single_envs(task: Task, num_rows: int) -> VecEnv:
 
 
 def batch(task: Task, num_rows: int) -> VecEnv:
-    """Rows that are one batch."""
+    """Return a batch of this package."""
     return SB3VecEnv(num_rows, task)
 
 
 def ways() -> dict[str, tuple[MakeEnv, bool]]:
-    """How it is measured: the environment, and whether the hyperparameters are ours."""
+    """Return what is measured: the environments, and whether the hyperparameters are ours."""
     return {
         "SB3, 256 rows, SB3VecEnv": (batch, True),
         "SB3, 256 rows, make_vec_env": (single_envs, True),
@@ -50,10 +50,10 @@ def ways() -> dict[str, tuple[MakeEnv, bool]]:
 
 
 class Stable:
-    """One of Stable-Baselines3's agents.
+    """An agent of Stable-Baselines3.
 
     Args:
-        name: which of ours it is like.
+        name: the corresponding agent of this package.
         given: our hyperparameters.
         task: what it learns.
         way: one of `ways`.
@@ -72,18 +72,18 @@ class Stable:
         self.frames = max(num_rows * getattr(self.model, "n_steps", given["num_steps"]), 1024)
 
     def _exploration(self, given: Mapping[str, Any]) -> Callable[[float], float]:
-        """Exploration that falls with the frames, not with the share of the frames of a call to ``learn``."""
+        """Return exploration that falls with the frames, not with their share of a call to ``learn``."""
         first, last, frames = given["eps_init"], given["eps_end"], given["annealing_num_steps"]
         return lambda _: max(last, first - (first - last) * self.model.num_timesteps / frames)
 
     def learn(self) -> int:
-        """Learn from one batch, or from some small ones."""
+        """Learn from one batch, or from several small ones."""
         before = self.model.num_timesteps
         self.model.learn(self.frames, reset_num_timesteps=False)
         return self.model.num_timesteps - before
 
     def success(self) -> float:
-        """The share of 100 greedy episodes that reach the goal."""
+        """Return the share of 100 greedy episodes that reach the goal."""
         envs = batch(self.task, 100)
         observation, state = envs.reset(), None
         starts, open_, outcomes = np.ones(100, dtype=bool), np.ones(100, dtype=bool), np.zeros(100)
@@ -97,7 +97,7 @@ class Stable:
 
 
 def translated(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Our hyperparameters in Stable-Baselines3's words."""
+    """Translate our hyperparameters to Stable-Baselines3's."""
     same = {"learning_rate": given["learning_rate"], "gamma": given["gamma"], "max_grad_norm": given["max_grad_norm"]}
     width, rows, steps = given["hidden_size"], given["num_envs"], given["num_steps"]
     network: dict[str, Any] = {"activation_fn": nn.ReLU, "optimizer_class": torch.optim.Adam}

@@ -16,21 +16,18 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-import yaml
 from rich.console import Console
 from rich.progress import track
 
+from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.benchmark import machine
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.learn.collect import collect
-from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 
 ROWS = 256
@@ -51,20 +48,20 @@ PAIRS = (
 
 
 class Learning(Protocol):
-    """An agent on its rows."""
+    """An agent with its environments."""
 
     def learn(self) -> int:
-        """Learn for a while; returns the number of frames."""
+        """Learn for a while, and return the number of frames."""
         ...
 
     def success(self) -> float:
-        """The share of greedy episodes that reach the goal."""
+        """Return the share of greedy episodes that reach the goal."""
         ...
 
 
 @dataclass
 class Contender:
-    """Somebody who learns a task, and what was measured."""
+    """A learner of a task, and its measurements."""
 
     agent: str
     task: str
@@ -74,14 +71,14 @@ class Contender:
     solved: list[tuple[int, float] | None] = field(default_factory=list)
 
     def measure(self, learning: Learning, seconds: float) -> None:
-        """Frames per second over at least so many seconds."""
+        """Measure frames per second over at least so many seconds."""
         frames, start = 0, time.process_time()
         while time.process_time() - start < seconds:
             frames += learning.learn()
         self.speeds.append(frames / (time.process_time() - start))
 
     def solve(self, seed: int, max_frames: int) -> None:
-        """Learn until the task is solved: frames and seconds of learning, None if it takes more than so many frames."""
+        """Learn until the task is solved, and note frames and seconds; None if ``max_frames`` are not enough."""
         learning, frames, seconds, checked = self.make(seed), 0, 0.0, 0
         while frames < max_frames:
             start = time.process_time()
@@ -95,15 +92,20 @@ class Contender:
         self.solved.append(None)
 
 
+def agent_named(name: str) -> Entry:
+    """Return the class and hyperparameters of an agent."""
+    return next(entry for entry in catalogue("agent") if entry.name == name)
+
+
 def settings(name: str) -> dict[str, Any]:
-    """An agent's hyperparameters, on `ROWS` rows with as many frames in a batch as its yaml file says."""
-    given = yaml.safe_load(Path(conf_dir(), "agent", f"{name}.yaml").read_text(encoding="utf-8"))
+    """Return an agent's hyperparameters for `ROWS` rows, with as many frames in a batch as in its yaml file."""
+    given = agent_named(name).settings
     frames = given["num_envs"] * given["num_steps"]
     return {**given, "num_envs": ROWS, "num_steps": max(1, frames // ROWS)}
 
 
 class Ours:
-    """One of the agents of this package.
+    """An agent of this package.
 
     Args:
         name: the agent.
@@ -113,14 +115,11 @@ class Ours:
 
     def __init__(self, name: str, task: Task, seed: int) -> None:
         given = settings(name)
-        module, kind = given.pop("_target_").rsplit(".", 1)
         torch.manual_seed(seed)
         env = CTGraphEnv([task] * given["num_envs"], seed)
         self.task = task
-        self.agent = getattr(import_module(module), kind)(
-            env.observation_spec_unbatched, env.action_spec_unbatched, **given
-        )
-        agent = self.agent
+        make_agent = agent_named(name).kind
+        self.agent = agent = make_agent(env.observation_spec_unbatched, env.action_spec_unbatched, **given)
         batch = agent.num_envs * agent.num_steps
         agent.start_task()
         self.batches = collect(env, agent.policy, 10**6 * batch, agent.num_steps, agent.initial_state)
@@ -132,13 +131,13 @@ class Ours:
         return batch.numel()
 
     def success(self) -> float:
-        """The share of 100 greedy episodes that reach the goal."""
+        """Return the share of 100 greedy episodes that reach the goal."""
         ends = evaluate(self.agent.policy, [self.task], seed=1, initial_state=self.agent.initial_state)
         return (ends["outcome"] == 3).double().mean().item()
 
 
 def contenders(agents: list[str]) -> Iterator[Contender]:
-    """Everybody who is measured; Stable-Baselines3 only where it is installed."""
+    """Yield everything to measure; Stable-Baselines3 only if it is installed."""
     for name, label in PAIRS:
         if name not in agents:
             continue
@@ -152,7 +151,7 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
 
 
 def table(measured: list[Contender]) -> str:
-    """Medians in Markdown; the ratio says how many times as fast ours is."""
+    """Format medians in Markdown; the ratio says how many times as fast ours is."""
     ours = {(one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours"}
     lines = ["| agent | task | who | frames/s | ours is | frames to 90 % | seconds to 90 % |", "|---" * 7 + "|"]
     for one in measured:
@@ -164,7 +163,7 @@ def table(measured: list[Contender]) -> str:
 
 
 def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
-    """Median frames and seconds, where most seeds solved the task; else how many did."""
+    """Return median frames and seconds if most seeds solved the task, else how many did."""
     times = sorted(one for one in found if one is not None)
     if len(times) * 2 <= len(found):
         return (f"{len(times)} of {len(found)} seeds", "") if found else ("", "")

@@ -83,11 +83,6 @@ NOT_IN_KERNEL: dict[str, str] = {}
 """Rewards of ours that the C kernel does not know, and why."""
 
 NOT_YET: dict[str, list[str]] = {
-    "by name": [
-        "baselines.__main__: baselines.",
-        "baselines.benchmark: ?",
-        "baselines.methods.__main__: ?",
-    ],
     "imports without a reason": [
         "ctgraph_rl.run",
     ],

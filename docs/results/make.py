@@ -71,9 +71,9 @@ def cell(lines: Raw, column: str) -> str:
 
 def by_goal(raw: Raw, configuration: str) -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
-    from baselines.__main__ import agents
+    from baselines.catalogue import catalogue
 
-    kinds = dict(agents())
+    kinds = {agent.name: agent.kind for agent in catalogue("agent")}
     of = groups([line for line in raw if line["configuration"] == configuration], "agent", "task")
     goals = sorted({goal for _, goal in of})
     names = [name for name in kinds if any(agent == name for agent, _ in of)]

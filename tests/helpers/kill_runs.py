@@ -31,7 +31,9 @@ REPLAY = ["agent.num_updates=2", "agent.batch_size=16", "agent.buffer_size=512"]
 TRIALS = ["curriculum=nm_uniform_goals", "curriculum.num_frames=2048", "evaluation.num_episodes=8"]
 TRIALS += ["evaluation.episodes_per_row=4", "evaluation.every=1024"]
 
-RUNS: dict[str, list[str]] = {
+CONF = Path(__file__).resolve().parents[2] / "conf" / "agent"
+
+RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") if "_target_" in path.read_text()} | {
     "a2c": [*BLOCKS, "protocol.boundaries=hidden"],
     "dqn": [*BLOCKS, *REPLAY, "agent.priority_alpha=0.6"],
     "drqn": [*BLOCKS, *REPLAY],

@@ -10,6 +10,9 @@ import torch
 from omegaconf import OmegaConf
 from torchrl.envs.utils import ExplorationType
 
+from baselines.catalogue import catalogue
+from baselines.policy_gradient import PolicyGradient
+from baselines.q_learning import QLearner
 from ctgraph_rl import CTGraph, CTGraphEnv, OneHot, Task
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import conf_dir
@@ -20,7 +23,13 @@ YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "age
 
 AGENTS = [name for name in YAML if "_target_" in YAML[name]]  # others only change some values of one of these
 
-LESS = {"dqn": ["agent.batch_size=32"], "drqn": ["agent.batch_size=4"], "qrdqn_lstm": ["agent.batch_size=4"]}
+KINDS = {agent.name: agent.kind for agent in catalogue("agent")}
+
+Q_LEARNERS = tuple(name for name, kind in KINDS.items() if issubclass(kind, QLearner))
+POLICY_GRADIENTS = tuple(name for name, kind in KINDS.items() if issubclass(kind, PolicyGradient))
+RECURRENT = tuple(name for name, kind in KINDS.items() if kind.memory)
+
+LESS = {name: [f"agent.batch_size={4 if name in RECURRENT else 32}"] for name in Q_LEARNERS}
 SMALL_AGENT = {
     name: ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", *LESS.get(name, [])] for name in YAML
 }
@@ -31,15 +40,16 @@ TWO_GOALS = replace(ONE_HOT_TASK, graph=CTGraph(2, 1), goal=(1,), goal_change=(4
 
 GREEDY, SAMPLED = ExplorationType.DETERMINISTIC, ExplorationType.RANDOM
 
-Q_LEARNERS = ("dqn", "drqn", "qrdqn_lstm")
-POLICY_GRADIENTS = ("a2c", "lstm_ppo", "ppo", "ppo_count", "reinforce", "rl2")
-RECURRENT = ("drqn", "lstm_ppo", "qrdqn_lstm", "rl2")
-
 ROWS, STEPS = 8, 4
 TINY = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size=4"]
 MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=2"]
 REPLAY = ["agent.num_updates=2", "agent.batch_size=8", "agent.buffer_size=96", "agent.target_update_interval=3"]
 """Overrides that make agents tiny: 32 frames a batch."""
+
+
+def less(name: str) -> list[str]:
+    """The last two of these, where an agent has such settings."""
+    return [*REPLAY * ("buffer_size" in YAML[name]), *MINIBATCHES * ("num_minibatches" in YAML[name])]
 
 
 def batches(agent, task: Task, count: int, seed: int = 0) -> list:
