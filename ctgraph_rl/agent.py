@@ -37,14 +37,14 @@ class Agent(Protocol):
     """
 
     def policy_for(self, task: int) -> TensorDictModuleBase:
-        """What acts in the task with an id, where the protocol tells ids; mostly `policy` itself."""
+        """Return the policy for the task with an id, where the protocol gives ids; mostly `policy` itself."""
         ...
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """The recurrent state of ``num_envs`` rows before their first observation; empty without memory.
+        """Return the recurrent state of ``num_envs`` rows before their first observation; empty without memory.
 
         Every episode starts with it, unless it has a key ``trial``: such a state lasts over episodes, and the policy
-        starts it anew itself.
+        resets it itself.
         """
         ...
 
@@ -52,7 +52,7 @@ class Agent(Protocol):
         """Called before the first batch of a block whose start is announced.
 
         Args:
-            task: the task's id, where the curriculum's protocol tells ids and the block has one task; else None.
+            task: the task's id, where the curriculum's protocol gives ids and the block has one task; else None.
         """
         ...
 
@@ -61,7 +61,7 @@ class Agent(Protocol):
         ...
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor] | TensorDictBase:
-        """The losses of a batch as scalars named ``loss_*``; their sum is what is minimised."""
+        """Return the losses of a batch as scalars named ``loss_*``; their sum is what is minimised."""
         ...
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
@@ -77,7 +77,7 @@ class Agent(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the agent needs to go on as if never stopped, as tensors and plain Python values."""
+        """Return all that a resumed run needs to continue with the same bits, as tensors and plain Python values."""
         ...
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:

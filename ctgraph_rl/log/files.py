@@ -20,10 +20,10 @@ FAILURE = "failed.txt"
 """Says why a run ended by an error."""
 
 CHECKPOINTS = "checkpoints"
-"""The folder with what an unfinished run goes on from."""
+"""The folder with the checkpoints of an unfinished run."""
 
 LOCK = ".lock"
-"""The file in a directory that says who works there."""
+"""The file in a directory that names the process that has locked it."""
 
 PART = ".part"
 """Ending of a file that is being written."""

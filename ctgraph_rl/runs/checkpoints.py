@@ -47,8 +47,8 @@ class Checkpoints:
     Args:
         folder: where they are.
         seconds: time between two checkpoints within a block.
-        strict: refuse to go on from an older checkpoint where the newest is broken, instead of warning.
-        interrupt: tells that the process was asked to stop: a checkpoint is then saved, and the process exits.
+        strict: refuse to resume from an older checkpoint where the newest is broken, instead of warning.
+        interrupt: notices that the process was asked to stop: a checkpoint is then saved, and the process exits.
     """
 
     def __init__(
@@ -97,11 +97,11 @@ class Checkpoints:
             other.unlink(missing_ok=True)
 
     def files(self) -> list[Path]:
-        """The checkpoints, newest first."""
+        """Return the checkpoints, newest first."""
         return sorted((file for file in self.folder.glob("*.pt") if file.stem.isdecimal()), key=_frames, reverse=True)
 
     def newest(self) -> State | None:
-        """The newest sound checkpoint, None without one; a broken one is warned of and left out.
+        """Return the newest sound checkpoint, None without one; warn of a broken one and skip it.
 
         Raises:
             BrokenCheckpoint: for a broken one, if ``strict``; and if there are some, but all are broken.
@@ -127,7 +127,7 @@ class Checkpoints:
 
 
 def encoded(state: State) -> bytes:
-    """The bytes of a checkpoint.
+    """Return the bytes of a checkpoint.
 
     Raises:
         ValueError: for what cannot be saved at all.
@@ -149,14 +149,14 @@ def decoded(path: Path) -> State:
         BrokenCheckpoint: if it is torn, changed, of another format, or holds more than tensors and plain values.
     """
     head, _, content = path.read_bytes().partition(b"\n")
-    advice = "delete it to go on from the one before"
+    advice = "delete it to resume from the one before"
     try:
         header = json.loads(head)
         version, expected = header["format"], (header["bytes"], header["sha256"])
     except (ValueError, KeyError, TypeError, RecursionError):
         raise BrokenCheckpoint(f"{path} is no checkpoint, or torn; {advice}") from None
     if version != FORMAT:
-        raise BrokenCheckpoint(f"{path} has format {version}, this version reads {FORMAT}; overwrite=true starts anew")
+        raise BrokenCheckpoint(f"{path} has format {version}, this version reads {FORMAT}; overwrite=true starts again")
     if (len(content), _digest(content)) != expected:
         raise BrokenCheckpoint(f"{path} is not what was written: {len(content)} of {expected[0]} bytes; {advice}")
     try:
@@ -169,7 +169,7 @@ def decoded(path: Path) -> State:
 
 
 def read_plain(content: bytes) -> Any:
-    """What `torch.save` made of tensors and plain values, on the CPU; nothing else is made of it, and no code runs.
+    """Read what `torch.save` made of tensors and plain values, on the CPU; nothing else is built, and no code runs.
 
     Raises:
         ValueError: for anything else.

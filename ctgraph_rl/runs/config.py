@@ -72,7 +72,7 @@ def check_one_cell() -> None:
     shown = " ".join(f"{key}={value}" for key, value in swept.items())
     require(
         (not swept, f"this configuration is a sweep, {shown}: add -m to run it, or give one value of each"),
-        (not chosen.sweeper.get("status"), "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+        (not chosen.sweeper.get("status"), "hydra.sweeper.status=true lists a sweep's cells: add -m"),
     )
 
 

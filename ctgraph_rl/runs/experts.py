@@ -20,15 +20,15 @@ from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
 from ctgraph_rl.tasks.task import Task
 
 Learn = Callable[[Curriculum, Path], None]
-"""Runs the learning of a curriculum into a directory, or goes on with what was begun there."""
+"""Learns a curriculum into a directory, or resumes what was begun there."""
 
 
 EXPERT = "single-task expert"
-"""What their curricula are called."""
+"""The name of their curricula."""
 
 
 class Expert(NamedTuple):
-    """Who learned a task alone."""
+    """An agent that learned one task alone."""
 
     task: int  # position in the curriculum's tasks, from 1
     fingerprint: str  # of the single-task curriculum
@@ -53,16 +53,18 @@ def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
     """
     block = next(block for block in curriculum.blocks if task in block.tasks)
     alone = set(block.tasks) == {task}
-    require((alone, "experts need blocks of one task each: the frames of one task cannot be told from the others'"))
-    told = curriculum.protocol
-    if told.task_id != "hidden":
-        length = told.length(len(curriculum.tasks)) if told.task_id == "one_hot" else None
-        told = Protocol(told.task_id, num_task_ids=length, task_ids=(curriculum.task_ids[task],))
+    require(
+        (alone, "experts need blocks of one task each: the frames of one task cannot be separated from the others'")
+    )
+    how = curriculum.protocol
+    if how.task_id != "hidden":
+        length = how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else None
+        how = Protocol(how.task_id, num_task_ids=length, task_ids=(curriculum.task_ids[task],))
     else:
-        told = Protocol()
+        how = Protocol()
     evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
     blocks = (Block((task,), block.num_frames),)
-    return Curriculum(EXPERT, 1, "-", blocks, evaluation=evaluation, protocol=told)
+    return Curriculum(EXPERT, 1, "-", blocks, evaluation=evaluation, protocol=how)
 
 
 def find_or_train(
@@ -73,11 +75,11 @@ def find_or_train(
     tell: Callable[[str], object],
     waiting: Callable[[], object] = lambda: None,
 ) -> list[Expert]:
-    """The experts of all tasks of a curriculum; those that the folder lacks are trained first.
+    """Return the experts of all tasks of a curriculum; those that the folder lacks are trained first.
 
     Args:
-        curriculum: whose tasks.
-        learn: trains one, or goes on training it.
+        curriculum: has the tasks.
+        learn: trains one, or resumes its training.
         folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
         settings: all else that an expert's numbers depend on: agent, seed, versions.
         tell: is given a line about each expert.
@@ -101,7 +103,7 @@ def find_or_train(
 
 
 def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callable[[], object]) -> None:
-    """Train into the directory, alone; go on with what was begun there, wait for a process that is at it."""
+    """Train into the directory, or resume what was begun there; wait while another process trains into it."""
     run_dir.mkdir(parents=True, exist_ok=True)
     with locked(run_dir, waiting):
         if not _is_trained(run_dir):

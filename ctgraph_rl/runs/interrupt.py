@@ -28,7 +28,7 @@ class Interrupt:
 
     @property
     def is_asked(self) -> bool:
-        """Whether the process was asked to stop."""
+        """True once the process was asked to stop."""
         return self.signal is not None
 
     def __enter__(self) -> Interrupt:
@@ -52,7 +52,7 @@ class Interrupt:
     def exit(self) -> None:
         """Leave the process with the code of the signal, or let the scheduler's library put it into the queue again."""
         assert self.signal is not None
-        print("saved, the same command goes on from there", file=sys.stderr)
+        print("saved; the same command resumes from there", file=sys.stderr)
         requeue = self._before.get(_requeuing())
         self._restore()
         if callable(requeue) and not _is_being_ended():
@@ -72,13 +72,13 @@ class Interrupt:
 
 
 def _acts(number: int) -> bool:
-    """Whether a signal would stop the process, or put its job into the queue again."""
+    """Return whether a signal would stop the process, or put its job into the queue again."""
     before = signal.getsignal(number)
     return callable(before) if number == _requeuing() else before not in (signal.SIG_IGN, None)
 
 
 def _is_being_ended() -> bool:
-    """Whether SLURM ends this process's job already: for good, as by ``scancel``, which a requeue would undo."""
+    """Return whether SLURM already ends this process's job: for good, as by ``scancel``, which a requeue would undo."""
     command = ["scontrol", "show", "job", os.environ.get("SLURM_JOB_ID", "")]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
@@ -88,5 +88,5 @@ def _is_being_ended() -> bool:
 
 
 def _requeuing() -> int:
-    """The signal by which submitit's jobs are put into the queue again; 0 where there is none."""
+    """Return the signal by which submitit's jobs are put into the queue again; 0 where there is none."""
     return getattr(signal, "SIGUSR2", 0)

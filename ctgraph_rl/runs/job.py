@@ -16,6 +16,7 @@ from rich.console import Console
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
+from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import versions
 from ctgraph_rl.log.run_log import RunLog
@@ -27,6 +28,8 @@ from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import RESULTS, MakeAgent, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
+
+KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads")
 """Settings that a single-task expert shares with the run that needs it."""
@@ -141,6 +144,9 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
     if cfg.experts and not job.curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
+    slow = sorted({type(task.reward_fn).__name__ for task in job.curriculum.tasks} - KERNEL_NAMES)
+    if slow:
+        print(f"note: the C kernel does not know {', '.join(slow)}: steps take the tensor engine, which is slower")
     job.learn(run_dir)
 
 

@@ -26,12 +26,12 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
 
 OURS = {"agent": re.compile(r"(baselines\.\w+)\.(\w+)"), "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)")}
-"""Names of agents and methods that a directory may name; others are named by who loads it."""
+"""Names of agents and methods that a directory may name; the caller of `load` gives any other."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What a run left.
+    """The agent that a run trained, and what it learned.
 
     ``evaluate(trained.policy_for(task), [task], initial_state=trained.agent.initial_state,
     curriculum=trained.curriculum)`` of this package plays a task, ``learn_curriculum(another, trained.agent)`` lets the
@@ -45,7 +45,7 @@ class Trained:
     log: RunLog
 
     def policy_for(self, task: Task) -> TensorDictModuleBase:
-        """What acts in a task: by its id, where the curriculum has one and tells it."""
+        """Return the policy for a task: the one for its id, where the curriculum has one and shows it."""
         number = None if self.curriculum.protocol.task_id == "hidden" else self.curriculum.task_ids.get(task)
         return self.agent.policy if number is None else self.agent.policy_for(number)
 
@@ -57,7 +57,7 @@ def load(
     device: torch.device | str = "cpu",
     make_method: Callable[[], Method] | None = None,
 ) -> Trained:
-    """The trained agent of a run, finished or not, with its method and all that it needs to play on or learn on.
+    """Load the trained agent of a run, finished or not, with its method and all that it needs to play or to learn on.
 
     Args:
         run_dir: the directory.
@@ -93,7 +93,7 @@ def load(
 
 
 def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Curriculum:
-    """The run's curriculum, from its directory if it is not given."""
+    """Return the run's curriculum, from its directory if it is not given."""
     path = run_dir / CURRICULUM
     there = given is not None or path.exists()
     require((there, f"{run_dir} has no {CURRICULUM}, as of classes that are not ours: give load(..., curriculum=)"))
@@ -110,7 +110,7 @@ def _builder(
     make_method: Callable[[], Method] | None,
     curriculum: Curriculum,
 ) -> MakeAgent:
-    """Builds the agent with its method, if it has one; the curriculum is already prepared for that."""
+    """Return what builds the agent with its method, if it has one; the curriculum is already prepared for that."""
     alone = _ours(run_dir, "agent", config.get("agent")) if make_agent is None else make_agent
     if make_method is None and config.get("method") is not None:
         make_method = _ours(run_dir, "method", config["method"])
@@ -120,7 +120,7 @@ def _builder(
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
-    """Builds the agent or method that a configuration names; only classes that are defined in ``baselines`` are."""
+    """Return what builds the agent or method that a configuration names, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
     ours = OURS[part].fullmatch(name)
@@ -136,7 +136,7 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
-    """The agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
+    """Return the agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
     if (run_dir / AGENT).exists():
         return _checked(run_dir / AGENT), log.ends()[-1]
     saved = Checkpoints(run_dir / CHECKPOINTS).newest()
@@ -147,7 +147,7 @@ def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
 
 
 def _checked(path: Path) -> Any:
-    """What a file of `torch.save` holds, if its own sums agree and it is plain."""
+    """Return what a file of `torch.save` holds, if its own sums agree and it is plain."""
     content = path.read_bytes()
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as records:

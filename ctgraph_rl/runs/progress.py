@@ -20,7 +20,7 @@ class ProgressBar:
         num_blocks: blocks of the run.
         num_frames: frames of the run.
         console: where it shows; default: standard error.
-        done: frames that were learned before, by a run that goes on.
+        done: frames that were learned before the run was resumed.
     """
 
     def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
@@ -46,8 +46,8 @@ class ProgressBar:
 
     @property
     def beginning(self) -> str:
-        """What is said before the first batch."""
-        return f"goes on after {_short(self.done)} frames" if self.done else "evaluating before training"
+        """The text before the first batch."""
+        return f"resumed after {_short(self.done)} frames" if self.done else "evaluating before training"
 
     def update(self, block: int, frames: int, episode_return: float) -> None:
         """See `ctgraph_rl.learn.lifelong.Progress`."""

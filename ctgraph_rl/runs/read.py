@@ -1,6 +1,6 @@
 """Run directories as data: each log is read once, and only what tables and figures need is kept of it.
 
-Runs of one configuration but for the seed belong together; one that names no agent stands alone, under its directory.
+Runs of one configuration but for the seed belong together; one that names no agent is shown alone, under its directory.
 A directory that cannot be read is a `Problem` with its reason, and never a number.
 """
 
@@ -21,23 +21,23 @@ from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
 
 MODIFIED = " (modified)"
-"""What the name of a curriculum ends with that is not what is published under the name."""
+"""Ending of the name of a curriculum that differs from the published one of this name."""
 
 OF_THE_CURRICULUM = ("curriculum", "evaluation", "protocol")
 """Settings that a curriculum's fingerprint covers."""
 
 ABOUT = ("curriculum", "fingerprint", "config")
-"""What the first line of a log must have."""
+"""Keys that the first line of a log must have."""
 
 NO_METHOD = "Finetune"
-"""The method of a run whose agent is as it is; such a run is one of a configuration without a method."""
+"""The method that changes nothing: a run with it and one without a method have the same configuration."""
 
 Curve = list[tuple[int, float]]
 """Mean returns after numbers of frames; NaN for one without a value."""
 
 
 class History(NamedTuple):
-    """What happened in a run, of the curriculum's own tasks."""
+    """The measurements of a run, of the curriculum's own tasks."""
 
     labels: tuple[str, ...]  # name of each task
     trained: tuple[tuple[int, ...], ...]  # for each block the positions of its tasks; empty if the log does not say
@@ -50,12 +50,12 @@ class History(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What a run directory says.
+    """A run directory as data.
 
     Args:
         path: the directory.
         about: the first line of its log.
-        agent: class or name of who learned, ``PPO + EWC`` with a method; None if the configuration does not say.
+        agent: class or name of the learner, ``PPO + EWC`` with a method; None if the configuration does not say.
         settings: the configuration without the seed and what the fingerprint covers, by dotted keys; the directory
             with them if there is no agent.
         seed: the seed.
@@ -92,7 +92,7 @@ class Run:
 
     @property
     def configuration(self) -> tuple[tuple[str, str], str]:
-        """What runs have in common that differ in their seed alone."""
+        """Equal for runs that differ in their seed alone."""
         return self.group, json.dumps(self.settings, sort_keys=True)
 
 
@@ -170,7 +170,7 @@ def read_run(path: Path) -> Run:
 
 
 def _about(file: Path) -> dict[str, Any]:
-    """The first line of a log: what was run."""
+    """Return the first line of a log, which says what was run."""
     with file.open("rb") as lines:
         first = lines.readline()
     try:
@@ -192,21 +192,21 @@ def _about(file: Path) -> dict[str, Any]:
 
 
 def _agent(config: Mapping[str, Any]) -> str | None:
-    """The agent and its method, each by its class or by the name that whoever recorded the run gave."""
+    """Return the agent and its method, each by its class or by the name that the recorder of the run gave."""
     agent = _called(config.get("agent")) or _called(config.get("learner"))
     method = _called(config.get("method"))
     return f"{agent} + {method}" if agent and method else agent
 
 
 def _called(part: Any) -> str | None:
-    """The class that a part of a configuration builds, or the part itself if it is a name."""
+    """Return the class that a part of a configuration builds, or the part itself if it is a name."""
     if isinstance(part, Mapping) and "_target_" in part:
         return str(part["_target_"]).rpartition(".")[2]
     return part if isinstance(part, str) and part else None
 
 
 def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
-    """The metrics of a finished run, or why there are none."""
+    """Return the metrics of a finished run, or why there are none."""
     file = path / METRICS
     if not file.exists():
         torn = ", with a torn last line" if log.torn_lines else ""
@@ -228,7 +228,7 @@ def _failure(path: Path) -> str | None:
 
 
 def _is_metric(metric: Any) -> bool:
-    """Whether it has what tables show of a metric."""
+    """Return whether it has the fields that tables show of a metric."""
     value = metric.get("value") if isinstance(metric, dict) else ""
     return (value is None or is_real(value)) and {"value", "definition", "undefined"} <= metric.keys()
 

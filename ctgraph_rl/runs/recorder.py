@@ -98,13 +98,13 @@ class Recorder:
     ) -> dict[str, float]:
         """Evaluate after ``frames`` frames of the run, on the tasks and in the way that the protocol says.
 
-        The ends of blocks must be told exactly, and are rows of the performance matrix; any other number of frames in
-        between is logged as an evaluation during a block.
+        Evaluations after exactly the frames at the end of a block are rows of the performance matrix. Any other number of
+        frames in between is logged as an evaluation during a block.
 
         Args:
-            policy: who plays; see the class.
+            policy: what plays; see the class.
             frames: frames learned from so far, more than at the last evaluation.
-            policy_for: instead of ``policy``, where the protocol tells task ids: the policy for an id.
+            policy_for: instead of ``policy``, where the protocol gives task ids: the policy for an id.
 
         Returns:
             The mean return on each task, by label.
@@ -174,14 +174,14 @@ class Recorder:
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
         greedy = self.curriculum.evaluation.greedy
-        ids, told = self.curriculum.task_ids, self.curriculum.protocol.task_id
+        ids, shown = self.curriculum.task_ids, self.curriculum.protocol.task_id
         if policy_for is None:
-            return adapt(policy, greedy, told == "one_hot")
-        require((told != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
+            return adapt(policy, greedy, shown == "one_hot")
+        require((shown != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
         unknown = [task for task in self._evaluator.tasks_at(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
         return by_slices(
-            [adapt(policy_for(ids[task]), greedy, told == "one_hot") for task in self._evaluator.tasks_at(frames)]
+            [adapt(policy_for(ids[task]), greedy, shown == "one_hot") for task in self._evaluator.tasks_at(frames)]
         )
 
 
@@ -199,7 +199,7 @@ def _number(value: Any) -> Any:
 
 
 def _last(measurements: list[dict[str, Any]], frames: int) -> Iterable[dict[str, Any]]:
-    """The measurements after ``frames`` frames, which are the last ones, in order."""
+    """Return the measurements after ``frames`` frames, which are the last ones, in order."""
     return reversed(list(takewhile(lambda m: m["frames"] == frames, reversed(measurements))))
 
 

@@ -25,7 +25,7 @@ from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.run_log import RunLog
 
 FOLDER = "tracker"
-"""Where trackers write, in the run's directory."""
+"""The folder in the run's directory that trackers write into."""
 
 MODES = ("offline", "online")
 """Of W&B."""
@@ -49,8 +49,8 @@ class Tracker:
 
     Args:
         make_logger: builds the logger, of a folder that is there and empty.
-        run_dir: the run's directory, in which the folder is made anew, as a resumed run sends all it measured again.
-        hyperparameters: what the logger is told of the configuration.
+        run_dir: the run's directory, in which the folder is replaced, as a resumed run sends all measurements again.
+        hyperparameters: the settings that the logger records.
 
     Raises:
         ModuleNotFoundError: if the logger's package is missing; names the extra to install.
@@ -100,11 +100,11 @@ class Tracker:
 
     def _give_up(self, error: Exception) -> None:
         self._logger = None
-        warnings.warn(f"{self.name} failed, the run goes on without it: {error}", stacklevel=3)
+        warnings.warn(f"{self.name} failed, the run continues without it: {error}", stacklevel=3)
 
 
 def scalars(measurement: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of a measurement of training or evaluation, named as ``train/return_mean``; none of another.
+    """Return the numbers of a measurement of training or evaluation, named as ``train/return_mean``; none of another.
 
     Those of a task have its label in the name, with ``_`` for what is no letter, digit or hyphen: W&B takes what is
     before a dot for another group, and MLflow and TensorBoard take no ``#``.

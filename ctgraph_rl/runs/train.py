@@ -42,10 +42,10 @@ MEMBERS = (
     "to",
     "state_dict",
 )
-"""What a run needs of an agent."""
+"""Members that a run needs of an agent."""
 
 RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
-"""What a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
+"""Files that a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
 ``curriculum.json`` where the curriculum has only parts of this package's classes."""
 
 RESTARTS = "restarts.jsonl"
@@ -177,7 +177,7 @@ def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: 
     require((before.get("fingerprint") == about["fingerprint"], changed))
     other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
     message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
-    require((not (strict and other), f"{message}; resume=warn goes on"))
+    require((not (strict and other), f"{message}; resume=warn resumes it all the same"))
     if other:
         warnings.warn(message, stacklevel=2)
     log = RunLog.resume(path, saved["log"])

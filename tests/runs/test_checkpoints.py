@@ -95,7 +95,7 @@ def test_what_is_no_checkpoint_is_refused(tmp_path, content):
     file = tmp_path / "000000000064.pt"
     file.write_bytes(content)
 
-    with pytest.raises(BrokenCheckpoint, match="is no checkpoint, or torn; delete it to go on from the one before"):
+    with pytest.raises(BrokenCheckpoint, match="is no checkpoint, or torn; delete it to resume from the one before"):
         decoded(file)
 
 
@@ -103,7 +103,7 @@ def test_another_format_is_refused_with_both_numbers(tmp_path):
     file = tmp_path / "000000000064.pt"
     file.write_bytes(with_header(b"", format=2))
 
-    with pytest.raises(BrokenCheckpoint, match="has format 2, this version reads 1; overwrite=true starts anew"):
+    with pytest.raises(BrokenCheckpoint, match="has format 2, this version reads 1; overwrite=true starts again"):
         decoded(file)
 
 

@@ -47,7 +47,7 @@ def test_a_signal_saves_after_the_update_and_exits_with_its_code_and_one_line(tm
     assert end.value.code == code
     assert saved == [0, 5]
     name = signal.Signals(number).name
-    line = f"\n{name}: saving after this update ... saved, the same command goes on from there\n"
+    line = f"\n{name}: saving after this update ... saved; the same command resumes from there\n"
     assert capsys.readouterr().err == line
 
 

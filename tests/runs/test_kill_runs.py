@@ -56,7 +56,7 @@ def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, monkeyp
 
     assert process.wait(60) == code
     assert process.stderr is not None
-    line = f"{name}: saving after this update ... saved, the same command goes on from there"
+    line = f"{name}: saving after this update ... saved; the same command resumes from there"
     assert line in process.stderr.read().splitlines()
     assert not (run_dir / "metrics.json").exists() and not (run_dir / ".lock").exists()
 

@@ -80,6 +80,6 @@ def test_a_run_that_goes_on_says_so_at_once(terminal):
         pass
 
     said = console.file.getvalue()
-    assert "goes on after 2.5k frames" in said
+    assert "resumed after 2.5k frames" in said
     assert bar._bar.tasks[0].completed == 2_500
     assert "evaluating before training" not in said

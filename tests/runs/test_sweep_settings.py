@@ -77,7 +77,7 @@ def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anyt
             ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(5): add -m",
         ),
         (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(5): add -m"),
-        (["hydra.sweeper.status=true"], "hydra.sweeper.status=true tells of a sweep's cells: add -m"),
+        (["hydra.sweeper.status=true"], "hydra.sweeper.status=true lists a sweep's cells: add -m"),
     ],
 )
 def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, capsys):

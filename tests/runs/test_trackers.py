@@ -176,7 +176,7 @@ def test_a_tracker_that_fails_warns_once_gets_no_more_and_the_log_is_whole(metho
                 log.append("training", block=1, frames=frames, loss_value=0.5)
     log.close()
 
-    assert [str(w.message) for w in caught] == ["memory failed, the run goes on without it: the server is down"]
+    assert [str(w.message) for w in caught] == ["memory failed, the run continues without it: the server is down"]
     everything = ["log_hparams", "log_metrics", "log_metrics", "log_metrics", "close"]
     assert [name for name, *_ in logger.sent] == everything[:num_sent]
     assert [m["frames"] for m in RunLog.read(tmp_path / "run.jsonl").measurements] == [8, 16, 24]
@@ -186,7 +186,7 @@ def test_a_tracker_that_cannot_start_is_a_warning_too(tmp_path):
     def unreachable(folder):
         raise ConnectionError("no route to host")
 
-    with pytest.warns(UserWarning, match="unreachable failed, the run goes on without it: no route to host"):
+    with pytest.warns(UserWarning, match="unreachable failed, the run continues without it: no route to host"):
         tracker = Tracker(unreachable, tmp_path, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
