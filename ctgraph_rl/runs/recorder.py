@@ -98,8 +98,8 @@ class Recorder:
     ) -> dict[str, float]:
         """Evaluate after ``frames`` frames of the run, on the tasks and in the way that the protocol says.
 
-        Evaluations after exactly the frames at the end of a block are rows of the performance matrix. Any other number of
-        frames in between is logged as an evaluation during a block.
+        Evaluations after exactly the frames at the end of a block are rows of the performance matrix. Any other one is
+        logged as an evaluation during a block.
 
         Args:
             policy: what plays; see the class.
