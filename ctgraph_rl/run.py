@@ -34,8 +34,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
-    from ctgraph_rl.report.style import require_packages  # here, as are those below: torch costs seconds, and ...
-    from ctgraph_rl.runs.job import run_job  # ... --help and a wrong setting need none of it
+    from ctgraph_rl.report.style import require_packages  # here: --help and a wrong setting need no torch
+    from ctgraph_rl.runs.job import run_job  # here: as above
 
     if cfg.report:
         require_packages()
@@ -46,8 +46,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
 
 def show(run_dir: Path, report: bool) -> None:
     """Print the results of a finished run, and make its report or say how."""
-    from ctgraph_rl.report.page import write_report
-    from ctgraph_rl.report.terminal import print_summary
+    from ctgraph_rl.report.page import write_report  # here: --help and a wrong setting need no torch
+    from ctgraph_rl.report.terminal import print_summary  # here: as above
 
     print_summary(run_dir)
     here = Path.cwd()
