@@ -27,7 +27,7 @@ class A2C(PolicyGradient):
             paper's returns of up to ``num_steps`` steps.
     """
 
-    solves = "what one observation tells: fully observable tasks (CT-FO)"
+    solves = "fully observable tasks (CT-FO)"
 
     def __init__(
         self,

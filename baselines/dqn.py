@@ -39,7 +39,7 @@ class DQN(QLearner):
             same after every decision, so nothing is learned about decisions: ``n_steps`` helps.
     """
 
-    solves = "what one observation tells: fully observable tasks (CT-FO)"
+    solves = "fully observable tasks (CT-FO)"
 
     def __init__(
         self,

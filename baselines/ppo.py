@@ -30,7 +30,7 @@ class PPO(PolicyGradient):
         settings: the arguments of `PolicyGradient`.
     """
 
-    solves = "what one observation tells: fully observable tasks (CT-FO)"
+    solves = "fully observable tasks (CT-FO)"
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from baselines.policy_gradient import PolicyGradient, critic_loss
 class Reinforce(PolicyGradient):
     """REINFORCE for tasks that need no memory; the arguments are those of `PolicyGradient`."""
 
-    solves = "what one observation tells: fully observable tasks (CT-FO)"
+    solves = "fully observable tasks (CT-FO)"
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
         """Compute the losses of policy and baseline, as TorchRL's `ReinforceLoss` does."""

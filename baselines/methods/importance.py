@@ -30,7 +30,7 @@ class Importance(Method):
     Args:
         coeff: weight of the penalty.
         heads: ``single``: all tasks share the output layers, whose weights are held, too; ``multi``: each task has its
-            own, which are not held; ``auto``: multi where the protocol tells task ids and each block has one task,
+            own, which are not held; ``auto``: multi where the protocol gives task ids and each block has one task,
             else single.
     """
 

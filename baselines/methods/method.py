@@ -58,7 +58,7 @@ class Method(Hooks):
             ),
             (
                 not self.needs_boundaries or protocol.boundaries == "announced",
-                f"{name} needs to be told when the task changes: set protocol.boundaries=announced",
+                f"{name} needs announced task changes: set protocol.boundaries=announced",
             ),
             (
                 not (self.needs_task_id and several),
@@ -93,7 +93,7 @@ class Method(Hooks):
         self.weights = weights
 
     def start_task(self, task: int | None) -> None:
-        """Called at the start of a task, with its id where the protocol tells ids."""
+        """Called at the start of a task, with its id if the protocol gives ids."""
 
     def end_task(self) -> None:
         """Called at the end of a task."""
@@ -137,7 +137,9 @@ class TaskMethod(Method):
         """Select the task's slot."""
         name = type(self).__name__
         if task is None:
-            raise ValueError(f"{name} needs the id of the task that begins: blocks of one task, with ids that are told")
+            raise ValueError(
+                f"{name} needs the id of the task that starts: blocks of one task, and ids that are not hidden"
+            )
         if task not in self.started:
             message = f"there is room for {self.num_tasks} tasks, got another, {task}"
             require((len(self.started) < self.num_tasks, message))

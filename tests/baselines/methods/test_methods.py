@@ -109,9 +109,7 @@ def test_output_layers_of_each_task_need_task_ids_and_shared_ones_do_not(compose
 def test_hidden_boundaries_are_refused_where_they_are_needed(compose, method):
     curriculum = of(*BLOCKS, boundaries="hidden", task_id="one_hot")
 
-    with pytest.raises(
-        ValueError, match=r" needs to be told when the task changes: set protocol\.boundaries=announced"
-    ):
+    with pytest.raises(ValueError, match=r" needs announced task changes: set protocol\.boundaries=announced"):
         prepared(compose, method, curriculum)
 
 
