@@ -6,7 +6,7 @@ import re
 
 import hydra
 import pytest
-from helpers.small_agents import AGENTS, POLICY_GRADIENTS, Q_LEARNERS, RECURRENT, YAML
+from helpers.small_agents import AGENTS, YAML
 
 from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1
@@ -73,16 +73,8 @@ OF_ONE = {
 
 def bad_values(name: str) -> list[tuple[str, str]]:
     """Overrides that an agent refuses, with the messages."""
-    groups = [
-        (EVERY, True),
-        (OF_POLICY_GRADIENTS, name in POLICY_GRADIENTS),
-        (OF_ACTOR_CRITICS, name in POLICY_GRADIENTS and name != "reinforce"),
-        (OF_PPO, name in POLICY_GRADIENTS and name not in ("reinforce", "a2c")),
-        (OF_Q_LEARNERS, name in Q_LEARNERS),
-        (OF_COMPILED, name not in RECURRENT),
-        (OF_ONE.get(name, []), True),
-    ]
-    return [bad for group, applies in groups if applies for bad in group]
+    shared = (*EVERY, *OF_POLICY_GRADIENTS, *OF_ACTOR_CRITICS, *OF_PPO, *OF_COMPILED, *OF_Q_LEARNERS)
+    return [bad for bad in shared if bad[0].split("=")[0] in YAML[name]] + OF_ONE.get(name, [])
 
 
 def refusal(name: str, override: str) -> str:
