@@ -13,7 +13,7 @@ from helpers.oracles import WAIT, act, confounding, is_uniform, one_hot, optimal
 from helpers.task_families import SWITCHED, VECTORS, calls, read, seen
 from torch import Tensor
 
-from ctgraph_rl import CTGraphEnv
+from ctgraph_rl import CTGraphEnv, Steps, rollout
 from ctgraph_rl.batch.draw_ahead import MAX_WORDS
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core import dynamics
@@ -137,6 +137,18 @@ def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
 
     play(cloned, alike, calls(40, 6, seed=1))
     play(rows, twin, calls(40, 6, seed=2))
+
+
+@every_engine
+def test_steps_that_are_taken_elsewhere_move_the_draws_too(kernel):
+    rows, twin = (tensor_rows(TASKS * 5, seed=3) for _ in range(2))
+    play(rows, twin, calls(20, 30))
+    waits = torch.zeros(300, 30, dtype=torch.int64)
+
+    for first in (("step", (waits[0],)), ("restart", (torch.arange(30) < 15,))):
+        for one in (rows, twin):
+            rollout(one, waits, Steps.empty(one, 300), kernel=kernel)
+        play(rows, twin, [first, *[("step", (waits[0],))] * 3])
 
 
 def test_a_step_that_was_refused_changes_nothing():
