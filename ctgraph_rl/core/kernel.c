@@ -1,6 +1,6 @@
 /* Steps of many rows in one pass: what `dynamics` computes with tensors, bit for bit; and two of its parts alone.
 
-   `library` compiles this file. `native` packs the parameters, checks the arguments and calls `ctgraph_run`. Rows are
+   `kernel.py` compiles this file. `native` packs the parameters, checks the arguments and calls `ctgraph_run`. Rows are
    run in blocks: the state of a block stays in the cache through all steps, and the draws of its rows are made in loops
    that compilers vectorize. Every row is computed alone, so blocks and threads do not change its bits. Nothing is written
    beyond the arrays of a call whatever their values, and nothing read beyond the tables: states that no task can have
@@ -42,7 +42,7 @@ typedef struct {
     int64_t num_tasks, bank_rows, num_pixels, width, is_vector, num_levels;
     int64_t draws, pixel_noise, noise_bank, reward_noise, fail_reward, step_reward, goal_change;
     int64_t own_seeds; /* a seed for each row, else one for all */
-    int64_t restarts;  /* rows that a step finishes start anew within it */
+    int64_t restarts;  /* rows that a step finishes start an episode within it */
     const Task *tasks;
     const int64_t *task, *seed, *row;
     const uint8_t *bank, *noises;

@@ -1,4 +1,4 @@
-"""The C code of the package, `kernel.c`, as a library, and the functions of it that work on tensors.
+"""The C code of the package, `kernel.c`, as a library, and its functions that work on tensors.
 
 It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. What
 the functions give are the bits of the tensor code, so it does not matter which of the two has run.

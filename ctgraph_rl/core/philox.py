@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core import kernel
 
 _WORD = 0xFFFFFFFF
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
@@ -33,7 +33,7 @@ def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Te
     Returns:
         Four int64 tensors with values in [0, 2**32).
     """
-    return library.philox((*counter, *key)) if library.takes(*counter, *key) else by_tensors(counter, key)
+    return kernel.philox((*counter, *key)) if kernel.takes(*counter, *key) else by_tensors(counter, key)
 
 
 def by_tensors(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:

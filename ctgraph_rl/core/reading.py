@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ctgraph_rl.core import kernel as library
+from ctgraph_rl.core import kernel
 from ctgraph_rl.core.philox import STREAM_NOISE, draw, splitmix64
 
 
@@ -35,7 +35,7 @@ _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
 def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     given = images, start, read_noise
     fits = images.dtype == torch.uint8 and start.shape == read_noise.shape == images.shape[:1]
-    return library.add_noise(*given) if fits and library.takes(*given) else by_parts(*given)
+    return kernel.add_noise(*given) if fits and kernel.takes(*given) else by_parts(*given)
 
 
 def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
