@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.images import PaperImages as PaperImages
     from ctgraph_rl.tasks.images import ReferenceImages as ReferenceImages
     from ctgraph_rl.tasks.images import ReferenceOneHot as ReferenceOneHot
-    from ctgraph_rl.tasks.images import count_repeats as count_repeats
-    from ctgraph_rl.tasks.images import distances as distances
+    from ctgraph_rl.tasks.images.measures import count_repeats as count_repeats
+    from ctgraph_rl.tasks.images.measures import distances as distances
     from ctgraph_rl.tasks.observations import Observations as Observations
     from ctgraph_rl.tasks.protocol import Block as Block
     from ctgraph_rl.tasks.protocol import Evaluation as Evaluation
@@ -43,38 +43,26 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "Agent": "agent",
-    "Block": "tasks.protocol",
-    "CTGraph": "core.graph",
-    "CTGraphEnv": "env",
-    "Curriculum": "tasks.curriculum",
-    "Evaluation": "tasks.protocol",
-    "GroupedImages": "tasks.images",
-    "ImageFile": "tasks.images",
-    "Gradient": "core.rewards",
-    "Needle": "core.rewards",
-    "Recorder": "runs.recorder",
-    "ReferenceImages": "tasks.images",
-    "ReferenceLinear": "core.rewards",
-    "ReferenceOneHot": "tasks.images",
-    "Observations": "tasks.observations",
-    "OneHot": "tasks.images",
-    "PaperImages": "tasks.images",
-    "Protocol": "tasks.protocol",
-    "Rows": "batch.rows",
-    "RunLog": "log.run_log",
-    "StateType": "core.graph",
-    "Steps": "batch.rollout",
-    "Task": "tasks.task",
-    "Trained": "runs.load",
-    "count_repeats": "tasks.images",
-    "distances": "tasks.images",
-    "evaluate": "learn.evaluate",
-    "learn_curriculum": "learn.lifelong",
-    "load": "runs.load",
-    "rollout": "batch.rollout",
+_EXPORTS = {
+    "agent": ("Agent",),
+    "batch.rollout": ("Steps", "rollout"),
+    "batch.rows": ("Rows",),
+    "core.graph": ("CTGraph", "StateType"),
+    "core.rewards": ("Gradient", "Needle", "ReferenceLinear"),
+    "env": ("CTGraphEnv",),
+    "learn.evaluate": ("evaluate",),
+    "learn.lifelong": ("learn_curriculum",),
+    "log.run_log": ("RunLog",),
+    "runs.load": ("Trained", "load"),
+    "runs.recorder": ("Recorder",),
+    "tasks.curriculum": ("Curriculum",),
+    "tasks.images": ("GroupedImages", "ImageFile", "OneHot", "PaperImages", "ReferenceImages", "ReferenceOneHot"),
+    "tasks.images.measures": ("count_repeats", "distances"),
+    "tasks.observations": ("Observations",),
+    "tasks.protocol": ("Block", "Evaluation", "Protocol"),
+    "tasks.task": ("Task",),
 }
+_HOMES = {name: module for module, names in _EXPORTS.items() for name in names}
 
 __all__ = [*_HOMES, "metrics"]
 

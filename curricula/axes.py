@@ -246,15 +246,10 @@ def random_tasks(
         kinds: choices of `observability`.
         image_seeds: choices of the image seed.
     """
-    choices: list[tuple[Any, ...]] = [
-        tuple(dict.fromkeys(c)) for c in (branching_factors, depths, wait_probs, kinds, image_seeds)
-    ]
-    require(
-        (
-            all(map(bool, choices)),
-            "branching_factors, depths, wait_probs, kinds and image_seeds need at least one choice each",
-        )
-    )
+    given: tuple[Sequence[Any], ...] = (branching_factors, depths, wait_probs, kinds, image_seeds)
+    choices = [tuple(dict.fromkeys(choice)) for choice in given]
+    rule = "branching_factors, depths, wait_probs, kinds and image_seeds need at least one choice each"
+    require((all(choices), rule))
     goals = sum(CTGraph(b, d).num_end_states for b, d in itertools.product(*choices[:2]))
     _check_draws("num_tasks", num_tasks, goals * prod(map(len, choices[2:])))
     source = generator(seed)

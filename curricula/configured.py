@@ -73,13 +73,10 @@ def from_axes(
     if goals == "nested":
         (task,) = axes.random_goals(task, 1, seed)
     probs = _several(task.graph.wait_prob if wait_prob is None else wait_prob)
-    by_seed = [
-        [
-            _with_goals(graph, goals, num_goals, seed)
-            for graph in axes.growing_depth(axes.wait_probs(shown, probs), depths)
-        ]
-        for shown in axes.image_seeds(task, _several(image_seeds))
-    ]
+    by_seed = []
+    for shown in axes.image_seeds(task, _several(image_seeds)):
+        graphs = axes.growing_depth(axes.wait_probs(shown, probs), depths)
+        by_seed.append([_with_goals(graph, goals, num_goals, seed) for graph in graphs])
     tasks = axes.cycle(_ordered(by_seed, order, seed), repeats)
     changes = _switch(switch, switch_episodes)
     return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
@@ -111,13 +108,10 @@ def _check_goals(goals: object, depths: tuple[int, ...]) -> None:
 
 def _with_goals(task: Task, goals: str | Sequence[Sequence[int]], num_goals: int, seed: int) -> Tasks:
     """A graph with its goals."""
+    if goals == "random":
+        return axes.random_goals(task, num_goals, seed)
     if isinstance(goals, str):
-        vary = {
-            "all": axes.all_goals,
-            "random": lambda graph: axes.random_goals(graph, num_goals, seed),
-            "nested": axes.as_tasks,
-        }
-        return vary[goals](task)
+        return axes.all_goals(task) if goals == "all" else axes.as_tasks(task)
     return axes.given_goals(task, [goal for goal in goals if len(goal) == task.graph.depth])
 
 

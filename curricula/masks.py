@@ -7,6 +7,8 @@ x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.order import sequence
@@ -72,9 +74,7 @@ def ct2_interfering(num_frames: int = 51_200) -> Curriculum:
     return _curriculum("ct2_interfering", BASELINES, "1:000 1:111", ids=(0, 7), num_ids=8, num_frames=num_frames)
 
 
-def _curriculum(
-    name: str, source: str, listing: str, ids: range | list[int] | tuple[int, ...], num_ids: int, num_frames: int
-) -> Curriculum:
+def _curriculum(name: str, source: str, listing: str, ids: Sequence[int], num_ids: int, num_frames: int) -> Curriculum:
     tasks = tuple(one_wait_image(path, seed) for seed, path in words(listing))
     return labelled(name, source, tasks, ids=ids, num_task_ids=num_ids, num_frames=num_frames)
 

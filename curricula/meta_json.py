@@ -39,11 +39,7 @@ ORDERS = ("default", "interleaved")
 LABEL_MODES = ("global_task_id", "curriculum_index", "explicit")
 
 
-def from_meta_json(
-    path: str | PathLike[str],
-    num_frames: int | Sequence[int],
-    name: str | None = None,
-) -> Curriculum:
+def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], name: str | None = None) -> Curriculum:
     """The curriculum that a meta-JSON file describes, on environments as the authors' implementation has them.
 
     The learner sees the labels as one-hot task ids; how performance is measured is our default, as the files have
@@ -68,10 +64,8 @@ def from_meta_json(
         pool = Pool([graph_goals(environment) for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
         tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
-        source = f"meta-JSON file {file.name}"
-        return sequence(
-            name or file.stem, tasks, num_frames, version=1, source=source, protocol=_labels(meta, tasks, numbers)
-        )
+        source, protocol = f"meta-JSON file {file.name}", _labels(meta, tasks, numbers)
+        return sequence(name or file.stem, tasks, num_frames, version=1, source=source, protocol=protocol)
 
 
 class Pool:
@@ -209,7 +203,7 @@ def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
 
 
 def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
-    paths, order = meta["config_paths"], meta["task_order"]
+    paths, order, by_place = meta["config_paths"], meta["task_order"], meta.get("label_by_curriculum_index", False)
     mode = meta.get("task_label_mode", LABEL_MODES[0])
     random_order = "; random is drawn from a global generator, so it cannot be reproduced" if order == "random" else ""
     only_paths = isinstance(paths, list) and 1 <= len(paths) <= MOST_CONFIGS and all(isinstance(p, str) for p in paths)
@@ -225,10 +219,7 @@ def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
         _ints_rule("task_label_ids", meta.get("task_label_ids", [0])),
         (mode in LABEL_MODES, f"task_label_mode must be one of {', '.join(LABEL_MODES)}, got {short(mode)}"),
         (mode != "explicit" or "task_label_ids" in meta, "task_label_mode explicit needs task_label_ids"),
-        (
-            isinstance(meta.get("label_by_curriculum_index", False), bool),
-            f"label_by_curriculum_index must be true or false, got {short(meta.get('label_by_curriculum_index'))}",
-        ),
+        (isinstance(by_place, bool), f"label_by_curriculum_index must be true or false, got {short(by_place)}"),
     ]
 
 

@@ -92,14 +92,8 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
         agent: the task of one agent alone, 0..27; None: all tasks one after the other, which is ours.
     """
     tasks = _of_agent([*chain(*_inconsistent())], agent)
-    return _curriculum(
-        "ct28_mosaic_skips_d5",
-        MOSAIC,
-        tasks,
-        num_frames=num_frames,
-        seed_set=seed_set,
-        evaluation=Evaluation(num_episodes=50),
-    )
+    evaluation = Evaluation(num_episodes=50)
+    return _curriculum("ct28_mosaic_skips_d5", MOSAIC, tasks, num_frames, seed_set, evaluation=evaluation)
 
 
 def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
@@ -181,15 +175,8 @@ def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
     tasks = _of_agent(everything, agent)
     pool = [(family, depth) for family in (1, 2) for depth in range(2, 12)]
     made = tuple(one_wait_image(path, family) for family, path in tasks)
-    return labelled(
-        "ct20",
-        L2D2C,
-        made,
-        ids=pool_ids(tasks, pool),
-        num_task_ids=8184,
-        num_frames=num_frames,
-        evaluation=Evaluation(),
-    )
+    ids = pool_ids(tasks, pool)
+    return labelled("ct20", L2D2C, made, ids, num_task_ids=8184, num_frames=num_frames, evaluation=Evaluation())
 
 
 def _family(number: int, deepest: int = 8) -> list[Named]:
@@ -219,33 +206,11 @@ def _curriculum(
     require((seed_set in SEED_SETS, f"seed_set must be one of {', '.join(map(str, SEED_SETS))}, got {seed_set!r}"))
     ids = pool_ids(tasks, [(family, depth) for family in PATHS for depth in range(2, 12)])
     made = tuple(one_wait_image(path, SEED_SETS[seed_set][family - 1]) for family, path in tasks)
-    return labelled(
-        name,
-        source,
-        made,
-        ids=ids,
-        num_task_ids=16_368 if seed_set == 1 else 16_370,
-        num_frames=num_frames,
-        evaluation=evaluation,
-    )
+    num_ids = 16_368 if seed_set == 1 else 16_370
+    return labelled(name, source, made, ids, num_task_ids=num_ids, num_frames=num_frames, evaluation=evaluation)
 
 
-NAMED = {
-    f.__name__: f
-    for f in (
-        ct8_interleaved,
-        ct10,
-        ct14_half_1,
-        ct14_half_2,
-        ct14_md,
-        ct20,
-        ct28,
-        ct28_blocked_skips_d5,
-        ct28_interleaved_skips_d5,
-        ct28_mosaic_skips_d5,
-        ct28_one_branch,
-        ct28_random_skips_d5,
-        ct29_recovery,
-    )
-}
+_SKIPPING_D5 = (ct28_blocked_skips_d5, ct28_interleaved_skips_d5, ct28_mosaic_skips_d5, ct28_random_skips_d5)
+_OTHERS = (ct8_interleaved, ct10, ct14_half_1, ct14_half_2, ct14_md, ct20, ct28, ct28_one_branch, ct29_recovery)
+NAMED = {f.__name__: f for f in (*_SKIPPING_D5, *_OTHERS)}
 """The curricula of this module by name."""

@@ -121,6 +121,4 @@ def sequence(
     budgets = frames if isinstance(frames, tuple) else (num_frames,) * len(items)
     require((len(budgets) == len(items), f"num_frames must be one for each of {len(items)} blocks, got {len(budgets)}"))
     blocks = tuple(Block(as_tasks(item), n, switch) for item, n in zip(items, budgets, strict=True))
-    return Curriculum(
-        name, version, source, blocks=blocks, evaluation=evaluation or Evaluation(), protocol=protocol or Protocol()
-    )
+    return Curriculum(name, version, source, blocks, evaluation or Evaluation(), protocol=protocol or Protocol())

@@ -19,27 +19,11 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import GroupedImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
-from curricula.axes import (
-    OneOrMore,
-    all_goals,
-    growing_depth,
-    image_seeds,
-    new_images,
-    observability,
-    random_goals,
-    reshaped,
-    sequence,
-)
+from curricula import axes
 
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
-KINDS = {
-    "fo_b1": "full",
-    "fo_b2": "full",
-    "su_b1": "surjective",
-    "co_b1": "confounding",
-    "posr_b1": "surjective",
-}
+KINDS = {"fo_b1": "full", "fo_b2": "full", "su_b1": "surjective", "co_b1": "confounding", "posr_b1": "surjective"}
 """The observability of each configuration; see `curricula.axes.observability`."""
 
 DEPTHS = (2, 3, 4, 5)
@@ -66,7 +50,7 @@ def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int 
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = all_goals(configured(configuration, image_seed))
+    tasks = axes.all_goals(configured(configuration, image_seed))
     return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames)
 
 
@@ -82,8 +66,8 @@ def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int =
         image_seed: seed of the image set that all tasks share.
     """
     task = configured(configuration, image_seed)
-    deepest = reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
-    return _curriculum(f"{configuration}_depth2to5", growing_depth(deepest, DEPTHS), num_frames)
+    deepest = axes.reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
+    return _curriculum(f"{configuration}_depth2to5", axes.growing_depth(deepest, DEPTHS), num_frames)
 
 
 def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -94,7 +78,7 @@ def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: in
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three.
     """
-    tasks = image_seeds(configured(configuration), _seeds(image_seed))
+    tasks = axes.image_seeds(configured(configuration), _seeds(image_seed))
     return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames)
 
 
@@ -106,8 +90,8 @@ def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int =
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three. It also draws the goals.
     """
-    shown = image_seeds(configured(configuration), _seeds(image_seed))
-    goals = random_goals(shown[0], NUM_VARIATIONS, image_seed)
+    shown = axes.image_seeds(configured(configuration), _seeds(image_seed))
+    goals = axes.random_goals(shown[0], NUM_VARIATIONS, image_seed)
     tasks = [replace(task, goal=other.goal) for task, other in zip(shown, goals, strict=True)]
     return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames)
 
@@ -122,7 +106,7 @@ def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int 
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("decision",))
+    tasks = axes.new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("decision",))
     return _curriculum(f"{configuration}_new_decisions", tasks, num_frames)
 
 
@@ -136,7 +120,7 @@ def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1)
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("wait",))
+    tasks = axes.new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("wait",))
     return _curriculum(f"{configuration}_new_waits", tasks, num_frames)
 
 
@@ -148,7 +132,7 @@ def fo_b2_gradient(num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
         image_seed: seed of the image set that all tasks share.
     """
     task = replace(ct_fo_b2(image_seed=image_seed), reward_fn=Gradient())
-    return _curriculum("fo_b2_gradient", all_goals(task), num_frames)
+    return _curriculum("fo_b2_gradient", axes.all_goals(task), num_frames)
 
 
 def fo_b1_noisy(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float = 0.5) -> Curriculum:
@@ -160,7 +144,7 @@ def fo_b1_noisy(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float
         reward_std: standard deviation of what end states pay.
     """
     task = replace(ct_fo_b1(image_seed=image_seed), reward_std=reward_std)
-    return _curriculum("fo_b1_noisy", all_goals(task), num_frames)
+    return _curriculum("fo_b1_noisy", axes.all_goals(task), num_frames)
 
 
 def stochastic_grouped(
@@ -181,7 +165,7 @@ def stochastic_grouped(
     names = ("home_ids", "fail_ids", "decision_ids", "wait_ids", "end_ids")
     ids = {name: (i * group_size, (i + 1) * group_size - 1) for i, name in enumerate(names)}
     task = Task(CTGraph(2, 2), (1, 1), Observations(**ids), images)  # type: ignore[arg-type]
-    return _curriculum("stochastic_grouped", all_goals(task), num_frames)
+    return _curriculum("stochastic_grouped", axes.all_goals(task), num_frames)
 
 
 def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_images: int = 500) -> Curriculum:
@@ -195,7 +179,7 @@ def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_im
         num_wait_images: images that wait states draw from.
     """
     task = replace(ct_su_b1(image_seed=image_seed), graph=CTGraph(2, 2, 0.9))
-    tasks = all_goals(observability(task, ["confounding"], num_wait_images))
+    tasks = axes.all_goals(axes.observability(task, ["confounding"], num_wait_images))
     return _curriculum("co_hard_4tasks", tasks, num_frames)
 
 
@@ -203,8 +187,8 @@ def _seeds(first: int) -> range:
     return range(first, first + NUM_VARIATIONS)
 
 
-def _curriculum(name: str, tasks: OneOrMore, num_frames: int) -> Curriculum:
-    return sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, 1, PAPER)
+def _curriculum(name: str, tasks: axes.OneOrMore, num_frames: int) -> Curriculum:
+    return axes.sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, 1, PAPER)
 
 
 WAYS = {

@@ -212,9 +212,7 @@ MISSING = (
         "the files give goals without image seeds, and their environments were not found",
     ),
     Missing(
-        "ctwtf_half",
-        "L2D2-C: 14 tasks of two families",
-        "half of its indices are beyond its own pool of 1,016 tasks",
+        "ctwtf_half", "L2D2-C: 14 tasks of two families", "half of its indices are beyond its own pool of 1,016 tasks"
     ),
     Missing(
         "context detection, 2020",

@@ -100,15 +100,8 @@ def rotated(num_tasks: int, num_frames: int | None = None, agent: int = 0) -> Cu
 
 def _curriculum(name: str, numbers: Sequence[int], num_task_ids: int, num_frames: int) -> Curriculum:
     tasks = tuple(full_mdp(GOALS[number % 4], 1 + number // 4) for number in numbers)
-    return labelled(
-        name,
-        SOURCE,
-        tasks,
-        ids=numbers,
-        num_task_ids=num_task_ids,
-        num_frames=num_frames,
-        evaluation=Evaluation(num_episodes=25),
-    )
+    evaluation = Evaluation(num_episodes=25)
+    return labelled(name, SOURCE, tasks, numbers, num_task_ids, num_frames=num_frames, evaluation=evaluation)
 
 
 NAMED = {

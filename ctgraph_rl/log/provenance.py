@@ -29,9 +29,8 @@ def versions() -> dict[str, str]:
 
 def named(curriculum: Curriculum) -> Curriculum:
     """Return the curriculum, with ``(modified)`` behind its name if another one is published under that name."""
-    return (
-        replace(curriculum, name=f"{curriculum.name} (modified)") if is_published(curriculum) is False else curriculum
-    )
+    modified = is_published(curriculum) is False
+    return replace(curriculum, name=f"{curriculum.name} (modified)") if modified else curriculum
 
 
 def provenance(curriculum: Curriculum) -> dict[str, Any]:
@@ -39,9 +38,7 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "curriculum": named(curriculum).name,
-        "version": curriculum.version,
-        "fingerprint": curriculum.fingerprint,
-        "source": curriculum.source,
+        **{name: getattr(curriculum, name) for name in ("version", "fingerprint", "source")},
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
         "versions": versions(),

@@ -140,10 +140,9 @@ class RunLog:
             except ValueError as error:
                 raise ValueError(f"{path}: line {number}: {error}") from None
         for run in log.of_kind("run"):
-            newer = run.get("schema", SCHEMA) > SCHEMA
-            require(
-                (not newer, f"{path} has schema {run.get('schema')}, this version reads {SCHEMA}: update ctgraph_rl")
-            )
+            schema = run.get("schema", SCHEMA)
+            newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
+            require((schema <= SCHEMA, newer))
         return log
 
     def of_kind(self, kind: str) -> list[dict[str, Any]]:
@@ -219,9 +218,8 @@ class RunLog:
         """
         tasks = [sorted(set(block)) for block in self._trained(trained)]
         mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
-        require(
-            (not mixed, f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several")
-        )
+        several = f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several"
+        require((not mixed, several))
         labels = {m["task"] - 1: m["label"] for m in self._evaluations(during=True)}
         require((all(block[0] in labels for block in tasks), "lifelong metrics need an evaluation of every task"))
         regimes = []

@@ -102,9 +102,8 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor) -> Tensor:
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
     """Return the intervals of each task in the block that trains it first, which must train it alone."""
-    first = [
-        min(i for i, block in enumerate(curriculum.trained) if task in block) for task in range(len(curriculum.tasks))
-    ]
+    blocks, tasks = curriculum.trained, range(len(curriculum.tasks))
+    first = [min(i for i, block in enumerate(blocks) if task in block) for task in tasks]
     reason = None
     if any(len(curriculum.trained[block]) > 1 for block in first):
         reason = "needs first blocks that train one task each"

@@ -102,28 +102,7 @@ def __dir__() -> list[str]:
     return sorted([*__all__, *METRICS])
 
 
-__all__ = [
-    "AGAINST_EXPERTS",
-    "MASTERED",
-    "METRICS",
-    "STAGES",
-    "SUMMARY",
-    "Curves",
-    "Definition",
-    "Metric",
-    "Regime",
-    "Trained",
-    "Undefined",
-    "check_experts",
-    "definitions",
-    "mean_area",
-    "of_curves",
-    "of_inputs",
-    "of_matrix",
-    "of_regimes",
-    "prepare",
-    "stage_areas",
-    "summary",
-    "trapezoid_area",
-    "undefined",
-]
+__all__ = ["AGAINST_EXPERTS", "MASTERED", "METRICS", "STAGES", "SUMMARY"]
+__all__ += ["Curves", "Definition", "Metric", "Regime", "Trained", "Undefined"]
+__all__ += ["definitions", "of_curves", "of_inputs", "of_matrix", "of_regimes", "prepare", "summary", "undefined"]
+__all__ += ["check_experts", "mean_area", "stage_areas", "trapezoid_area"]

@@ -218,9 +218,8 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
 
     def of_task(task: str) -> float:
         own = torch.cat([each.values for each in _training(regimes, task)])
-        return _mean(
-            [_quotient(curve[: len(own)].sum().item(), own[: len(curve)].sum().item()) for curve in experts[task]]
-        )
+        pairs = [(curve[: len(own)], own[: len(curve)]) for curve in experts[task]]
+        return _mean([_quotient(expert.sum().item(), trained.sum().item()) for expert, trained in pairs])
 
     return _per_task(regimes, lambda task: of_task(task) if experts.get(task) else math.nan, only_trained=True)
 

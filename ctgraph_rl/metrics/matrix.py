@@ -135,7 +135,7 @@ def isolated_forgetting(performance: Tensor, trained: Trained | None = None, sca
         scale: for each task, what changes are divided by; default: max |R[i, task]| of this matrix. The source takes
             it over all seeds of a model, which makes values of two models no longer comparable: give the known optimum.
     """
-    return _changes_by_other_blocks(performance, trained, scale, before=False) * -1
+    return _changes_by_others(performance, trained, scale, before=False) * -1
 
 
 @defined(
@@ -150,7 +150,7 @@ def zero_shot_transfer(performance: Tensor, trained: Trained | None = None, scal
     As `isolated_forgetting`; also undefined without the evaluation before any training.
     """
     _has_initial_evaluation(performance)
-    return _changes_by_other_blocks(performance, trained, scale, before=True)
+    return _changes_by_others(performance, trained, scale, before=True)
 
 
 def _changes_after_own_block(performance: Tensor, trained: Trained | None) -> Tensor:
@@ -165,9 +165,7 @@ def _pairs(matrix: Tensor, chosen: Callable[[int, int], bool]) -> Tensor:
     return torch.stack([matrix[i, j - 1] for i in range(1, count + 1) for j in range(1, count + 1) if chosen(i, j)])
 
 
-def _changes_by_other_blocks(
-    performance: Tensor, trained: Trained | None, scale: Tensor | None, before: bool
-) -> Tensor:
+def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tensor | None, before: bool) -> Tensor:
     """(R[j, i] - R[j-1, i]) / scale[i] for blocks j before, or after, the first one that trains i."""
     tasks = performance.shape[1]
     alone = _alone(performance, trained)
@@ -176,12 +174,8 @@ def _changes_by_other_blocks(
     scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else torch.as_tensor(scale)
     changes = ratio(performance.diff(dim=0), scale.to(performance).expand(performance.shape[0] - 1, tasks))
     first = [alone.index(task) if task in alone else len(alone) for task in range(tasks)]
-    terms = [
-        changes[block, task]
-        for task in range(tasks)
-        for block, other in enumerate(alone)
-        if other != task and (block < first[task]) == before
-    ]
+    pairs = [(block, task) for task in range(tasks) for block, other in enumerate(alone) if other != task]
+    terms = [changes[block, task] for block, task in pairs if (block < first[task]) == before]
     return torch.stack(terms) if terms else performance.new_empty(0)
 
 
@@ -212,9 +206,8 @@ def _blocks(performance: Tensor, trained: Trained | None) -> list[list[int]]:
     """
     blocks, tasks = performance.shape[0] - 1, performance.shape[1]
     if trained is None and blocks != tasks:
-        raise ValueError(
-            f"without trained, the definition needs one block per task, got {blocks} blocks and {tasks} tasks"
-        )
+        got = f"got {blocks} blocks and {tasks} tasks"
+        raise ValueError(f"without trained, the definition needs one block per task, {got}")
     if trained is None:
         return [[task] for task in range(tasks)]
     if len(trained) != blocks:

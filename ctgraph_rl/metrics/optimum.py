@@ -17,6 +17,8 @@ from ctgraph_rl.metrics.record import HERE, MASTERED, defined, ratio
 
 PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
 
+_FIRST_BLOCK = {"episodes": "first_episodes", "success_rates": "first_success_rates"}
+
 STAGES = ("fails", "navigates", "solves")
 """Stages of an agent on a task: it fails on the way, gets to end states, or gets to the goal."""
 
@@ -78,7 +80,7 @@ def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     "1/T sum_j frames_j to the first reward / (E[frames of a random episode] / P_R)",
     PAPER,
     missing="a goal was never reached",
-    inputs={"frames": "first_frames", "episodes": "first_episodes", "success_rates": "first_success_rates"},
+    inputs=_FIRST_BLOCK | {"frames": "first_frames"},
 )
 def frames_to_first_reward(
     frames: Sequence[Tensor],
@@ -104,11 +106,7 @@ def frames_to_first_reward(
     "1/T sum_j E[kappa_j] / episodes_j to the first reward",
     PAPER,
     missing="a goal was never reached",
-    inputs={
-        "episodes": "first_episodes",
-        "success_rates": "first_success_rates",
-        "expected_episodes": "search_episodes",
-    },
+    inputs=_FIRST_BLOCK | {"expected_episodes": "search_episodes"},
 )
 def search_efficiency(
     episodes: Sequence[Tensor], success_rates: Sequence[Tensor], expected_episodes: Sequence[float]

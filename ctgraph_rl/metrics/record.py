@@ -162,15 +162,7 @@ def _metric(meaning: Definition, terms: Tensor, missing: str, aggregate: Callabl
         reason = f"{without} of {count} terms have no value: {missing}"
     value = None if reason else aggregate(terms[has_value]).item()
     shown = tuple(term if finite else None for term, finite in zip(terms.tolist(), has_value.tolist(), strict=True))
-    return Metric(
-        value,
-        definition=meaning.id,
-        formula=meaning.formula,
-        source=meaning.source,
-        undefined=reason,
-        n_undefined=without,
-        terms=shown,
-    )
+    return Metric(value, meaning.id, meaning.formula, meaning.source, reason, n_undefined=without, terms=shown)
 
 
 def ratio(above: Tensor, below: Tensor) -> Tensor:

@@ -13,10 +13,7 @@ from ctgraph_rl.report.trees import Trees, task_trees
 OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (learning_curves, training_curves)
 """Figures of all agents on a curriculum; None where there is nothing to draw."""
 
-OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (
-    transfer_maps,
-    task_trees,
-)
+OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
 """Figures of an agent with finished runs."""
 
 

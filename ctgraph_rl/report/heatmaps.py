@@ -39,9 +39,8 @@ def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFi
         f"rows; purple is gain, orange is loss.{marks}{intervals} Framed: the tasks "
         "that the block trains. Grey: not evaluated."
     )
-    return CaptionedFigure(
-        "transfer", f"{result.agent}: performance and transfer", caption, draw_matrices(section, result)
-    )
+    title = f"{result.agent}: performance and transfer"
+    return CaptionedFigure("transfer", title, caption, draw_matrices(section, result))
 
 
 def draw_matrices(section: Section, result: Result) -> Any:

@@ -9,21 +9,10 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
+from ctgraph_rl.report import results
 from ctgraph_rl.report.figures import of_agent, of_section
 from ctgraph_rl.report.gallery import Gallery, Written
 from ctgraph_rl.report.heatmaps import MOST_NAMES
-from ctgraph_rl.report.results import (
-    LEGEND,
-    MEANS,
-    Page,
-    Row,
-    latex,
-    latex_text,
-    latex_value,
-    markdown_text,
-    pages,
-    selected,
-)
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
@@ -73,8 +62,8 @@ class Part(NamedTuple):
     section: Section
     facts: list[tuple[str, Any]]
     figures: list[Written]
-    table: Page
-    everything: Page | None  # the table of every measure
+    table: results.Page
+    everything: results.Page | None  # the table of every measure
     agents: list[AgentPart]
     unshown: int  # agents without figures
     runs: list[tuple[str, ...]]
@@ -103,8 +92,8 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
         "title": _title(parts),
         "parts": parts,
         "problems": problems,
-        "legend": LEGEND,
-        "legend_of_means": MEANS,
+        "legend": results.LEGEND,
+        "legend_of_means": results.MEANS,
         "definitions": _definitions(parts),
         "version": __version__,
         "missing": [run for part in parts for run in part.section.runs if run.reason is not None],
@@ -121,15 +110,10 @@ def _rendered(name: str, about: Mapping[str, Any]) -> str:
     from jinja2 import FileSystemLoader, StrictUndefined
     from jinja2.sandbox import SandboxedEnvironment
 
-    loader = FileSystemLoader(Path(__file__).parent)
-    environment = SandboxedEnvironment(
-        loader=loader,
-        autoescape=name.endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["line"] = lambda value: markdown_text(str(value))
+    loader, style = FileSystemLoader(Path(__file__).parent), {"trim_blocks": True, "lstrip_blocks": True}
+    escapes = name.endswith(".html")
+    environment = SandboxedEnvironment(loader=loader, autoescape=escapes, undefined=StrictUndefined, **style)
+    environment.filters["line"] = lambda value: results.markdown_text(str(value))
     return environment.get_template(f"{name}.j2").render(about)
 
 
@@ -142,15 +126,12 @@ def _title(parts: Sequence[Part]) -> str:
 
 
 def _part(section: Section, gallery: Gallery) -> Part:
-    names = (section.name,)
-    shown = selected(section.rows)
-    everything = next(pages(section.rows)) if len(section.rows) <= MOST_ROWS else None
     return Part(
         section,
         facts=list(_facts(section)),
-        figures=gallery.write(names, of_section(section)),
-        table=next(pages(shown)),
-        everything=everything,
+        figures=gallery.write((section.name,), of_section(section)),
+        table=next(results.pages(results.selected(section.rows))),
+        everything=next(results.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
         unshown=max(0, len(section.results) - MOST_AGENTS),
         runs=[row for result in section.results for row in _runs(result)],
@@ -243,18 +224,18 @@ def _latex(parts: Sequence[Part]) -> str:
     """Tables for papers: the measures of each curriculum, and each agent's matrices."""
     found = ["% needs \\usepackage{booktabs}"]
     for part in parts:
-        rows: list[Row] = selected(part.section.rows)
-        found.append(latex(rows))
+        found.append(results.latex(results.selected(part.section.rows)))
         for agent in part.agents:
             for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
-                caption = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n}): {numbers.title}; {MEANS}"
-                found.append(_latex_table(caption, numbers))
+                who = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n})"
+                found.append(_latex_table(f"{who}: {numbers.title}; {results.MEANS}", numbers))
     return "\n\n".join(found) + "\n"
 
 
 def _latex_table(caption: str, numbers: Numbers) -> str:
-    rows = [[*map(latex_text, numbers.head)], *([*map(latex_value, row)] for row in numbers.rows)]
+    rows = [[*map(results.latex_text, numbers.head)], *([*map(results.latex_value, row)] for row in numbers.rows)]
     lines = [" & ".join(row) + r" \\" for row in rows]
-    head = [r"\begin{table}", rf"\caption{{{latex_text(caption)}}}", rf"\begin{{tabular}}{{{'l' * len(numbers.head)}}}"]
+    title, columns = rf"\caption{{{results.latex_text(caption)}}}", "l" * len(numbers.head)
+    head = [r"\begin{table}", title, rf"\begin{{tabular}}{{{columns}}}"]
     tail = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
     return "\n".join([*head, r"\toprule", lines[0], r"\midrule", *lines[1:], *tail])

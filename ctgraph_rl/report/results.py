@@ -22,15 +22,8 @@ from typing import NamedTuple
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
-from ctgraph_rl.report.statistics import (
-    Comparison,
-    Estimate,
-    compare,
-    interquartile_mean,
-    mean,
-    seeds_needed,
-    solved_rate,
-)
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 
 SOLVED = 0.9
@@ -96,12 +89,8 @@ class Row:
 
 def table(runs: Sequence[Run]) -> list[Row]:
     """Every metric, and how tasks ended, for each agent on each curriculum."""
-    groups = grouped(runs).items()
-    return [
-        Row(name, agent, *line)
-        for (name, agent), by_seed in groups
-        for line in (*_metrics(by_seed), *_at_the_end(by_seed))
-    ]
+    lines = {which: (*_metrics(by_seed), *_at_the_end(by_seed)) for which, by_seed in grouped(runs).items()}
+    return [Row(name, agent, *line) for (name, agent), of_agent in lines.items() for line in of_agent]
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
@@ -116,7 +105,7 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
     for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
         if first[0] == second[0] and list(one) == list(other):
             values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
-            found[first[0], first[1], second[1]] = compare(values, others)
+            found[first[0], first[1], second[1]] = statistics.compare(values, others)
     return found
 
 
@@ -136,12 +125,8 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Ro
     message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
     require((not choices or not unknown, message))
     with_value = {(row.curriculum, row.measure) for row in rows if row.measure in AGAINST_EXPERTS and row.estimate.n}
-    always = (*(SHOWN if names is None else names), NO_RUN_FINISHED)
-    return [
-        row
-        for row in rows
-        if row.measure.split(" ")[0] in always or (names is None and (row.curriculum, row.measure) in with_value)
-    ]
+    always, further = (*(SHOWN if names is None else names), NO_RUN_FINISHED), with_value if names is None else ()
+    return [row for row in rows if row.measure.split(" ")[0] in always or (row.curriculum, row.measure) in further]
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
@@ -220,14 +205,8 @@ def _text(page: Page) -> str:
 
 
 def _markdown(page: Page) -> str:
-    head = [
-        f"### {markdown_text(page.curriculum)}",
-        "",
-        LEGEND,
-        "",
-        "| agent | measure | over seeds | n | note |",
-        "|---|---|---|---|---|",
-    ]
+    columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
+    head = [f"### {markdown_text(page.curriculum)}", "", LEGEND, "", *columns]
     lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
     notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
     return "\n".join([*head, *lines, *([""] if notes else []), *notes])
@@ -282,23 +261,20 @@ def _at_the_end(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
     tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
     if tasks:
         returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
-        estimate = interquartile_mean(returns)
+        estimate = statistics.interquartile_mean(returns)
         yield _ended("interquartile_return", estimate, by_seed)
     for task in tasks:
-        estimate = solved_rate([_solved(run, task) for run in by_seed.values()])
+        estimate = statistics.solved_rate([_solved(run, task) for run in by_seed.values()])
         yield _ended(f"solved {task}", estimate, by_seed)
 
 
 def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
     """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
-    returns = mean(
-        [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in by_seed.values()]
-    )
-    yield _ended("mean_final_return", returns, by_seed)
-    solved = mean(
-        [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in by_seed.values()]
-    )
-    yield _ended("solved_rate", solved, by_seed)
+    runs = by_seed.values()
+    returns = [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in runs]
+    yield _ended("mean_final_return", mean(returns), by_seed)
+    solved = [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in runs]
+    yield _ended("solved_rate", mean(solved), by_seed)
 
 
 def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
@@ -389,7 +365,7 @@ def _sentence(curriculum: str, first: str, second: str, found: Comparison, diffe
     sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}{p_value}"
     if difference is None or not found.std:
         return sentence
-    seeds = seeds_needed(difference, found.std, paired=True)
+    seeds = statistics.seeds_needed(difference, found.std, paired=True)
     return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
 
 

@@ -99,17 +99,13 @@ def mean(values: Values, level: float = LEVEL) -> Estimate:
     known, missing = _known(values)
     method = f"mean, Student t {level:.0%}"
     if len(known) == 0:
-        return Estimate(
-            None, low=None, high=None, n=0, n_undefined=missing, method=method, reason="no seed has a value"
-        )
+        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
     centre = math.fsum(known) / len(known)
     if len(known) == 1 or min(known) == max(known):
         reason = "one seed has no interval" if len(known) == 1 else "all seeds are equal: no spread to estimate"
-        return Estimate(centre, low=None, high=None, n=len(known), n_undefined=missing, method=method, reason=reason)
+        return Estimate(centre, None, None, len(known), missing, method=method, reason=reason)
     half = _student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known))
-    return Estimate(
-        centre, low=float(centre - half), high=float(centre + half), n=len(known), n_undefined=missing, method=method
-    )
+    return Estimate(centre, float(centre - half), float(centre + half), len(known), missing, method=method)
 
 
 def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate:
@@ -125,9 +121,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     n, k, missing = len(known), sum(known), len(solved) - len(known)
     method = f"share, Clopper-Pearson {level:.0%}"
     if n == 0:
-        return Estimate(
-            None, low=None, high=None, n=0, n_undefined=missing, method=method, reason="no seed has a result"
-        )
+        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a result")
     interval = stats.binomtest(k, n).proportion_ci(level, method="exact")
     return Estimate(k / n, low=float(interval.low), high=float(interval.high), n=n, n_undefined=missing, method=method)
 
@@ -177,14 +171,8 @@ def compare(first: Values, second: Values, level: float = LEVEL) -> Comparison:
     known, _ = _known(differences)
     signs = [(each > 0) - (each < 0) for each in known]
     std, p_value = (float(np.std(known, ddof=1)), _sign_flip(known)) if len(known) > 1 else (None, None)
-    return Comparison(
-        mean(differences, level),
-        std=std,
-        p_value=p_value,
-        wins=signs.count(1),
-        ties=signs.count(0),
-        losses=signs.count(-1),
-    )
+    wins, ties, losses = (signs.count(sign) for sign in (1, 0, -1))
+    return Comparison(mean(differences, level), std, p_value, wins=wins, ties=ties, losses=losses)
 
 
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:

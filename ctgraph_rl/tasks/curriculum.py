@@ -46,11 +46,8 @@ class Curriculum:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "blocks", as_tuple(self.blocks))
-        only_blocks = (
-            isinstance(self.blocks, tuple)
-            and bool(self.blocks)
-            and all(isinstance(block, Block) for block in self.blocks)
-        )
+        blocks = self.blocks
+        only_blocks = isinstance(blocks, tuple) and bool(blocks) and all(isinstance(each, Block) for each in blocks)
         require(
             (isinstance(self.name, str) and bool(self.name), f"a curriculum needs a name, got {self.name!r}"),
             (is_int(self.version, 1), f"version must be an integer >= 1, got {self.version!r}"),

@@ -56,10 +56,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     places = {task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))}
     content = {
         "schema": SCHEMA,
-        "fingerprint": curriculum.fingerprint,
-        "name": curriculum.name,
-        "version": curriculum.version,
-        "source": curriculum.source,
+        **{name: getattr(curriculum, name) for name in ("fingerprint", "name", "version", "source")},
         "tasks": [_plain(task, {}) for task in places],
         "blocks": [_plain(block, places) for block in curriculum.blocks],
         "evaluation": _plain(curriculum.evaluation, places),

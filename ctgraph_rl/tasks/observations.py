@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from itertools import combinations
 
-from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.checks import as_tuple, is_int, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
@@ -67,15 +67,14 @@ class Observations:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         if self.unique_ends is None:
             object.__setattr__(self, "unique_ends", bool(self.unique_decisions or self.unique_waits))
+        given, rotation = {name: getattr(self, name) for name in ranges}, self.read_rotation
+        degrees = f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {rotation!r}"
         require(
-            *((_is_range(getattr(self, name)), _range_rule(name, getattr(self, name))) for name in ranges),
-            *_overlap_rules({name: getattr(self, name) for name in ranges if _is_range(getattr(self, name))}),
-            *_flag_rules(self),
+            *((_is_range(ids), _range_rule(name, ids)) for name, ids in given.items()),
+            *_overlap_rules({name: ids for name, ids in given.items() if _is_range(ids)}),
+            *true_or_false(**{field.name: getattr(self, field.name) for field in fields(self) if "bool" in field.type}),
             (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
-            (
-                is_int(self.read_rotation, 0, MAX_READ_ROTATION),
-                f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {self.read_rotation!r}",
-            ),
+            (is_int(rotation, 0, MAX_READ_ROTATION), degrees),
         )
 
     def ids(self, kind: StateType) -> Ids:
@@ -104,20 +103,13 @@ class Observations:
 
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
         """Return the rules on a graph: unique ids need as many ids as there are states."""
-        return [self._room_rule(kind, count) for kind, count in _states_with_ids(graph) if self.is_unique(kind)]
+        kinds = (kind for kind in StateType if self.is_unique(kind))
+        return [self._room_rule(kind, getattr(graph, f"num_{kind.name.lower()}_states")) for kind in kinds]
 
     def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:
         name, (first, last) = f"{kind.name.lower()}_ids", self.ids(kind)
         need = f"unique_{kind.name.lower()}s needs {count} {name}, got {last - first + 1} in ({first}, {last})"
         return last - first + 1 >= count, f"{need}; use ({first}, {first + count - 1})"
-
-
-def _states_with_ids(graph: CTGraph) -> list[tuple[StateType, int]]:
-    return [
-        (StateType.WAIT, graph.num_wait_states),
-        (StateType.DECISION, graph.num_decision_states),
-        (StateType.END, graph.num_end_states),
-    ]
 
 
 def _is_range(value: object) -> bool:
@@ -126,12 +118,6 @@ def _is_range(value: object) -> bool:
 
 def _range_rule(name: str, value: object) -> str:
     return f"{name} must be (first, last) with 0 <= first <= last, got {value!r}"
-
-
-def _flag_rules(observations: Observations) -> list[tuple[bool, str]]:
-    names = [field.name for field in fields(observations) if field.type in ("bool", "bool | None")]
-    flags = [(name, getattr(observations, name)) for name in names]
-    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in flags]
 
 
 def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, one_of, require, true_or_false
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
 
@@ -44,14 +44,11 @@ class Block:
         tasks = (self.tasks,) if isinstance(self.tasks, Task) else as_tuple(self.tasks)
         object.__setattr__(self, "tasks", tasks)
         only_tasks = isinstance(tasks, tuple) and bool(tasks) and all(isinstance(task, Task) for task in tasks)
-        switches = is_dataclass(self.switch) and switch_rule(self.switch)[0]
+        switches = self.switch is None or (is_dataclass(self.switch) and switch_rule(self.switch)[0])
         require(
             (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
-            (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
-            (
-                self.switch is None or switches,
-                f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}",
-            ),
+            *at_least_one(num_frames=self.num_frames),
+            (switches, f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}"),
         )
         enough = self.switch is None or len(self.tasks) > 1
         require((enough, "a block with a switch needs at least two tasks, got one; leave the switch out"))
@@ -108,12 +105,11 @@ class Evaluation:
         held_out = (self.held_out,) if isinstance(self.held_out, Task) else as_tuple(self.held_out)
         object.__setattr__(self, "held_out", held_out)
         only_tasks = isinstance(held_out, tuple) and all(isinstance(task, Task) for task in held_out)
-        flags = {"greedy": self.greedy, "before": self.before, "at_block_ends": self.at_block_ends}
         require(
             *at_least_one(num_episodes=n, episodes_per_row=per_row),
-            *((isinstance(flag, bool), f"{name} must be true or false, got {flag!r}") for name, flag in flags.items()),
+            *true_or_false(greedy=self.greedy, before=self.before, at_block_ends=self.at_block_ends),
             (is_int(self.every, 0), f"every must be an integer >= 0, got {self.every!r}"),
-            _one_of("tasks", self.tasks, EVALUATED),
+            *one_of(EVALUATED, tasks=self.tasks),
             (only_tasks, f"held_out must be tasks, got {held_out!r}"),
         )
         require(
@@ -170,13 +166,11 @@ class Protocol:
         is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0, MOST_IDS) for i in ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
+        is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
-            _one_of("task_id", self.task_id, TASK_IDS),
-            _one_of("boundaries", self.boundaries, BOUNDARIES),
-            (
-                self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS),
-                f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}",
-            ),
+            *one_of(TASK_IDS, task_id=self.task_id),
+            *one_of(BOUNDARIES, boundaries=self.boundaries),
+            (is_length, f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}"),
             (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
             (names_ids, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
             (not hidden_gift, "task_id cannot be given at_boundaries that are hidden; use one_hot, or announced ones"),
@@ -199,7 +193,3 @@ class Protocol:
     def length(self, num_tasks: int) -> int:
         """The length of a one-hot id."""
         return max(self.ids(num_tasks)) + 1 if self.num_task_ids is None else self.num_task_ids
-
-
-def _one_of(name: str, value: object, choices: tuple[str, ...]) -> tuple[bool, str]:
-    return value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}"

@@ -60,12 +60,7 @@ _SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
 
 _DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
 
-_LEGACY: dict[str, Any] = {
-    "reward_cue": True,
-    "cue_wraps": True,
-    "legacy_index": True,
-    "noise_before_rotation": True,
-}
+_LEGACY: dict[str, Any] = {"reward_cue": True, "cue_wraps": True, "legacy_index": True, "noise_before_rotation": True}
 """How the authors' implementation shows states, whatever a file says."""
 
 
@@ -118,21 +113,13 @@ def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
     wanted, names = _places(dialect).values(), (*_SECTIONS, "general_seed")
     unknown = [f"unknown section {name!r}{_suggest(name, names)}" for name in content if name not in names]
     whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
-    no_section = [
-        f"section {name!r} {'must be an object' if name in content else 'is missing'}"
-        for name in _SECTIONS
-        if name not in whole
-    ]
-    surplus = [
-        _surplus(section, key, dialect)
-        for section in whole
-        for key in content[section]
-        if (section, key) not in wanted and not _says_nothing(section, key, content)
-    ]
-    missing = [
-        f"{section}.{key} is missing" for section, key in wanted if section in whole and key not in content[section]
-    ]
-    return [*unknown, *no_section, *surplus, *missing]
+    absent = {name: "must be an object" if name in content else "is missing" for name in _SECTIONS if name not in whole}
+    no_section = [f"section {name!r} {fault}" for name, fault in absent.items()]
+    given = [(section, key) for section in whole for key in content[section]]
+    surplus = [place for place in given if place not in wanted and not _says_nothing(*place, content)]
+    missing = [place for place in wanted if place[0] in whole and place not in given]
+    faults = [_surplus(*place, dialect) for place in surplus]
+    return [*unknown, *no_section, *faults, *(f"{section}.{key} is missing" for section, key in missing)]
 
 
 def _says_nothing(section: str, key: str, content: Mapping[str, Any]) -> bool:
@@ -164,18 +151,16 @@ def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> l
         return f"{'.'.join(places[name])} must be"
 
     noise, rotation, first, end = (found[name] for name in ("noise", "rotation", "min_episodes", "max_episodes"))
-    whole = is_int(first) and is_int(end)
+    episodes = is_int(first) and is_int(end) and (max(first, end) <= 0 or 1 <= first < end)
     distribution, choices = found["distribution"], " or ".join(map(repr, _DISTRIBUTIONS))
+    known = isinstance(distribution, str) and distribution in _DISTRIBUTIONS
     flags = [name for name in ("is_stochastic", "unique_decisions", "unique_waits", "one_hot") if name in found]
-    still = is_real(noise) and noise < 1 and rotation == 1
+    still = found["one_hot"] is not True or (is_real(noise) and noise < 1 and rotation == 1)
     return [
         *((isinstance(found[name], bool), f"{said(name)} true or false, got {found[name]!r}") for name in flags),
+        (known, f"{said('distribution')} {choices}, got {distribution!r}"),
         (
-            isinstance(distribution, str) and distribution in _DISTRIBUTIONS,
-            f"{said('distribution')} {choices}, got {distribution!r}",
-        ),
-        (
-            whole and (max(first, end) <= 0 or 1 <= first < end),
+            episodes,
             f"{said('min_episodes')} below max_static_reward_episodes, which is exclusive, and both >= 1, or both <= 0 "
             f"for a goal that stays; got {first!r} and {end!r}",
         ),
@@ -186,7 +171,7 @@ def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> l
             "none, and 0 makes the authors' implementation crash",
         ),
         (
-            found["one_hot"] is not True or still,
+            still,
             f"image_dataset.1D needs {places['noise'][1]} below 1 and {places['rotation'][1]} 1, got {noise!r} and "
             f"{rotation!r}: what the authors' implementation does with others is not recorded",
         ),
@@ -197,21 +182,16 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
     """Values in our words as arguments of `Task`, all but the goal."""
     changes = found["min_episodes"] > 0
     noise = 0 if found["one_hot"] else found["noise"]
-    images = (
-        ReferenceOneHot(found["num_images"])
-        if found["one_hot"]
-        else ReferenceImages(found["num_images"], found["image_seed"], noise)
-    )
+    count, seed = found["num_images"], found["image_seed"]
+    images = ReferenceOneHot(count) if found["one_hot"] else ReferenceImages(count, seed, noise)
     shown = {name: found[name] for name in ("wait_ids", "decision_ids", "end_ids", "unique_waits", "unique_decisions")}
+    on_read = {"read_noise": math.floor(noise), "read_rotation": found["rotation"] - 1}
     return {
         "graph": CTGraph(found["branching_factor"], found["depth"], found["wait_prob"]),
-        "observations": Observations(
-            **shown, **_LEGACY, read_noise=math.floor(noise), read_rotation=found["rotation"] - 1
-        ),
+        "observations": Observations(**shown, **_LEGACY, **on_read),
         "images": images,
         "reward_fn": _DISTRIBUTIONS[found["distribution"]],
-        "goal_reward": found["goal_reward"],
-        "fail_reward": found["fail_reward"],
+        **{name: found[name] for name in ("goal_reward", "fail_reward")},
         "reward_std": found["reward_std"] if found.get("is_stochastic", True) else 0.0,
         "reward_noise": "multiplicative",
         "goal_change": (found["min_episodes"], found["max_episodes"] - 1) if changes else None,
@@ -242,52 +222,40 @@ def _expressible(task: Task) -> list[tuple[bool, str]]:
     unique = x.unique_waits or x.unique_decisions or x.unique_ends
     kinds = (ReferenceImages, ReferenceOneHot)
     one_noise = not isinstance(images, ReferenceImages) or x.read_noise == math.floor(images.noise)
+    scales = task.reward_std == 0 or task.reward_noise == "multiplicative"
+    as_others = x.unique_ends == (x.unique_waits or x.unique_decisions)
+    in_order = x.noise_before_rotation or not (x.read_noise and x.read_rotation)
     return [
         (isinstance(images, kinds), f"images={images!r}: use ReferenceImages or ReferenceOneHot"),
         (one_noise, f"read_noise={x.read_noise} with {images!r}: use one noise, noise={x.read_noise} of the images"),
         (task.reward_fn in _DISTRIBUTIONS.values(), f"reward_fn={task.reward_fn!r}: use Needle or ReferenceLinear"),
         (task.step_reward == 0, f"step_reward={task.step_reward}: use 0"),
-        (
-            task.reward_std == 0 or task.reward_noise == "multiplicative",
-            f"reward_noise={task.reward_noise!r}: use 'multiplicative'",
-        ),
+        (scales, f"reward_noise={task.reward_noise!r}: use 'multiplicative'"),
         (task.extra_end_step, "extra_end_step=False: use True"),
         (task.goal_change is None or task.legacy_goal_change, "legacy_goal_change=False with a goal_change: use True"),
         (x.home_ids == (0, 0), f"home_ids={x.home_ids}: use (0, 0)"),
         (x.fail_ids == (1, 1), f"fail_ids={x.fail_ids}: use (1, 1)"),
-        (
-            x.unique_ends == (x.unique_waits or x.unique_decisions),
-            f"unique_ends={x.unique_ends}: end states are unique when waits or decisions are; use None",
-        ),
+        (as_others, f"unique_ends={x.unique_ends}: end states are unique when waits or decisions are; use None"),
         (x.reward_cue, "reward_cue=False: use True"),
         (x.cue_wraps, "cue_wraps=False: use True"),
         (x.legacy_index or not unique, "legacy_index=False with unique ids: use True"),
-        (
-            x.noise_before_rotation or not (x.read_noise and x.read_rotation),
-            "noise_before_rotation=False with noise and rotation: use True",
-        ),
+        (in_order, "noise_before_rotation=False with noise and rotation: use True"),
     ]
 
 
 def _values(task: Task) -> dict[str, Any]:
     """A task in the words of `_KEYS`."""
-    graph, x, images = task.graph, task.observations, task.images
+    x, images = task.observations, task.images
     first, last = task.goal_change or (-1, -2)
     return {
-        "depth": graph.depth,
-        "branching_factor": graph.branching_factor,
-        "wait_prob": graph.wait_prob,
-        "goal_reward": task.goal_reward,
-        "fail_reward": task.fail_reward,
-        "reward_std": task.reward_std,
+        **{name: getattr(task.graph, name) for name in ("depth", "branching_factor", "wait_prob")},
+        **{name: getattr(task, name) for name in ("goal_reward", "fail_reward", "reward_std")},
         "min_episodes": first,
         "max_episodes": last + 1,
         "distribution": next(name for name, reward_fn in _DISTRIBUTIONS.items() if reward_fn == task.reward_fn),
         "unique_decisions": x.unique_decisions,
         "unique_waits": x.unique_waits,
-        "wait_ids": list(x.wait_ids),
-        "decision_ids": list(x.decision_ids),
-        "end_ids": list(x.end_ids),
+        **{name: list(getattr(x, name)) for name in ("wait_ids", "decision_ids", "end_ids")},
         "image_seed": getattr(images, "seed", 1),
         "one_hot": isinstance(images, ReferenceOneHot),
         "num_images": images.num_images,

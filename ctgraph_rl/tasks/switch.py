@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import is_int, is_real, require, true_or_false
 from ctgraph_rl.core.philox import randint
 
 MOST_EPISODES = 2**31
@@ -53,7 +53,7 @@ class ByEpisode:
     together: bool = False
 
     def __post_init__(self) -> None:
-        require(_episodes_rule(self.episodes), _together_rule(self.together))
+        require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""
@@ -76,7 +76,7 @@ class AtRandom:
 
     def __post_init__(self) -> None:
         holds = is_real(self.prob, 0, 1) and self.prob > 0
-        require((holds, f"prob must be in (0, 1], got {self.prob!r}"), _together_rule(self.together))
+        require((holds, f"prob must be in (0, 1], got {self.prob!r}"), *true_or_false(together=self.together))
         object.__setattr__(self, "prob", float(self.prob))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
@@ -100,7 +100,7 @@ class Drift:
     together: bool = False
 
     def __post_init__(self) -> None:
-        require(_episodes_rule(self.episodes), _together_rule(self.together))
+        require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""
@@ -120,7 +120,3 @@ def switch_rule(switch: object) -> tuple[bool, str]:
 
 def _episodes_rule(episodes: object) -> tuple[bool, str]:
     return is_int(episodes, 1, MOST_EPISODES), f"episodes must be an integer in 1..2**31, got {episodes!r}"
-
-
-def _together_rule(together: object) -> tuple[bool, str]:
-    return isinstance(together, bool), f"together must be true or false, got {together!r}"

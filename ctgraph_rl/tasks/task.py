@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, is_int, is_real, require
+from ctgraph_rl.checks import as_tuple, is_int, is_real, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.tasks import reference, values
@@ -130,15 +130,12 @@ class Task:
         return reference.write_task(self, path, general_seed)
 
     def _check_parts(self) -> None:
-        images, reward_fn = self.images, self.reward_fn
+        images, reward_fn, shown = self.images, self.reward_fn, self.observations
         has_images = hasattr(images, "bank") and not isinstance(images, type)
         pays = callable(reward_fn) and not isinstance(reward_fn, type)
         require(
             (isinstance(self.graph, CTGraph), f"graph must be a CTGraph, got {self.graph!r}"),
-            (
-                isinstance(self.observations, Observations),
-                f"observations must be Observations, got {self.observations!r}",
-            ),
+            (isinstance(shown, Observations), f"observations must be Observations, got {shown!r}"),
             (has_images, f"images must be an image set such as PaperImages(5), got {images!r}"),
             (pays, f"reward_fn must be a reward such as Needle(), got {reward_fn!r}"),
         )
@@ -146,22 +143,16 @@ class Task:
     def _reward_rules(self) -> list[tuple[bool, str]]:
         cue, change = self.observations.reward_cue, self.goal_change
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
-        lasts = pair and is_int(change[1], change[0], MAX_EPISODES)  # type: ignore[index]
-        switches = [(name, getattr(self, name)) for name in ("extra_end_step", "legacy_goal_change")]
+        lasts = change is None or (pair and is_int(change[1], change[0], MAX_EPISODES))
+        cues = not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD)
         return [
             *(_reward_rule(name, getattr(self, name)) for name in REWARDS),
-            *((isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in switches),
+            *true_or_false(extra_end_step=self.extra_end_step, legacy_goal_change=self.legacy_goal_change),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
             (self._noise_is_finite(), f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
             (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
-            (
-                change is None or lasts,
-                f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}",
-            ),
-            (
-                not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD),
-                f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}",
-            ),
+            (lasts, f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}"),
+            (cues, f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}"),
         ]
 
     def _noise_is_finite(self) -> bool:
@@ -175,9 +166,8 @@ class Task:
         holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
         message = f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
         if not holds and isinstance(goal, tuple) and 0 in goal and all(is_int(branch, 0, b - 1) for branch in goal):
-            message += (
-                f"; a path of the authors' implementation counts from 0: use {tuple(branch + 1 for branch in goal)}"
-            )
+            decisions = tuple(branch + 1 for branch in goal)
+            message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
 
     @property

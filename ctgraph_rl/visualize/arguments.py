@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,16 +57,8 @@ class Selection(NamedTuple):
         """Count where the policy goes; as many episodes follow each other in a row as the curriculum says."""
         assert self.policy is not None
         in_row = 1 if self.curriculum is None else self.curriculum.evaluation.episodes_per_row
-        return visits(
-            self.task,
-            self.policy,
-            self.initial_state,
-            num_episodes=max(1, num_episodes // in_row) * in_row,
-            seed=seed,
-            greedy=greedy,
-            episodes_per_row=in_row,
-            curriculum=self.curriculum,
-        )
+        count = partial(visits, self.task, self.policy, self.initial_state, curriculum=self.curriculum)
+        return count(max(1, num_episodes // in_row) * in_row, seed, greedy=greedy, episodes_per_row=in_row)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,9 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
     parser.add_argument("--goal", type=decisions, metavar="1.2", help="the decisions to the goal")
-    parser.add_argument(
-        "--surjective", action="store_true", help="with numbers alone: one image for each kind of state"
-    )
+    surjective = "with numbers alone: one image for each kind of state"
+    parser.add_argument("--surjective", action="store_true", help=surjective)
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--policy", choices=POLICIES, help="who acts")
     who.add_argument("--run", type=Path, help="the trained agent of a run acts, in a task of its curriculum")

@@ -82,9 +82,8 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
 
 def _title(graph: CTGraph, goals: int, shown: int) -> str:
     some = f", {shown} shown" if shown < goals else ""
-    return (
-        f"{shape_of(graph)}: {goals:,} {'goal' if goals == 1 else 'goals'}{some}, {graph.num_end_states:,} end states"
-    )
+    count = f"{goals:,} {'goal' if goals == 1 else 'goals'}{some}"
+    return f"{shape_of(graph)}: {count}, {graph.num_end_states:,} end states"
 
 
 def _room(depth: int, level: bool) -> float:
@@ -116,14 +115,6 @@ def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: 
 
 def _write(axes: Any, place: Point, text: str, level: bool) -> None:
     """A goal's label below it, upright where there is little room."""
-    words = text if level else text.replace("\n", "  ")
-    axes.annotate(
-        words,
-        place,
-        xytext=(0, -9),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=7,
-        rotation=0 if level else 90,
-    )
+    words, rotation = (text, 0) if level else (text.replace("\n", "  "), 90)
+    style = {"ha": "center", "va": "top", "fontsize": 7, "rotation": rotation}
+    axes.annotate(words, place, xytext=(0, -9), textcoords="offset points", **style)

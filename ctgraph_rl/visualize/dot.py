@@ -6,32 +6,15 @@ from collections.abc import Iterator, Mapping
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize import states as drawn
 from ctgraph_rl.visualize.layout import lay_out
-from ctgraph_rl.visualize.states import (
-    DECISION,
-    END,
-    FAIL,
-    FAIL_KEY,
-    HOME,
-    HOME_KEY,
-    WAIT,
-    Key,
-    edges,
-    ids_text,
-    states,
-)
+from ctgraph_rl.visualize.states import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Key
 from ctgraph_rl.visualize.style import colour
 
 MOST_LEAVES = 1024
 """End states up to which a file has the whole tree."""
 
-SHAPES: Mapping[StateType, str] = {
-    HOME: "house",
-    WAIT: "circle",
-    DECISION: "diamond",
-    END: "box",
-    FAIL: "octagon",
-}
+SHAPES: Mapping[StateType, str] = {HOME: "house", WAIT: "circle", DECISION: "diamond", END: "box", FAIL: "octagon"}
 
 
 def to_dot(task: Task, name: str = "") -> str:
@@ -53,14 +36,14 @@ def _statements(task: Task, name: str) -> Iterator[str]:
     b, p = task.graph.branching_factor, task.graph.wait_prob
     yield _attributes("graph", label=name, labelloc="t")
     yield _attributes("node", style="filled", fontname="sans-serif")
-    for state in (*states(layout), FAIL_KEY):
+    for state in (*drawn.states(layout), FAIL_KEY):
         kind, node = state
         rings = {"peripheries": "2"} if state == (END, goal) else {}
-        text = ids_text(task, state, layout.level[node])
+        text = drawn.ids_text(task, state, layout.level[node])
         yield _attributes(_name(state), label=text, shape=SHAPES[kind], fillcolor=colour(kind), **rings)
-    for start, end, action in edges(layout):
+    for start, end, action in drawn.edges(layout):
         yield _attributes(f"{_name(start)} -> {_name(end)}", label="any" if start == HOME_KEY else str(action))
-    for state in states(layout):
+    for state in drawn.states(layout):
         if state[0] == WAIT and p > 0:
             yield _attributes(f"{_name(state)} -> {_name(state)}", label=f"{WAIT_ACTION} (p={p:g})")
         if state[0] in (WAIT, DECISION):

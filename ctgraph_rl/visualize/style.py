@@ -14,13 +14,7 @@ from ctgraph_rl.visualize.layout import Layout
 
 DPI = 160
 
-MARKERS = {
-    StateType.HOME: "p",
-    StateType.WAIT: "o",
-    StateType.DECISION: "D",
-    StateType.END: "s",
-    StateType.FAIL: "8",
-}
+MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", StateType.END: "s", StateType.FAIL: "8"}
 """Pentagon, circle, diamond, square and octagon."""
 
 Point = tuple[float, float]

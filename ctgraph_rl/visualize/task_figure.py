@@ -7,21 +7,9 @@ from typing import Any
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.visualize import states as drawn
 from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_PATHS, in_digits, lay_out
-from ctgraph_rl.visualize.states import (
-    DECISION,
-    END,
-    FAIL,
-    FAIL_KEY,
-    HOME,
-    HOME_KEY,
-    WAIT,
-    Edge,
-    Key,
-    edges,
-    ids_text,
-    states,
-)
+from ctgraph_rl.visualize.states import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Edge, Key
 from ctgraph_rl.visualize.style import Point, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 
 Counts = Mapping[Any, float]
@@ -92,7 +80,7 @@ class _TaskPicture:
         self.values = {key: [float(value) for value in of] for key, of in values.items()}
         self.layout = lay_out(self.graph, [self.goal, *self._most_visited()])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
-        self.places = {state: self._place(state) for state in states(self.layout, self.waits)}
+        self.places = {state: self._place(state) for state in drawn.states(self.layout, self.waits)}
         self.size, beside = self._sizes()
         self.has_room, self.has_numbers = beside >= ROOM, beside >= ROOM_FOR_NUMBERS
 
@@ -144,17 +132,13 @@ class _TaskPicture:
         return f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
 
     def _draw_edges(self) -> None:
-        found = list(edges(self.layout, self.waits))
+        found = list(drawn.edges(self.layout, self.waits))
         lines = [[self.places[edge.start], self.places[edge.end]] for edge in found]
         strong = [self._is_strong(edge) for edge in found]
         widths = [self._width(edge) for edge in found]
         order = sorted(range(len(found)), key=strong.__getitem__)
-        draw_lines(
-            self.axes,
-            [lines[i] for i in order],
-            colors=["0" if strong[i] else GREY for i in order],
-            linewidths=[widths[i] for i in order],
-        )
+        style = {"colors": ["0" if strong[i] else GREY for i in order], "linewidths": [widths[i] for i in order]}
+        draw_lines(self.axes, [lines[i] for i in order], **style)
         row = 1.0 if self.waits else 0.5
         nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
         draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)
@@ -214,7 +198,7 @@ class _TaskPicture:
         """Return the text within a node."""
         if self.visits:
             return _short(self.visits.get(state, 0))
-        return ids_text(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
+        return drawn.ids_text(self.task, state, self.layout.level[state[1]]) if self.ids else INITIALS[state[0]]
 
     def _draw_goal(self) -> None:
         """A star below the goal, and the decisions below every end state of a tree that is not drawn whole."""
@@ -281,9 +265,8 @@ class _TaskPicture:
     def _meaning(self) -> str:
         """Return the meaning of numbers and widths."""
         nodes = "visits" if self.visits else "observation ids" if self.ids else ""
-        numbers = [
-            name for name, given in (("probability", self.policy), ("Q", self.values)) if given and self.has_numbers
-        ]
+        numbers = ["probability"] if self.policy and self.has_numbers else []
+        numbers += ["Q"] if self.values and self.has_numbers else []
         at_edges = f"at edges: {', '.join(['action', *numbers])}" if self.has_room else ""
         black = "black: the likeliest action" if self.policy else ""
         return "; ".join(filter(None, [f"in nodes: {nodes}" if nodes else "", at_edges, black]))

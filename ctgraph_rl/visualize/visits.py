@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -70,16 +71,9 @@ def visits(
             return acted
 
     bound = isinstance(policy, RandomPolicy)  # to another environment, which evaluate refuses
-    ends = evaluate(
-        policy if bound else Watched,
-        [task],
-        num_episodes,
-        seed=seed,
-        greedy=greedy,
-        episodes_per_row=episodes_per_row,
-        initial_state=initial_state,
-        curriculum=curriculum,
-    )
+    play = partial(evaluate, seed=seed, greedy=greedy, episodes_per_row=episodes_per_row)
+    acting = policy if bound else Watched
+    ends = play(acting, [task], num_episodes, initial_state=initial_state, curriculum=curriculum)
     return _count(task, torch.cat(seen), ends[0])
 
 

@@ -188,10 +188,9 @@ def _candidates(image_set: GroupedImages, count: int) -> Tensor:
     kept_by_both = 1 - image_set.between / UNRELATED
     group_share = 1 - math.sqrt(kept_by_both / kept_by_image) if kept_by_image else 0.0
     group = torch.arange(1, len(image_set.groups) + 1)
-    common = _redraw(
-        torch.zeros(cells**2, dtype=torch.int64), 1.0, _words(seed, torch.tensor(0), torch.tensor(0), cells)
-    )
-    blueprints = _redraw(common, group_share, _words(seed, group, torch.tensor(0), cells))
+    zero = torch.tensor(0)
+    common = _redraw(zero.expand(cells**2), 1.0, _words(seed, zero, zero, cells))
+    blueprints = _redraw(common, group_share, _words(seed, group, zero, cells))
     words = _words(seed, group, torch.arange(1, count + 1).unsqueeze(-1), cells)
     return _redraw(blueprints, 1 - math.sqrt(kept_by_image), words)
 

@@ -46,10 +46,8 @@ class ImageFile:
         classes, instances, side = _read(self.path).shape[:3]
         size = side if self.size is None else self.size
         whole = is_int(size, 1) and (size % side == 0 or side % size == 0)
-        require(
-            self._hash_rule(),
-            (whole, f"size must be a multiple or a divisor of the file's {side} pixels, got {size!r}"),
-        )
+        size_rule = f"size must be a multiple or a divisor of the file's {side} pixels, got {size!r}"
+        require(self._hash_rule(), (whole, size_rule))
         found = {"size": size, "num_images": classes, "num_variants": instances, "shape": (1, size, size)}
         for name, value in found.items():
             object.__setattr__(self, name, value)
