@@ -82,7 +82,7 @@ class Contender:
 
 
 class Counter(EnvBase):
-    """The trivial environment: it counts to four and starts anew.
+    """The trivial environment: it counts to four and starts again.
 
     A batch starts at 0, 1, 2, 3, 0, ...: rows end at every step, so that TorchRL merges a reset at every step.
     """

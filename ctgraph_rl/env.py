@@ -336,7 +336,7 @@ class CTGraphEnv(EnvBase):
         return render(self.tasks, self.state_type, self.node, self.goal_leaf, observation, size=size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start all rows anew with another seed and their tasks' goals; the next `reset` gives their first episodes."""
+        """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))
         self.rows.set_seed(seed)  # type: ignore[arg-type]
 

@@ -91,7 +91,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         """Start an episode.
 
         Args:
-            seed: start the random stream of (seed, row 0), in [0, 2**63); None: go on with the present one.
+            seed: start the random stream of (seed, row 0), in [0, 2**63); None: continue the present one.
             options: without use.
         """
         seed = _plain(seed)
@@ -202,7 +202,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         """Start an episode in all rows, or in those of a mask.
 
         Args:
-            seed: start the random streams of (seed + i, row 0), or of a list's seeds; None: go on with the present.
+            seed: start the random streams of (seed + i, row 0), or of a list's seeds; None: continue the present ones.
             options: ``{"reset_mask": bool [N]}`` says which rows; the others stay as they are.
 
         Raises:

@@ -20,7 +20,7 @@ Policy = Callable[[Tensor, Tensor], Tensor]
 
 
 class Steps(NamedTuple):
-    """T steps of N rows. Finished rows start anew at once, so every entry is a step that was taken.
+    """T steps of N rows. Finished rows are reset at once, so every entry is a step that was taken.
 
     What was seen at the end of an episode is not kept: it is terminal, so nothing is to be learned from it.
     """

@@ -42,7 +42,7 @@ class Player:
 
     @torch.no_grad()
     def start(self) -> None:
-        """Begin an episode; a trial goes on, as in `evaluate`."""
+        """Begin an episode; a trial continues, as in `evaluate`."""
         goes_on = TRIAL in self.memory.keys() and not self.data.is_empty()  # noqa: SIM118, it iterates over rows
         memory = self.data.select(*self.memory.keys()) if goes_on else self.memory
         self.data = self.env.reset().update(memory)
