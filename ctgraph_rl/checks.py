@@ -35,6 +35,14 @@ def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bo
         return False
 
 
+def is_shallow(value: object, levels: int) -> bool:
+    """True for a value of JSON with at most so many lists and objects within each other."""
+    if not isinstance(value, (dict, list)):
+        return True
+    items = value.values() if isinstance(value, dict) else value
+    return levels > 0 and all(is_shallow(item, levels - 1) for item in items)
+
+
 def at_least_one(**values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is an integer >= 1."""
     return [(is_int(value, 1), f"{name} must be an integer >= 1, got {value!r}") for name, value in values.items()]

@@ -16,6 +16,8 @@ from typing import Any
 
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
+from ctgraph_rl.tasks.configurations import observations_of
 from ctgraph_rl.tasks.images import ImageSet, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
@@ -32,7 +34,6 @@ from curricula.order import sequence as sequence
 from curricula.order import shuffle as shuffle
 from curricula.order import split as split
 
-OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
 MOVABLE = ("home", "fail", "wait", "decision", "end")
 
 
@@ -218,7 +219,7 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
 
 def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wait_images: int = 100) -> Task:
     """A task on another graph, observed in one of the ways of `observability`; all else stays."""
-    observations = _observations(graph, kind, num_wait_images)
+    observations = observations_of(graph, kind, num_wait_images)
     images = _with_room(task.images, observations.last_id + 1, exact=True)
     return replace(task, graph=graph, goal=tuple(goal), observations=observations, images=images)
 
@@ -272,7 +273,7 @@ def _random_goal(graph: CTGraph, source: random.Random) -> tuple[int, ...]:
 def _random_task(choices: Sequence[Sequence[Any]], source: random.Random) -> Task:
     b, d, p, kind, seed = (choice[below(source, len(choice))] for choice in choices)
     graph = CTGraph(b, d, p)
-    observations = _observations(graph, kind)
+    observations = observations_of(graph, kind)
     goal = _random_goal(graph, source)
     return Task(graph, goal, observations, PaperImages(observations.last_id + 1, seed))
 
@@ -285,10 +286,8 @@ def _cut(task: Task, depth: int, nested: bool) -> Task:
 
 
 def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Observations:
-    ids: dict[str, Any] = {}
-    for kind in kinds:
-        first, last = observations.ids(StateType[kind.upper()])
-        ids[f"{kind}_ids"] = (first + shift, last + shift)
+    ranges = {kind: observations.ids(StateType[kind.upper()]) for kind in kinds}
+    ids: dict[str, Any] = {f"{kind}_ids": (first + shift, last + shift) for kind, (first, last) in ranges.items()}
     return replace(observations, **ids)
 
 
@@ -297,21 +296,3 @@ def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageS
     settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
     fits = images.num_images == num_images if exact else images.num_images >= num_images
     return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore
-
-
-def _observations(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Observations:
-    """Ids from 2 on: waits, decisions and ends where states have images of their own, else decisions first."""
-    require(
-        (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
-        (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
-    )
-    unique = kind in ("full", "decisions")
-    waits = {"full": graph.num_wait_states, "confounding": num_wait_images}.get(kind, 1)
-    decisions, ends = (graph.num_decision_states, graph.num_end_states) if unique else (1, 1)
-    order = [("wait", waits), ("decision", decisions)] if unique else [("decision", decisions), ("wait", waits)]
-    ids: dict[str, Any] = {}
-    first = 2
-    for name, size in (*order, ("end", ends)):
-        ids[f"{name}_ids"] = (first, first + size - 1)
-        first += size
-    return Observations(**ids, unique_waits=kind == "full", unique_decisions=unique)

@@ -20,7 +20,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, is_shallow, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
@@ -61,7 +61,7 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         require(*_key_rules(meta))
         require(*_value_rules(meta))
         environments = [read_environment(file.parent / config) for config in meta["config_paths"]]
-        pool = Pool([graph_goals(environment) for environment in environments], meta["task_order"])
+        pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
         tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
         source, protocol = f"meta-JSON file {file.name}", _labels(meta, tasks, numbers)
@@ -104,11 +104,6 @@ def read_environment(path: Path) -> dict[str, Any]:
     content = _read(path)
     with _named(path):
         return read_task(content, ())
-
-
-def graph_goals(environment: dict[str, Any]) -> int:
-    """The number of goals of an environment."""
-    return environment["graph"].num_end_states
 
 
 def _task(environment: dict[str, Any], leaf: int) -> Task:
@@ -162,18 +157,8 @@ def _read(path: Path) -> dict[str, Any]:
         except RecursionError as error:
             raise ValueError(f"must be nested at most {MOST_NESTING} levels deep") from error
         require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
-        require((_nesting(content) <= MOST_NESTING, f"must be nested at most {MOST_NESTING} levels deep"))
+        require((is_shallow(content, MOST_NESTING), f"must be nested at most {MOST_NESTING} levels deep"))
     return content
-
-
-def _nesting(value: Any) -> int:
-    """The number of levels of lists and objects, counted up to one more than allowed."""
-    level, values = 0, [value]
-    while values and level <= MOST_NESTING:
-        nested = [v for v in values if isinstance(v, (list, dict))]
-        values = [item for v in nested for item in (v.values() if isinstance(v, dict) else v)]
-        level += bool(nested)
-    return level
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import is_int, is_real, is_shallow, require
 
 MOST = 10**6
 """Largest number of a block or task: tables are as long."""
@@ -83,12 +83,5 @@ def check(measurement: Mapping[str, Any]) -> None:
     require(
         *((holds(value), f"{name} must be {what}, got {value!r:.80}") for (holds, what), name, value in rules),
         (not missing, f"{', '.join(missing)} must be there"),
-        (_is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
+        (is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
     )
-
-
-def _is_shallow(value: Any, levels: int) -> bool:
-    if not isinstance(value, (dict, list)):
-        return True
-    items = value.values() if isinstance(value, dict) else value
-    return levels > 0 and all(_is_shallow(item, levels - 1) for item in items)

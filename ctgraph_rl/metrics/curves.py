@@ -37,10 +37,8 @@ class Curves:
     def __post_init__(self) -> None:
         rows = len(self.performance)
         if self.performance.ndim != 2 or (len(self.blocks), len(self.frames)) != (rows, rows) or rows == 0:
-            raise ValueError(
-                f"performance must be [evaluations, tasks] with a block and frames each, got {self.performance.shape}, "
-                f"{len(self.blocks)} blocks and {len(self.frames)} frames"
-            )
+            got = f"{self.performance.shape}, {len(self.blocks)} blocks and {len(self.frames)} frames"
+            raise ValueError(f"performance must be [evaluations, tasks] with a block and frames each, got {got}")
         if list(self.blocks) != sorted(self.blocks) or self.blocks[-1] > len(self.trained):
             raise ValueError(f"blocks must rise from 0 to at most {len(self.trained)}, got {self.blocks}")
 

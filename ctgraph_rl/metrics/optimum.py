@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -75,11 +76,12 @@ def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     return torch.where(episodes == 0, 0.0, episodes * (best - returns))
 
 
-@defined(
+of_first_success = partial(defined, source=PAPER, missing="a goal was never reached")
+
+
+@of_first_success(
     "ctgraph_rl/first-reward",
     "1/T sum_j frames_j to the first reward / (E[frames of a random episode] / P_R)",
-    PAPER,
-    missing="a goal was never reached",
     inputs=_FIRST_BLOCK | {"frames": "first_frames"},
 )
 def frames_to_first_reward(
@@ -101,11 +103,9 @@ def frames_to_first_reward(
     return _at_first_success(frames, episodes, success_rates) / torch.tensor(random_frames, dtype=torch.float64)
 
 
-@defined(
+@of_first_success(
     "ctgraph_rl/search-efficiency",
     "1/T sum_j E[kappa_j] / episodes_j to the first reward",
-    PAPER,
-    missing="a goal was never reached",
     inputs=_FIRST_BLOCK | {"expected_episodes": "search_episodes"},
 )
 def search_efficiency(

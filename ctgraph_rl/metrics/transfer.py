@@ -67,7 +67,7 @@ def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Ten
         areas: float64 [tasks], or [seeds, tasks] to be averaged over seeds.
         expert_areas: the same of the experts, whose seeds may be others.
     """
-    own, expert = (_over_seeds(each) for each in (areas, expert_areas))
+    own, expert = (each.mean(0) if each.ndim == 2 else each for each in (areas, expert_areas))
     return ratio(own - expert, 1 - expert)
 
 
@@ -101,7 +101,3 @@ def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:
         count = len(curves.of_block(next(i for i, block in enumerate(curves.trained, 1) if task in block)))
         if len(expert) != count:
             raise ValueError(f"the expert of task {task + 1} needs {count} evaluations as its block, got {len(expert)}")
-
-
-def _over_seeds(areas: Tensor) -> Tensor:
-    return areas.mean(0) if areas.ndim == 2 else areas

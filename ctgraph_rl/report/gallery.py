@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,11 +50,11 @@ class Gallery:
         self._taken: set[str] = set()
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
 
-    def write(self, names: tuple[str, ...], figures: Iterator[CaptionedFigure]) -> list[Written]:
-        """Draw and write figures; ``names`` begin those of their files."""
+    def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
+        """Draw and write figures, but for those that are None; ``names`` begin those of their files."""
         written = []
         with style():
-            for one in figures:
+            for one in filter(None, figures):
                 path = f"{FOLDER}/{self._stem(*names, one.kind)}"
                 one.figure.savefig(self.folder / f"{path}.png")
                 one.figure.set_layout_engine("none")  # its work is done, and is most of the time of a figure

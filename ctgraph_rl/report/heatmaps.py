@@ -8,7 +8,7 @@ from typing import Any
 
 from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.sections import Matrix, Result, Section
-from ctgraph_rl.report.style import WIDTH, short
+from ctgraph_rl.report.style import WIDTH, new_figure, short
 from ctgraph_rl.report.trees import Trees
 
 MOST_NUMBERS = 10
@@ -45,13 +45,11 @@ def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFi
 
 def draw_matrices(section: Section, result: Result) -> Any:
     """Performance and transfer side by side; below each other where there are many tasks."""
-    from matplotlib.figure import Figure
-
     performance, transfer = result.performance(), result.transfer()
     tasks, rows = len(performance[0]), len(performance)
     beside = tasks <= MOST_NUMBERS
     height = min(1.3 + 0.34 * rows, 6.0) if beside else min(1.2 + 0.22 * rows, 6.5)
-    figure = Figure(figsize=(WIDTH, height if beside else 2 * height))
+    figure = new_figure(WIDTH, height if beside else 2 * height)
     left, right = figure.subplots(1, 2) if beside else figure.subplots(2, 1)
     draw_performance(left, performance, section.labels, section.trained)
     draw_transfer(right, transfer, section.labels, section.trained)

@@ -8,7 +8,7 @@ from typing import Any
 
 from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Point, Result, Section, evaluation_curve, training_curve
-from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, short
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
 from ctgraph_rl.runs.read import Curve
 
 MOST_TASKS = 32
@@ -59,7 +59,7 @@ def draw_tasks(section: Section) -> Any:
     labels = section.labels[:MOST_TASKS]
     rows = math.ceil(len(labels) / COLUMNS)
     columns = min(COLUMNS, len(labels))
-    figure = _figure(max(0.5 * WIDTH, WIDTH * columns / COLUMNS), 1.45 * rows + 0.5)
+    figure = new_figure(max(0.5 * WIDTH, WIDTH * columns / COLUMNS), 1.45 * rows + 0.5)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for panel in grid.ravel()[len(labels) :]:
         panel.axis("off")
@@ -75,7 +75,7 @@ def draw_tasks(section: Section) -> Any:
 
 def draw_training(section: Section) -> Any:
     """Draw the return while training over all blocks, a curve for each agent."""
-    figure = _figure(WIDTH, 2.3)
+    figure = new_figure(WIDTH, 2.3)
     axes = figure.subplots()
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
@@ -91,12 +91,6 @@ def has_training(section: Section) -> bool:
     """Return whether any run measured its return while training."""
     finished = [run for result in section.results for run in result.finished]
     return any(run.history is not None and run.history.training for run in finished)
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height))
 
 
 def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:

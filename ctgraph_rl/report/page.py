@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
 from ctgraph_rl.report import results
-from ctgraph_rl.report.figures import of_agent, of_section
-from ctgraph_rl.report.gallery import Gallery, Written
-from ctgraph_rl.report.heatmaps import MOST_NAMES
+from ctgraph_rl.report.gallery import CaptionedFigure, Gallery, Written
+from ctgraph_rl.report.heatmaps import MOST_NAMES, transfer_maps
+from ctgraph_rl.report.learning_curves import learning_curves, training_curves
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
-from ctgraph_rl.report.trees import Trees, find_trees
+from ctgraph_rl.report.trees import Trees, find_trees, task_trees
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
+
+OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (learning_curves, training_curves)
+"""Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
+
+OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
+"""Figures of an agent with finished runs, in their order; None where there is nothing to draw."""
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
@@ -129,7 +135,7 @@ def _part(section: Section, gallery: Gallery) -> Part:
     return Part(
         section,
         facts=list(_facts(section)),
-        figures=gallery.write((section.name,), of_section(section)),
+        figures=gallery.write((section.name,), (draw(section) for draw in OF_SECTION)),
         table=next(results.pages(results.selected(section.rows))),
         everything=next(results.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
@@ -157,7 +163,7 @@ def _facts(section: Section) -> Iterator[tuple[str, Any]]:
 
 def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
     trees = find_trees(result.finished[0]) if result.finished else None
-    drawn = iter(()) if trees is None else of_agent(section, result, trees)
+    drawn = () if trees is None else (draw(section, result, trees) for draw in OF_AGENT)
     figures = gallery.write((section.name, result.agent), drawn)
     settings = list(result.runs[0].settings.items())
     return AgentPart(result, figures, list(_numbers(section, result)), settings, list(_sentences(result, trees)))

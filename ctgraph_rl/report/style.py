@@ -45,6 +45,13 @@ def style() -> Iterator[None]:
         yield
 
 
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure, sizes in inches; it has the report's style within `style`."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height))
+
+
 def agent_style(position: int) -> dict[str, Any]:
     """Colour, line and mark of an agent's curve; needs `style`."""
     from matplotlib import rcParams

@@ -12,11 +12,14 @@ from inspect import signature
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
+
+OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
+"""How much of its state a task shows; see `observations_of`."""
 
 
 def ct_graph(
@@ -41,24 +44,38 @@ def ct_graph(
         image_seed: seed of the image set.
     """
     graph = CTGraph(branching_factor, depth, wait_prob)
-    observations = _one_id_per_state(graph) if fully_observable else _ONE_ID_PER_KIND
+    observations = observations_of(graph, "full" if fully_observable else "surjective")
     num_images = observations.last_id + 1
     images = OneHot(num_images) if one_hot else PaperImages(num_images, image_seed)
     return Task(graph, (1,) * depth if goal is None else goal, observations, images)
 
 
-_ONE_ID_PER_KIND = Observations(decision_ids=(2, 2), wait_ids=(3, 3), end_ids=(4, 4))
+def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Observations:
+    """Return observations with ids from 2 on: waits, decisions, ends where states have their own, else decisions first.
 
+    Args:
+        graph: the tree.
+        kind: ``full``, an id for each state; ``decisions``, as full but one id for all wait states; ``surjective``, one
+            id for each kind of state; ``confounding``, as surjective but wait states draw one of several ids.
+        num_wait_images: ids of wait states, for ``confounding``.
 
-def _one_id_per_state(graph: CTGraph) -> Observations:
-    decisions, ends = 2 + graph.num_wait_states, 2 + graph.num_wait_states + graph.num_decision_states
-    return Observations(
-        wait_ids=(2, decisions - 1),
-        decision_ids=(decisions, ends - 1),
-        end_ids=(ends, ends + graph.num_end_states - 1),
-        unique_waits=True,
-        unique_decisions=True,
+    Raises:
+        ValueError: for another kind, and no wait images.
+    """
+    require(
+        (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
+        (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
     )
+    unique = kind in ("full", "decisions")
+    waits = {"full": graph.num_wait_states, "confounding": num_wait_images}.get(kind, 1)
+    decisions, ends = (graph.num_decision_states, graph.num_end_states) if unique else (1, 1)
+    order = [("wait", waits), ("decision", decisions)] if unique else [("decision", decisions), ("wait", waits)]
+    ids: dict[str, Any] = {}
+    first = 2
+    for name, size in (*order, ("end", ends)):
+        ids[f"{name}_ids"] = (first, first + size - 1)
+        first += size
+    return Observations(**ids, unique_waits=kind == "full", unique_decisions=unique)
 
 
 def ct_fo_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
@@ -101,8 +118,8 @@ def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
         goal: two decisions in 1..2.
         image_seed: seed of the image set.
     """
-    observations = Observations(decision_ids=(2, 2), wait_ids=(3, 102), end_ids=(103, 103))
-    return Task(CTGraph(2, 2, 0.0), goal, observations, PaperImages(104, image_seed))
+    graph = CTGraph(2, 2, 0.0)
+    return Task(graph, goal, observations_of(graph, "confounding"), PaperImages(104, image_seed))
 
 
 def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:

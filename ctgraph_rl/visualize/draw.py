@@ -43,11 +43,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _write(selection: Selection, arguments: argparse.Namespace) -> None:
     """Write all that is asked for."""
-    films = arguments.gif is None or selection.policy is not None
-    require(
-        (films, "a film needs a policy: name a --policy or a --run"),
-        *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes),
-    )
+    film = arguments.gif is None or selection.policy is not None, "a film needs a policy: name a --policy or a --run"
+    require(film, *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes))
     if arguments.figure is not None:
         _figure(selection, arguments).savefig(arguments.figure, dpi=arguments.dpi)
     if arguments.dot is not None:
