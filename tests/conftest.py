@@ -50,6 +50,12 @@ def one_thread() -> None:
     torch.set_flush_denormal(True)
 
 
+@pytest.fixture(autouse=True)
+def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restore the variable that a run sets, so that no test leaves it to processes of another."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+
+
 @pytest.fixture
 def compose() -> Iterator[Callable[..., DictConfig]]:
     """Composes a configuration from overrides, as the command line does."""

@@ -50,6 +50,7 @@ def command(tmp_path, monkeypatch):
         (tmp_path / "added_later.py").write_text(CODE.format(argument="cell, " if more else ""))
         sys.modules.pop("added_later", None)
         monkeypatch.setattr(settings, "ADDED", {} if added is None else {"agent.cell": "lstm"})
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
         monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "--config-dir", "conf", *SHORT, "agent=mine", *overrides])
         run.main()
         return max((tmp_path / "runs").glob("*/*"), key=lambda folder: folder.stat().st_mtime)
