@@ -115,7 +115,9 @@ class Native:
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that are none of the rows' tasks.
         """
-        call = self._call = self._call or self._prepare()
+        if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
+            self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
+        call = self._call
         n, before = call.num_rows, self._own(state, call)
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
@@ -159,7 +161,8 @@ class Native:
             tables |= {"level_first": x.legacy.level_first, "level_shift": x.legacy.level_shift}
         if x.taps is not None:
             tables |= {"tap_index": x.taps[0], "tap_weight": x.taps[1]}
-        self._alive = {name: value.contiguous() for name, value in tables.items()}
+        self._alive = [value.contiguous() for value in tables.values()]
+        self._pointers = [value.data_ptr() for value in self._alive]
         return _Call(
             num_rows=n,
             num_tasks=len(tables["tasks"]),
@@ -170,7 +173,7 @@ class Native:
             num_levels=0 if x.legacy is None else x.legacy.level_first.shape[1],
             own_seeds=len(params.seed) > 1,
             **{name: int(getattr(uses, name)) for name in _USES},
-            **{name: value.data_ptr() for name, value in self._alive.items()},
+            **dict(zip(tables, self._pointers, strict=True)),
         )
 
 

@@ -36,9 +36,6 @@ def _place(entry: Entry) -> int:
     return ORDER.index(module) if module in ORDER else len(ORDER)
 
 
-_LISTED = {entry.metric.__name__: entry for entry in sorted(METRICS.values(), key=_place)}
-
-
 def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
     """Compute every metric whose inputs are given, by name.
 
@@ -46,7 +43,8 @@ def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
         given: inputs by the names that `ctgraph_rl.metrics.inputs.INPUTS` has; an `Undefined` in place of one that
             there is not, with the reason.
     """
-    return {name: entry.of(given) for name, entry in _LISTED.items() if given.keys() >= {*entry.required}}
+    listed = sorted(METRICS.values(), key=_place)  # as a user's own script may define others
+    return {entry.metric.__name__: entry.of(given) for entry in listed if given.keys() >= {*entry.required}}
 
 
 def summary(performance: Tensor, trained: Trained) -> dict[str, Metric]:
@@ -88,7 +86,7 @@ def definitions() -> dict[str, Definition]:
     return dict(sorted(found.items(), key=lambda item: item[1].id))
 
 
-AGAINST_EXPERTS = tuple(entry.metric for entry in _LISTED.values() if "experts" in entry.required)
+AGAINST_EXPERTS = tuple(entry.metric for entry in METRICS.values() if "experts" in entry.required)
 """Lifelong metrics that compare training with experts'."""
 
 

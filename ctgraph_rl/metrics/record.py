@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import wraps
 from inspect import Parameter, signature
 from typing import Any, NamedTuple, ParamSpec
@@ -113,7 +114,8 @@ def defined(
         inputs: the inputs of arguments with other names.
 
     Raises:
-        ValueError: for an argument without default that is no input, and a name or an id that another metric has.
+        ValueError: for a function without inputs, an argument without default that is no input or whose name is nearly
+            that of one, and a name or an id that another metric has.
     """
     meaning = Definition(definition, formula, source, partial)
 
@@ -137,7 +139,11 @@ def _register(metric: Callable[..., Metric], meaning: Definition, renamed: Mappi
     name, arguments = metric.__name__, signature(metric).parameters
     sources = {argument: renamed.get(argument, argument) for argument in arguments}
     required = [argument for argument, each in arguments.items() if each.default is Parameter.empty]
+    options = arguments.keys() - {*required, *(each for each in sources if sources[each] in INPUTS)}
+    misspelt = [each for each in options if get_close_matches(each, INPUTS, cutoff=0.8)]
+    stars = [each for each in required if arguments[each].kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)]
     unknown = [*(renamed.keys() - arguments.keys()), *(each for each in required if sources[each] not in INPUTS)]
+    unknown += [*misspelt, *stars, *([] if required else ["any argument"])]
     if unknown:
         raise ValueError(f"metric {name}: no input for {', '.join(unknown)}. Inputs: {', '.join(INPUTS)}")
     if name in METRICS or meaning.id in (entry.meaning.id for entry in METRICS.values()):

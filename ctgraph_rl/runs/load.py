@@ -20,7 +20,7 @@ from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.packages import class_named
 from ctgraph_rl.runs.checkpoints import Checkpoints, read_plain
-from ctgraph_rl.runs.settings import parameters_of, with_added
+from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -129,10 +129,7 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     kind: Any = class_named(ours[1], ours[2])
     defined = kind is not None and issubclass(kind, torch.nn.Module)
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
-    return partial(
-        kind,
-        **with_added(part, {key: value for key, value in settings.items() if key != "_target_"}, parameters_of(kind)),
-    )
+    return partial(kind, **{key: value for key, value in with_added(settings).items() if key != "_target_"})
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:

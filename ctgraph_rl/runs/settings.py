@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from inspect import Parameter, signature
 from typing import Any
 
-ADDED: dict[str, Any] = {}
-"""Settings that were added after runs had been stored, such as ``"agent.cell"``, with the value for "as before".
+ADDED: dict[str, dict[str, Any]] = {}
+"""Settings that were added after runs had been stored, each with the value for "as before".
 
-With this value a setting is part of no run name and of no comparison, and stored runs without it have it. So a setting
-that is added to a yaml file needs a line here, and then no earlier run is lost.
+They are listed by the ``_target_`` that takes them, as ``{"baselines.rl2.RL2": {"cell": "lstm"}}``; those of no target
+by their dotted names under ``run``, as ``{"run": {"meta.enabled": False}}``. With this value a setting is part of no
+run name and of no comparison, and stored runs without it have it. So a setting that is added to a yaml file needs an
+entry here, and then no earlier run is lost.
 """
 
 
@@ -25,28 +27,34 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-def as_before(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings without those of `ADDED` that have the value that means "as before"."""
+def as_before(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a run without those of `ADDED` that have the value for "as before"."""
+    kept = _without(settings, ADDED.get("run", {}))
+    return {
+        key: _without(value, _added_to(value)) if isinstance(value, Mapping) else value for key, value in kept.items()
+    }
+
+
+def _without(settings: Mapping[str, Any], added: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings without added ones of this value, and without groups that then are empty."""
     kept: dict[str, Any] = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            kept[key] = as_before(value, f"{name}.")
-        elif name not in ADDED or value != ADDED[name]:
-            kept[key] = value
+        inner = _without(value, added, f"{name}.") if isinstance(value, Mapping) else value
+        is_added = name in added and json.dumps(value, sort_keys=True) == json.dumps(added[name], sort_keys=True)
+        if not is_added and (inner != {} or value == {}):
+            kept[key] = inner
     return kept
 
 
-def with_added(group: str, settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return the settings of a group, such as ``agent``, with those of `ADDED` that a stored run lacks.
+def _added_to(group: Any) -> dict[str, Any]:
+    """Return the settings that were added to the target of a group."""
+    return ADDED.get(str(group.get("_target_")), {}) if isinstance(group, Mapping) else {}
 
-    Args:
-        group: which group of the configuration they are.
-        settings: of a stored run.
-        names: the settings that the group takes today.
-    """
-    added = {key.removeprefix(f"{group}."): value for key, value in ADDED.items() if key.startswith(f"{group}.")}
-    return {**{name: value for name, value in added.items() if name in names}, **settings}
+
+def with_added(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a stored group, such as ``agent``, with those that were added to its target since."""
+    return {**_added_to(settings), **settings}
 
 
 def parameters_of(function: Any) -> dict[str, Parameter]:
@@ -66,6 +74,11 @@ def digest(settings: Mapping[str, Any]) -> str:
 
 def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]:
     """Return in words which settings of a stored run differ from those that are given."""
-    before, now = dict(flat(stored)), dict(flat(given))
-    pairs = {key: (before.get(key, ADDED.get(key)), now.get(key, ADDED.get(key))) for key in sorted({*before, *now})}
+    before, now = dict(flat(as_before(stored))), dict(flat(as_before(given)))
+
+    def value_of(key: str, values: Mapping[str, Any]) -> Any:
+        group, _, name = key.partition(".")
+        return values.get(key, _added_to(given.get(group)).get(name, ADDED.get("run", {}).get(key)))
+
+    pairs = {key: (value_of(key, before), value_of(key, now)) for key in sorted({*before, *now})}
     return [f"{key}={old!r} instead of {new!r}" for key, (old, new) in pairs.items() if old != new]

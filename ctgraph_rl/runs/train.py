@@ -31,16 +31,8 @@ MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent for an environment's unbatched observation and action specs."""
 
 MEMBERS = (
-    "num_envs",
-    "num_steps",
-    "policy",
-    "policy_for",
-    "initial_state",
-    "start_task",
-    "end_task",
-    "learn",
-    "to",
-    "state_dict",
+    *("num_envs", "num_steps", "policy", "policy_for", "initial_state"),
+    *("start_task", "end_task", "learn", "to", "state_dict"),
 )
 """Members that a run needs of an agent."""
 

@@ -8,6 +8,7 @@ import pickle
 import re
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from ctgraph_rl.core.tree import TreeParams
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collect import collect, make_env
 from ctgraph_rl.policies import RandomPolicy
+from ctgraph_rl.tasks.configurations import ct_co_b1
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
 
 WIDE = replace(surjective(70, 1, 0.2), goal_change=(1, 2))
@@ -355,3 +357,19 @@ def test_the_kernel_reads_every_parameter_of_tasks_but_what_it_has_in_another_fo
     named = {name for part in (TreeParams, ObservationParams, RewardParams) for name in part._fields}
 
     assert {name for name in named if not re.search(rf"\.{name}\b", source)} <= in_another_form
+
+
+def test_tables_that_are_moved_into_shared_memory_are_read_where_they_are():
+    tasks = [ct_co_b1()] * 64
+    moved, plain = (CTGraphEnv(tasks, seed=3, kernel=kernel) for kernel in ("required", "off"))
+    here, there = moved.reset(), plain.reset()
+    actions = torch.randint(0, 3, (20, 64), generator=torch.Generator().manual_seed(0))
+    before = moved.rows.bank.data_ptr()
+
+    ForkingPickler.dumps(moved)  # as torch.multiprocessing does with what it sends
+
+    assert moved.rows.bank.data_ptr() != before
+    for action in actions:
+        _, here = moved.step_and_maybe_reset(here.set("action", action))
+        _, there = plain.step_and_maybe_reset(there.set("action", action))
+        assert torch.equal(here["observation"], there["observation"])

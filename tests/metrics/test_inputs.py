@@ -55,6 +55,42 @@ def test_a_metric_of_anything_else_is_refused_where_it_is_defined():
     assert not {"best_colour", "renamed"} & METRICS.keys()
 
 
+def misspelt(performance: Tensor, curve: object = None) -> Tensor:
+    return performance
+
+
+def starred(*performance: Tensor) -> Tensor:
+    return performance[0]
+
+
+def without_inputs() -> Tensor:
+    return torch.tensor([1.0])
+
+
+@pytest.mark.parametrize(
+    ("terms", "what"), [(misspelt, "curve"), (starred, "performance"), (without_inputs, "any argument")]
+)
+def test_a_metric_that_would_be_computed_of_something_else_is_refused(terms, what):
+    with pytest.raises(ValueError, match=f"metric {terms.__name__}: no input for {what}"):
+        defined(f"test/{terms.__name__}", "x", "test")(terms)
+
+
+def test_a_metric_that_a_users_script_defines_is_computed():
+    before = dict(METRICS)
+    try:
+        defined("test/late", "x", "test")(late)
+        found = metrics.of_matrix(torch.tensor([[0.0], [1.0]]), [(0,)])
+    finally:
+        METRICS.clear()
+        METRICS.update(before)
+
+    assert found["late"].value == 0.5
+
+
+def late(performance: Tensor) -> Tensor:
+    return performance
+
+
 @pytest.mark.parametrize(("name", "which"), [("forgetting", "test/new"), ("another_name", "chaudhry2018/f")])
 def test_a_name_and_an_id_are_those_of_one_metric(name, which):
     def terms(performance: Tensor) -> Tensor:

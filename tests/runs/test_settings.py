@@ -49,7 +49,7 @@ def command(tmp_path, monkeypatch):
         (tmp_path / "conf" / "agent" / "mine.yaml").write_text(YAML + more)
         (tmp_path / "added_later.py").write_text(CODE.format(argument="cell, " if more else ""))
         sys.modules.pop("added_later", None)
-        monkeypatch.setattr(settings, "ADDED", {} if added is None else {"agent.cell": "lstm"})
+        monkeypatch.setattr(settings, "ADDED", {} if added is None else {"added_later.Agent": {"cell": "lstm"}})
         monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
         monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "--config-dir", "conf", *SHORT, "agent=mine", *overrides])
         run.main()
@@ -88,29 +88,56 @@ def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch
     assert (resumed / "restarts.jsonl").exists()
 
 
-def test_a_stored_run_of_another_value_is_another_run():
-    assert settings.differences({"agent": {"a": 1}, "seed": 0}, {"agent": {"a": 2}, "seed": 0}) == [
-        "agent.a=1 instead of 2"
-    ]
-    assert settings.as_before({"agent": {"cell": "lstm"}, "seed": 0}) == {"agent": {"cell": "lstm"}, "seed": 0}
+MINE = {"_target_": "mine.Agent", "gamma": 0.9}
+LSTM, GRU = {**MINE, "cell": "lstm"}, {**MINE, "cell": "gru"}
+
+
+def test_without_added_settings_all_count():
+    stored, given = {"agent": {"a": 1}, "seed": 0}, {"agent": {"a": 2}, "seed": 0}
+
+    assert settings.differences(stored, given) == ["agent.a=1 instead of 2"]
+    assert settings.as_before({"agent": LSTM, "seed": 0}) == {"agent": LSTM, "seed": 0}
 
 
 def test_settings_that_were_added_have_their_value_in_runs_without_them(monkeypatch):
-    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm", "device": "cpu"})
-    stored = {"agent": {"gamma": 0.9}, "seed": 0}
+    added = {"mine.Agent": {"cell": "lstm"}, "run": {"meta.enabled": False, "device": "cpu"}}
+    monkeypatch.setattr(settings, "ADDED", added)
+    stored, same = {"agent": MINE, "seed": 0}, {"agent": LSTM, "seed": 0, "device": "cpu", "meta": {"enabled": False}}
 
-    assert settings.differences(stored, {"agent": {"gamma": 0.9, "cell": "lstm"}, "seed": 0, "device": "cpu"}) == []
-    other = {"agent": {"gamma": 0.9, "cell": "gru"}, "seed": 0}
-    assert settings.differences(stored, other) == ["agent.cell='lstm' instead of 'gru'"]
-    assert settings.digest(stored) == settings.digest({**stored, "agent": {"gamma": 0.9, "cell": "lstm"}})
-    assert settings.digest(stored) != settings.digest(other)
-    assert settings.with_added("agent", {"gamma": 0.9}, {"gamma", "cell"}) == {"gamma": 0.9, "cell": "lstm"}
-    assert settings.with_added("agent", {"gamma": 0.9}, {"gamma"}) == {"gamma": 0.9}
-    assert settings.with_added("agent", {"cell": "gru"}, {"cell"}) == {"cell": "gru"}
+    assert settings.differences(stored, same) == settings.differences(same, stored) == []
+    assert settings.digest(stored) == settings.digest(same)
+    assert settings.as_before(same) == stored
+    assert settings.with_added(MINE) == LSTM
+    assert settings.with_added(GRU) == GRU
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        ({"agent": GRU}, "agent.cell='lstm' instead of 'gru'"),
+        ({"meta": {"enabled": 0}}, None),  # equal in Python, and yet another name
+        ({"meta": {"enabled": True}}, "meta.enabled=False instead of True"),
+        ({"agent": {**LSTM, "_target_": "theirs.Agent"}}, "agent._target_='mine.Agent' instead of 'theirs.Agent'"),
+    ],
+)
+def test_settings_of_another_value_or_target_are_another_run(monkeypatch, change, difference):
+    monkeypatch.setattr(settings, "ADDED", {"mine.Agent": {"cell": "lstm"}, "run": {"meta.enabled": False}})
+    stored = {"agent": MINE, "seed": 0}
+
+    assert settings.digest({**stored, **change}) != settings.digest(stored)
+    assert difference is None or difference in settings.differences(stored, {**stored, **change})
+
+
+def test_an_added_setting_may_be_a_group(monkeypatch):
+    monkeypatch.setattr(settings, "ADDED", {"mine.Agent": {"options": {"a": 1, "b": None}}})
+    more = {"agent": {**MINE, "options": {"b": None, "a": 1}}}
+
+    assert settings.digest(more) == settings.digest({"agent": MINE})
+    assert settings.differences(more, {"agent": MINE}) == []
 
 
 def test_runs_from_before_and_after_a_setting_was_added_are_one_group(tmp_path, monkeypatch):
-    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm"})
+    monkeypatch.setattr(settings, "ADDED", {"mine.Agent": {"cell": "lstm"}})
     first = {"kind": "run", "curriculum": "c", "fingerprint": "f"}
     for name, more in (("old", {}), ("new", {"cell": "lstm"}), ("other", {"cell": "gru"})):
         (tmp_path / name).mkdir()
@@ -139,6 +166,6 @@ def test_a_stored_agent_without_a_setting_that_was_added_is_loaded(tmp_path, mon
     with pytest.raises(ValueError, match="cell"):
         load(tmp_path)
 
-    monkeypatch.setattr(settings, "ADDED", {"agent.cell": "lstm"})
+    monkeypatch.setattr(settings, "ADDED", {"baselines.a2c.A2C": {"cell": "lstm"}})
 
     assert load(tmp_path).frames == 256
