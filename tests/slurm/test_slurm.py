@@ -182,7 +182,7 @@ def test_a_cancelled_cell_saves_and_stays_cancelled(slurm, sweep, tmp_path):
 
     assert re.findall(r"(?:JobState|Restarts)=(\w+)", slurm("scontrol", "show", "job", job)) == ["CANCELLED", "0"]
     told = next(tmp_path.glob("runs/.slurm/*log.out")).read_text()  # with lines of SLURM's own in between
-    assert re.search(r"SIGTERM: saving after this update \.\.\. .*saved, the same command goes on", told, re.DOTALL)
+    assert re.search(r"SIGTERM: saving after this update \.\.\. .*saved; the same command resumes", told, re.DOTALL)
 
 
 @pytest.fixture
