@@ -31,7 +31,7 @@ def goal_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[i
     """Return the numbers of the end states that goals, given by their decisions, are in tasks.
 
     Raises:
-        ValueError: for another number of goals, and for one that is none of its task's tree.
+        ValueError: if there is not one goal per row, or a goal is no end state of its row's tree.
     """
     goals, n = list(goals), len(tasks)
     require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))

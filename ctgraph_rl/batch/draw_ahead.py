@@ -36,7 +36,7 @@ class Draws:
         return params.seed is own.seed and params.row is own.row and uses is self._uses
 
     def move(self, tick: Tensor, words: Words) -> None:
-        """Go on to ticks, int64 [N], at most one ahead, whose draws are known."""
+        """Advance to ticks, int64 [N], at most one ahead, with their draws."""
         self._tick, self._now = tick, words
 
     def now(self, tick: Tensor) -> Words:

@@ -113,7 +113,7 @@ class Native:
             arrays: those of ``_ARRAYS``, filled or read.
 
         Raises:
-            ValueError: for arrays of a wrong shape or dtype, and for states that are none of the rows' tasks.
+            ValueError: for arrays of a wrong shape or dtype, and for states that the rows' tasks cannot have.
         """
         if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes

@@ -30,7 +30,7 @@ class Curriculum:
         source: where the sequence comes from.
         blocks: the blocks in order.
         evaluation: how performance is measured.
-        protocol: what the learner is told.
+        protocol: what the learner observes of task ids and boundaries.
 
     Raises:
         ValueError: for no blocks, an empty name, tasks that one environment cannot hold together, and a protocol or an

@@ -62,14 +62,14 @@ class GroupedImages(SquareImages):
 
     Ids follow the groups: ``groups=(1, 1, 4, 8)`` makes id 0 the first group, id 1 the second, ids 2..5 the third. The
     distance of two images is their mean absolute pixel difference as a share of 254. An image has c x c cells, each
-    uniform over 0..254. A group's blueprint is a common blueprint with a share s_g of its cells drawn anew, an image is
-    its group's blueprint with a share s_i drawn anew. Cells that are not shared differ by D = 256/765 on average, hence
+    uniform over 0..254. A group's blueprint is a common blueprint with a share s_g of its cells redrawn, an image is
+    its group's blueprint with a share s_i redrawn. Cells that are not shared differ by D = 256/765 on average, hence
 
         within = D (1 - (1 - s_i)^2),    between = D (1 - (1 - s_i)^2 (1 - s_g)^2)
 
     are the expected distances of two images of one group and of two groups, and the shares follow from them. What came
-    out for a seed is told by `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
-    up or down, so at least one is drawn anew when within >= D (1 - (1 - 1 / c^2)^2), the least value allowed.
+    out for a seed is computed by `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
+    up or down, so at least one is redrawn when within >= D (1 - (1 - 1 / c^2)^2), the least value allowed.
 
     No image occurs twice: one drawn before is left out. Longer groups begin with the shorter ones.
 
@@ -203,7 +203,7 @@ def _words(seed: int, row: Tensor, tick: Tensor, cells: int) -> Tensor:
 
 
 def _redraw(levels: Tensor, share: float, words: Tensor) -> Tensor:
-    """Levels [..., n] with a share of them drawn anew, each with this probability: share * n, rounded at random."""
+    """Levels [..., n] with a share of them redrawn, each with this probability: share * n, rounded at random."""
     n = levels.shape[-1]
     count = (words[..., 2 * n : 2 * n + 1] + int(share * n * 2**32)) >> 32
     rank = words[..., :n].argsort(dim=-1, stable=True).argsort(dim=-1)
