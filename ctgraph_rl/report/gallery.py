@@ -51,7 +51,7 @@ class Gallery:
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
 
     def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
-        """Draw and write figures, skipping None; file names start with ``names``."""
+        """Draw and write figures, skipping None; their file names start with ``names``."""
         written = []
         with style():
             for one in filter(None, figures):
