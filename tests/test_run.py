@@ -17,7 +17,7 @@ from helpers.sweeping import command_line, files_in
 import curricula
 from baselines.lstm_ppo import LSTMPPO
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, Protocol, RunLog, evaluate
-from ctgraph_rl.log.provenance import named
+from ctgraph_rl.log.provenance import NUMBERS, named
 from ctgraph_rl.metrics import definitions
 from ctgraph_rl.run import run
 from ctgraph_rl.runs import job
@@ -78,7 +78,7 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
     }
     assert first["config"]["curriculum"]["num_frames"] == 1024
     assert set(first["versions"]) == {"ctgraph_rl", "torch", "torchrl", "tensordict", "python"}
-    assert (first["num_threads"], first["schema"]) == (1, 1)
+    assert (first["num_threads"], first["schema"], first["numbers"]) == (1, 1, NUMBERS)
 
 
 def test_the_files_of_a_run_agree_with_its_log(finished):

@@ -15,6 +15,12 @@ from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.packages import is_published
 from ctgraph_rl.tasks.curriculum import Curriculum
 
+NUMBERS = 1
+"""The numbers version of this package: raised when equal configurations and seeds give other weights or measurements.
+
+Every run stores it. A log without it is of numbers version 1.
+"""
+
 
 def versions() -> dict[str, str]:
     """Return the versions of this package and of what computes its numbers."""
@@ -42,6 +48,7 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
         "versions": versions(),
+        "numbers": NUMBERS,
         **machine(),
     }
 
