@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
@@ -35,31 +35,48 @@ class Status(NamedTuple):
     reason: str = ""
 
 
-def status_of(folder: Path, since: float = 0.0, error: str | None = None) -> Status:
+class Outcome(NamedTuple):
+    """The results and the failure of a run directory, each as what differs once it is written again; None without."""
+
+    results: Hashable = None
+    failure: Hashable = None
+
+    @classmethod
+    def of(cls, folder: Path) -> Outcome:
+        """Return what a directory holds; no clock is compared, for that of another machine may be behind."""
+        return cls(_identity(folder / METRICS), _identity(folder / FAILURE))
+
+
+NOTHING = Outcome()
+
+
+def _identity(path: Path) -> Hashable:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None) -> Status:
     """Return the status of the cell of a run directory.
 
     Args:
         folder: the directory; need not exist.
-        since: results and failures that are older do not count, in seconds since 1970.
+        before: results and failures that do not count, as they were there before the sweep began.
         error: what it raised, where that is known.
     """
-    if _is_younger(folder / METRICS, since):
+    now = Outcome.of(folder)
+    if now.results not in (None, before.results):
         return Status(DONE)
     user = lock_holder(folder)
     if user is not None:
         return Status(IN_USE, f"by {user}")
     if error is not None:
         return Status(FAILED, error)
-    if _is_younger(folder / FAILURE, since):
+    if now.failure not in (None, before.failure):
         return Status(FAILED, (folder / FAILURE).read_text(encoding="utf-8", errors="replace"))
     return Status(MISSING, "stopped; the next start resumes it" if (folder / LOG).exists() else "not begun")
-
-
-def _is_younger(path: Path, since: float) -> bool:
-    try:
-        return path.stat().st_mtime >= since
-    except OSError:
-        return False
 
 
 def lock_holder(folder: Path) -> str | None:
@@ -106,15 +123,14 @@ class SweepProgress:
     It looks at their directories every second, or less often where that takes long.
 
     Args:
-        folders: the cells' run directories.
-        since: see `status_of`.
+        cells: the cells' run directories, each with the outcome before the sweep; see `status_of`.
         console: where it shows; default: standard error.
     """
 
-    def __init__(self, folders: Sequence[Path], since: float = 0.0, console: Console | None = None) -> None:
-        self.total, self.since = len(folders), since
+    def __init__(self, cells: Mapping[Path, Outcome], console: Console | None = None) -> None:
+        self.total = len(cells)
         self.console = Console(stderr=True) if console is None else console
-        self._left = list(folders)
+        self._left = dict(cells)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
@@ -151,8 +167,8 @@ class SweepProgress:
 
     def look(self) -> tuple[int, int, int]:
         """Return the numbers of cells that are done, failed and running."""
-        found = {folder: status_of(folder, self.since).state for folder in self._left}
-        self._left = [folder for folder, state in found.items() if state != DONE]
+        found = {folder: status_of(folder, before).state for folder, before in self._left.items()}
+        self._left = {folder: before for folder, before in self._left.items() if found[folder] != DONE}
         counts = Counter(found.values())
         return self.total - len(self._left), counts[FAILED], counts[IN_USE]
 

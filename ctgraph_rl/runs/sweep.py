@@ -6,7 +6,6 @@ import io
 import os
 import signal
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
@@ -20,7 +19,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.runs.status import DONE, SHOWN, SweepProgress, report, status_of
+from ctgraph_rl.runs.status import DONE, NOTHING, SHOWN, Outcome, SweepProgress, report, status_of
 
 if TYPE_CHECKING:
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper as Base
@@ -68,15 +67,15 @@ class Sweeper(Base):
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
         [batch] = self.split_arguments(overrides, None)
         cells = self.cells(batch)
-        since = time.time() if self.config.overwrite else 0.0
-        left = [folder for folder in cells if status_of(folder, since).state != DONE]
+        before = {folder: Outcome.of(folder) if self.config.overwrite else NOTHING for folder in cells}
+        left = [folder for folder in cells if status_of(folder, before[folder]).state != DONE]
         errors: dict[Path, str] = {}
         try:
             if left and not self.status:
-                with sigterm_exits(), SweepProgress(list(cells), since):
+                with sigterm_exits(), SweepProgress(before):
                     self._launch({folder: cells[folder] for folder in left}, errors)
         finally:
-            found = {folder: status_of(folder, since, errors.get(folder)) for folder in cells}
+            found = {folder: status_of(folder, before[folder], errors.get(folder)) for folder in cells}
             names = shortened(list(cells.values()))
             statuses = dict(zip(names, found.values(), strict=True))
             print(report(statuses, len(batch) - len(cells), None if self.status else SHOWN))

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from rich.console import Console
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import explain
-from ctgraph_rl.runs.status import SHOWN, Status, SweepProgress, lock_holder, report, status_of
+from ctgraph_rl.runs.status import SHOWN, Outcome, Status, SweepProgress, lock_holder, report, status_of
 from ctgraph_rl.runs.sweep import shortened, sigterm_exits, why
 
 SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -119,6 +120,33 @@ def test_overwrite_runs_what_is_done_again(learned, monkeypatch):
     code = sweep(monkeypatch, "seed=0,1", "overwrite=true")
 
     assert code == 0 and len(learned) == 4
+
+
+@pytest.mark.parametrize("behind", [3600, -3600])
+def test_overwrite_counts_what_a_machine_with_another_clock_has_run(learned, monkeypatch, capsys, behind):
+    sweep(monkeypatch, "seed=0,1")
+    capsys.readouterr()
+    learn = job.learn
+
+    def elsewhere(cfg, run_dir, interrupt):
+        learn(cfg, run_dir, interrupt)
+        there = time.time() - behind
+        os.utime(run_dir / "metrics.json", (there, there))
+
+    monkeypatch.setattr(job, "learn", elsewhere)
+    code = sweep(monkeypatch, "seed=0,1", "overwrite=true")
+
+    assert code == 0 and ALL_DONE.format(2) in capsys.readouterr().out
+
+
+def test_overwrite_counts_no_outcome_of_before(learned, monkeypatch, capsys):
+    sweep(monkeypatch, f"seed=0,{UNLUCKY}")
+    capsys.readouterr()
+
+    code = sweep(monkeypatch, f"seed=0,{UNLUCKY}", "overwrite=true", "hydra.sweeper.status=true")
+
+    assert code == 1
+    assert "sweep of 2 cells: 0 done, 0 failed, 0 in use, 2 missing" in capsys.readouterr().out
 
 
 def test_a_sweep_that_is_interrupted_says_where_it_stands(learned, monkeypatch, capsys):
@@ -280,8 +308,7 @@ def test_the_status_of_a_cell_is_read_from_its_directory(tmp_path):
     assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
     reasons = ["not begun", "stopped; the next start resumes it", "ValueError: no\n"]
     assert [reason for _, reason in found[:3]] == reasons
-    later = (tmp_path / "metrics.json").stat().st_mtime + 1
-    assert status_of(tmp_path, since=later).state == "missing"
+    assert status_of(tmp_path, before=Outcome.of(tmp_path)).state == "missing"
 
 
 def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
@@ -317,7 +344,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     for cell in cells[:10]:
         cell.mkdir()
         (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).touch()
-    progress = SweepProgress(cells, console=Console(file=io.StringIO()))
+    progress = SweepProgress(dict.fromkeys(cells, Outcome()), console=Console(file=io.StringIO()))
 
     done, failed, running = progress.look()
 
@@ -333,7 +360,8 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
 
     (tmp_path / "metrics.json").touch()  # done before, so it tells nothing of the rate
 
-    with SweepProgress([tmp_path, tmp_path / "b"], console=Console(file=shown)) as progress:
+    cells = dict.fromkeys([tmp_path, tmp_path / "b"], Outcome())
+    with SweepProgress(cells, console=Console(file=shown)) as progress:
         progress._stop.wait(1.5)
 
     assert shown.getvalue() == "1/2 cells done  0 failed  0 running  0/min  ? left\n"
