@@ -20,6 +20,7 @@ from ctgraph_rl.core import rewards
 
 FLOORS = (
     ("ctgraph_rl", "checks", "metrics"),
+    ("disk",),
     ("core",),
     ("tasks",),
     ("packages", "batch", "agent", "curricula"),

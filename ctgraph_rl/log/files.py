@@ -1,10 +1,8 @@
-"""The files of a run: their names, written whole or not at all, and a lock for their directory."""
+"""The files of a run: their names, and a lock for their directory."""
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +10,8 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
+
+from ctgraph_rl.disk import open_own
 
 LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curriculum.json"
 """Files of a run's directory; `METRICS` is there when the run is complete."""
@@ -25,51 +25,8 @@ CHECKPOINTS = "checkpoints"
 LOCK = ".lock"
 """The file in a directory that names the process that has locked it."""
 
-PART = ".part"
-"""Ending of a file that is being written."""
-
 SECONDS_BETWEEN_ATTEMPTS = 0.5
 """To get a lock that another process has."""
-
-
-def write_whole(path: Path | str, content: bytes) -> None:
-    """Write a file so that whoever reads it, also after a crash, finds the old content or the new.
-
-    Raises:
-        OSError: if it cannot be written; names the path and the bytes needed and free. The old file stays.
-    """
-    path = Path(path)
-    part = path.with_name(path.name + PART)
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise cannot_write(path, len(content), error) from error
-
-
-def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
-    """The error for a file that cannot be written, with sizes."""
-    try:
-        free = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free"
-    except OSError:
-        free = "its disk cannot be read"
-    return OSError(error.errno, f"{error.strerror}: cannot write {num_bytes / 1e6:.1f} MB to {path}, {free}")
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last; folders of some file systems cannot be synced, which then do it themselves."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 @contextmanager
@@ -95,7 +52,7 @@ def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterato
 def _lock(path: Path, waiting: Callable[[], object] | None) -> BinaryIO:
     """The open and locked file."""
     while True:
-        file = path.open("ab+", buffering=0)
+        file = open_own(path, "ab+")
         try:
             if _is_locked(file):
                 if _is_still_there(file, path):
@@ -142,9 +99,3 @@ def _signed(file: BinaryIO) -> BinaryIO:
     with suppress(OSError):
         file.write(f"process {os.getpid()} on {socket.gethostname()} since {now}".encode())
     return file
-
-
-def append_line(path: Path, value: object) -> None:
-    """Add a value to a file of JSON lines."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(value) + "\n")

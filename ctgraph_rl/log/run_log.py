@@ -35,7 +35,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.log.files import cannot_write, write_whole
+from ctgraph_rl.disk import cannot_write, write_whole
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Curves, Regime
 

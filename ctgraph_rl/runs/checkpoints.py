@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from ctgraph_rl.checks import is_int
-from ctgraph_rl.log.files import PART, write_whole
+from ctgraph_rl.disk import PART, write_whole
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1

@@ -14,9 +14,10 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
+from ctgraph_rl.disk import append_line, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
-from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS, append_line, write_whole
+from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import machine, provenance
 from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores

@@ -9,12 +9,12 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 
+from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
-from ctgraph_rl.log.files import LOCK, locked, write_whole
+from ctgraph_rl.log.files import LOCK, locked
 
 HOLD = """
 import sys, time
@@ -51,7 +51,7 @@ def test_a_failure_at_any_step_keeps_the_old_content_and_removes_the_half(tmp_pa
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(f"ctgraph_rl.log.files.{step}", fail)
+    monkeypatch.setattr(f"ctgraph_rl.disk.{step}", fail)
     with pytest.raises(OSError, match=r"No space left on device: cannot write 2\.0 MB to .*file, [\d.]+ MB are free"):
         write_whole(tmp_path / "file", bytes(2_000_000))
 
@@ -71,7 +71,7 @@ def test_a_kill_between_any_two_steps_keeps_the_old_content_or_has_the_new(tmp_p
         with monkeypatch.context() as patch:
             write_whole(tmp_path / "file", b"old")
             names = {"fsync": "os.fsync", "replace": "Path.replace", "folder": "_sync_folder"}
-            patch.setattr(f"ctgraph_rl.log.files.{names[step]}", kill)
+            patch.setattr(f"ctgraph_rl.disk.{names[step]}", kill)
             with pytest.raises(Killed):
                 write_whole(tmp_path / "file", b"new")
             found.append((tmp_path / "file").read_bytes())
@@ -82,7 +82,7 @@ def test_a_kill_between_any_two_steps_keeps_the_old_content_or_has_the_new(tmp_p
 def test_content_and_folder_reach_the_disk_before_it_returns(tmp_path, monkeypatch):
     synced = []
     monkeypatch.setattr(
-        "ctgraph_rl.log.files.os.fsync", lambda number: synced.append(os.readlink(f"/proc/self/fd/{number}"))
+        "ctgraph_rl.disk.os.fsync", lambda number: synced.append(os.readlink(f"/proc/self/fd/{number}"))
     )
 
     write_whole(tmp_path / "file", b"new")
@@ -189,10 +189,10 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
 
 
 def test_a_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
-    def read_only(self, *_, **__):
-        raise OSError(errno.EROFS, "Read-only file system", str(self))
+    def read_only(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
 
-    monkeypatch.setattr(Path, "open", read_only)
+    monkeypatch.setattr("ctgraph_rl.disk.os.open", read_only)
 
     with pytest.raises(OSError, match=rf"Read-only file system: '{tmp_path}"), locked(tmp_path):
         pytest.fail("no lock")

@@ -1,0 +1,154 @@
+"""Files in directories that others may have made: written whole and never through a link, read within limits.
+
+Every file of the package is written here. A file is written beside its place and renamed, so what was there, a link
+too, is replaced and not followed. Folders that the package names itself are refused where they are links. What the
+user names, such as ``--csv FILE``, is taken as it is: `write_named`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from ctgraph_rl.checks import require
+
+PART = ".part"
+"""Ending of a file that is being written."""
+
+
+def write_whole(path: Path | str, content: bytes | str) -> None:
+    """Write a file so that whoever reads it, also after a crash, finds the old content or the new.
+
+    A link at its place is replaced, its target stays as it is.
+
+    Args:
+        path: the file.
+        content: bytes, or text that is written in UTF-8.
+
+    Raises:
+        OSError: if it cannot be written; names the path and the bytes needed and free. The old file stays.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + PART)
+    data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+    try:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file:  # a new file, never one that is there, nor a link
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise cannot_write(path, len(data), error) from error
+
+
+def write_named(path: Path | str, content: bytes | str) -> None:
+    """Write a file that the user has named: where a link, a pipe or a device is, the content goes through it.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    path = Path(path)
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        path.write_bytes(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
+    else:
+        write_whole(path, content)
+
+
+def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
+    """The error for a file that cannot be written, with sizes."""
+    try:
+        free = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB are free"
+    except OSError:
+        free = "its disk cannot be read"
+    return OSError(error.errno, f"{error.strerror}: cannot write {num_bytes / 1e6:.1f} MB to {path}, {free}")
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last; folders of some file systems cannot be synced, which then do it themselves."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def made_folder(folder: Path) -> Path:
+    """Make a folder that the package names itself, unless it is there.
+
+    Raises:
+        ValueError: if a link is there.
+    """
+    require_no_link(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def require_no_link(path: Path) -> None:
+    """Refuse a symbolic link that might lead out of a directory.
+
+    Raises:
+        ValueError: if there is one.
+    """
+    fix = "links within a run's directory or a report's are not followed; remove it"
+    require((not path.is_symlink(), f"{path} is a symbolic link, and {fix}"))
+
+
+def open_own(path: Path, mode: str) -> BinaryIO:
+    """Open a file to change it in place, unbuffered.
+
+    Args:
+        path: the file.
+        mode: as of `open`, binary.
+
+    Raises:
+        ValueError: for a symbolic link, a file with a second name elsewhere, and what is no regular file.
+    """
+    require_no_link(path)
+    opener = _opener(os.O_NOFOLLOW | os.O_NONBLOCK)
+    file: BinaryIO = open(path, mode, 0, opener=opener)  # type: ignore[assignment] # noqa: SIM115 - it is returned
+    found = os.fstat(file.fileno())
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        file.close()
+        raise ValueError(f"{path} must be a regular file without another name, as hard links are; remove it")
+    return file
+
+
+def _opener(more: int) -> Callable[[str, int], int]:
+    return lambda path, flags: os.open(path, flags | more, 0o666)
+
+
+def append_line(path: Path, value: object) -> None:
+    """Add a value to a file of JSON lines."""
+    with open_own(path, "ab") as file:
+        file.write(json.dumps(value).encode() + b"\n")
+
+
+def read_regular(path: Path | str, most: int) -> bytes:
+    """Return the content of a regular file, which is not opened where it is a pipe or a device.
+
+    Args:
+        path: the file, or a link to it.
+        most: bytes that it may have.
+
+    Raises:
+        ValueError: for a larger file, and what is no regular file.
+        OSError: if it cannot be read.
+    """
+    with open(path, "rb", opener=_opener(os.O_NONBLOCK)) as file:
+        found = os.fstat(file.fileno())
+        require((stat.S_ISREG(found.st_mode), f"{path} must be a regular file"))
+        content = file.read(most + 1) if found.st_size <= most else b""
+    size = max(found.st_size, len(content))
+    require((size <= most, f"{path} has {size:,} bytes, the limit is {most:,}"))
+    return content
