@@ -1,8 +1,8 @@
 """The sequences of the modulating-masks paper and of the baselines that were compared with it.
 
-Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), repository dlpbc/mask-lrl, its data in anon-6994/mmn-lrl. Image seed 1
-and one image for all wait states throughout. A one-hot task id is part of the input of every method. PPO had 4 workers
-x 128 steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
+Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), repository dlpbc/mask-lrl, which has no results. Image seed 1 and one
+image for all wait states throughout. A one-hot task id is part of the input of every method. PPO had 4 workers x 128
+steps; 10 greedy episodes of all tasks were evaluated every 5,120 frames.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.tasks.values import random_frames_to_goal
+from ctgraph_rl.tasks.values import optimal_value, random_frames_to_goal, worst_value
 
 NO_EXPERTS = "no experts were given"
 
@@ -49,7 +49,7 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         "performance": log.performance(count),
         "trained": curriculum.trained,
         "curves": curves,
-        "mastered_returns": metrics.MASTERED * best,
+        "mastered_returns": mastered_returns(curriculum.tasks),
         "best": best,
         "zero": torch.tensor([task.fail_reward for task in curriculum.tasks], dtype=torch.float64),
         "end_rates": log.last("end_rate", count),
@@ -61,7 +61,8 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         "search_episodes": [task.graph.expected_search_episodes for task in curriculum.tasks],
         **_first_blocks(log, curriculum),
         **_regimes(log, curriculum, best, experts),
-        **_areas(curves, best, experts),
+        **_areas(curves, best, experts, trapezoids=False),
+        **_areas(curves, best, experts, trapezoids=True),
     }
 
 
@@ -76,12 +77,29 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
 
 def optimal_values(tasks: Sequence[Task]) -> Tensor:
     """Each task's best mean return, float64 [tasks]; NaN where a graph is too large to know."""
-    return torch.tensor([_optimal_value(task) for task in tasks], dtype=torch.float64)
+    return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64)
 
 
-def _optimal_value(task: Task) -> float:
+def mastered_returns(tasks: Sequence[Task]) -> Tensor:
+    """The mean return from which on each task is mastered, float64 [tasks]; NaN as for `optimal_values`.
+
+    It is `metrics.MASTERED` times a positive optimal value, and that share of the way from the worst possible mean
+    return to any other, so that the optimal policy masters every task.
+    """
+    return torch.tensor([_mastered_return(task) for task in tasks], dtype=torch.float64)
+
+
+def _mastered_return(task: Task) -> float:
+    best, share = _known(optimal_value, task), metrics.MASTERED
+    if best > 0 or math.isnan(best):
+        return share * best
+    return best - (1 - share) * (best - _known(worst_value, task))
+
+
+def _known(value: Callable[[Task, float], float], task: Task) -> float:
+    """An undiscounted value; NaN where the graph is too large to know it."""
     try:
-        return task.optimal_value(1.0)
+        return value(task, 1.0)
     except ValueError:
         return math.nan
 
@@ -140,20 +158,25 @@ def _returns(expert: RunLog) -> Tensor:
     return returns[~returns.isnan()]
 
 
-def _areas(curves: Curves, best: Tensor, experts: Sequence[RunLog] | None) -> dict[str, Any]:
+def _areas(curves: Curves, best: Tensor, experts: Sequence[RunLog] | None, trapezoids: bool) -> dict[str, Any]:
     """Return areas under curves for forward transfer; its definitions are of performance whose best is 1."""
+    kind = "trapezoid_areas" if trapezoids else "areas"
     try:
         require((experts is not None, NO_EXPERTS))
         best_is_1 = torch.allclose(best, torch.ones_like(best), rtol=0, atol=1e-9)
         require((best_is_1, "the definition needs tasks whose optimal value is 1"))
         alone = [expert.curves([(0,)]) for expert in experts or ()]
         metrics.check_experts(curves, [curve.own_stage(0) for curve in alone])
+        _check_stages(curves, least=2 if trapezoids else 1)
     except (ValueError, Undefined) as error:
-        names = ("areas", "expert_areas", "trapezoid_areas", "expert_trapezoid_areas")
-        return dict.fromkeys(names, Undefined(str(error)))
-    return {
-        "areas": metrics.stage_areas(curves),
-        "expert_areas": torch.cat([metrics.stage_areas(each) for each in alone]),
-        "trapezoid_areas": metrics.stage_areas(curves, trapezoids=True),
-        "expert_trapezoid_areas": torch.cat([metrics.stage_areas(each, trapezoids=True) for each in alone]),
-    }
+        return dict.fromkeys((kind, f"expert_{kind}"), Undefined(str(error)))
+    expert_areas = torch.cat([metrics.stage_areas(each, trapezoids) for each in alone])
+    return {kind: metrics.stage_areas(curves, trapezoids), f"expert_{kind}": expert_areas}
+
+
+def _check_stages(curves: Curves, least: int) -> None:
+    """Raise `Undefined` for a task whose own block, as definitions need it, has no area of so many evaluations."""
+    for task in range(curves.performance.shape[1]):
+        count = len(curves.own_stage(task))
+        if count < least:
+            raise Undefined(f"areas by trapezoids need {least} evaluations, task {task + 1} has {count} in its block")

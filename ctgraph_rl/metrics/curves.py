@@ -119,10 +119,13 @@ def instant_cumulative_return(curves: Curves) -> Tensor:
     return curves.performance.sum(1)
 
 
-@defined("ben-iwhiwhu2022/tpot", "sum_t sum_j p_j(t)", LABS, aggregate=torch.sum)
+@defined("ben-iwhiwhu2022/tpot", "sum_{t>0} sum_j p_j(t)", LABS, aggregate=torch.sum)
 def total_performance_over_time(curves: Curves) -> Tensor:
-    """TPOT = sum_t ICR(t) over all evaluations; it grows with their number, so compare equal protocols only."""
-    return curves.performance.sum(1)
+    """TPOT = sum_{t>0} ICR(t) over all evaluations but those before training, which the published protocol lacks.
+
+    It grows with the number of evaluations, so compare equal protocols only.
+    """
+    return curves.performance[[block > 0 for block in curves.blocks]].sum(1)
 
 
 @defined(
@@ -160,7 +163,8 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
 
     Args:
         curves: the evaluations of a run.
-        threshold: what counts as mastered: a number, or one per task such as 0.9 times the optimal value.
+        threshold: what counts as mastered: a number, or one per task. A run takes 0.9 times the optimal value, and
+            where that is not positive 0.9 of the way from the worst possible mean return to it.
     """
     ends = curves.ends
     last = {task: block for block, tasks in enumerate(curves.trained, 1) for task in tasks}

@@ -127,7 +127,9 @@ def isolated_forgetting(performance: Tensor, trained: Trained | None = None, sca
     """F: what one block of another task takes from a task that was trained before; positive when it is forgotten.
 
     The source smooths curves over 20 evaluations first: `Curves.smoothed`; its tables show the value times 10. Tasks
-    may be trained again. Undefined where a block trains several tasks, and for a single task.
+    may be trained again: blocks of other tasks after the first training count, and none that trains the task itself.
+    The source's code counts the first cycle of tasks alone, or of more cycles a task's own later trainings, too.
+    Undefined where a block trains several tasks, and for a single task.
 
     Args:
         performance: the matrix.

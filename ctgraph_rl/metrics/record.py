@@ -95,7 +95,7 @@ def defined(
     source: str,
     *,
     partial: bool = False,
-    missing: str = "an evaluation is missing",
+    missing: str | Callable[..., str] = "an evaluation is missing",
     aggregate: Callable[[Tensor], Tensor] = torch.mean,
     inputs: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
@@ -109,7 +109,7 @@ def defined(
         formula: the formula.
         source: where it is defined.
         partial: see `Definition`.
-        missing: why a term may be without a value.
+        missing: why a term may be without a value, or a function of the same arguments that says why terms are.
         aggregate: makes the value of the terms; the mean of all but a few.
         inputs: the inputs of arguments with other names.
 
@@ -123,7 +123,8 @@ def defined(
         @wraps(terms)
         def metric(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
             try:
-                return _metric(meaning, terms(*args, **kwargs).flatten(), missing, aggregate)
+                why = missing if isinstance(missing, str) else missing(*args, **kwargs)
+                return _metric(meaning, terms(*args, **kwargs).flatten(), why, aggregate)
             except Undefined as reason:
                 return undefined(metric, str(reason))
 

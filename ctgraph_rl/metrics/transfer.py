@@ -8,6 +8,7 @@ curriculum; its curve is an argument.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,7 +16,6 @@ from torch import Tensor
 from ctgraph_rl.metrics.curves import CONTINUAL_WORLD, LABS_CODE, Curves
 from ctgraph_rl.metrics.record import Undefined, defined, ratio
 
-NO_HEADROOM = "an evaluation is missing or the expert leaves nothing to gain"
 SMALLEST_HEADROOM = 1e-3
 """1 - area of an expert below which the labs' code gives no forward transfer."""
 
@@ -55,7 +55,28 @@ def _area_or_nan(curves: Curves, task: int, area: Callable[[Tensor], Tensor]) ->
         return curves.performance.new_tensor(torch.nan)
 
 
-@defined("wolczyk2021/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)", CONTINUAL_WORLD, missing=NO_HEADROOM)
+def _no_transfer(areas: Tensor, expert_areas: Tensor, smallest_headroom: float = 0.0) -> str:
+    """Return each cause of terms without a value, with the tasks that it concerns."""
+    own, expert = _over_seeds(areas, expert_areas)
+    causes = {
+        "an evaluation is missing": own.isnan() | expert.isnan(),
+        "the expert leaves nothing to gain": ~own.isnan() & _is_full(expert, smallest_headroom),
+    }
+    tasks = {cause: (each.nonzero().flatten() + 1).tolist() for cause, each in causes.items()}
+    return "; ".join(f"{cause} (task {', '.join(map(str, of))})" for cause, of in tasks.items() if of)
+
+
+def _over_seeds(*areas: Tensor) -> list[Tensor]:
+    return [each.mean(0) if each.ndim == 2 else each for each in areas]
+
+
+def _is_full(expert_areas: Tensor, smallest_headroom: float) -> Tensor:
+    """bool [tasks]: whether an expert leaves nothing to gain, or less than the smallest headroom."""
+    headroom = 1 - expert_areas
+    return (headroom == 0) | (headroom < smallest_headroom)
+
+
+@defined("wolczyk2021/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)", CONTINUAL_WORLD, missing=_no_transfer)
 def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Tensor:
     """FT: what a task's own block gains by what came before, as a share of what was left to gain; at most 1.
 
@@ -67,7 +88,7 @@ def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Ten
         areas: float64 [tasks], or [seeds, tasks] to be averaged over seeds.
         expert_areas: the same of the experts, whose seeds may be others.
     """
-    own, expert = (each.mean(0) if each.ndim == 2 else each for each in (areas, expert_areas))
+    own, expert = _over_seeds(areas, expert_areas)
     return ratio(own - expert, 1 - expert)
 
 
@@ -75,7 +96,7 @@ def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Ten
     "ct-graph-labs/ft",
     "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j), AUC by trapezoids",
     LABS_CODE,
-    missing=NO_HEADROOM,
+    missing=partial(_no_transfer, smallest_headroom=SMALLEST_HEADROOM),
     inputs={"areas": "trapezoid_areas", "expert_areas": "expert_trapezoid_areas"},
 )
 def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor:
@@ -87,8 +108,8 @@ def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor
         areas: float64 [tasks] of ``stage_areas(curves, trapezoids=True)``.
         expert_areas: the same of the experts.
     """
-    headroom = 1 - expert_areas
-    return ratio(areas - expert_areas, torch.where(headroom < SMALLEST_HEADROOM, 0.0, headroom))
+    full = _is_full(expert_areas, SMALLEST_HEADROOM)
+    return ratio(areas - expert_areas, torch.where(full, 0.0, 1 - expert_areas))
 
 
 def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:

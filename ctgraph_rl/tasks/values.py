@@ -55,6 +55,12 @@ def optimal_value(task: Task, gamma: float) -> float:
     return _value_at_home(smallest_tree(task, is_needle(task)), BestActions(task, gamma))
 
 
+def worst_value(task: Task, gamma: float) -> float:
+    """The lowest expected discounted return from the home state, of any policy; arguments as `optimal_value`."""
+    require(*fraction(gamma=gamma))
+    return _value_at_home(smallest_tree(task, is_needle(task)), _WorstActions(task, gamma))
+
+
 def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
     """The expected discounted return of a memoryless policy from the home state; with gamma = 1 the mean return.
 
@@ -235,6 +241,19 @@ class BestActions:
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """Decide for the best child or fail. float64 [n] of [n, b]."""
         return self.task.step_reward + (self.gamma * children.amax(-1)).clamp_min(self.task.fail_reward)
+
+
+class _WorstActions(BestActions):
+    """The worst choice at every node."""
+
+    def at_wait(self, arrival: Tensor, level: int) -> Tensor:
+        """Wait until it ends or fail; the choice that is worst once stays worst. float64, as ``arrival``."""
+        p, s = self.task.graph.wait_prob, self.task.step_reward
+        return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_max(s + self.task.fail_reward)
+
+    def at_decision(self, children: Tensor, level: int) -> Tensor:
+        """Decide for the worst child or fail. float64 [n] of [n, b]."""
+        return self.task.step_reward + (self.gamma * children.amin(-1)).clamp_max(self.task.fail_reward)
 
 
 @dataclass(frozen=True)

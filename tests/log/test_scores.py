@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, metrics
-from ctgraph_rl.log.scores import optimal_values, scores
+from ctgraph_rl.log.scores import inputs_of, optimal_values, scores
 from ctgraph_rl.tasks.configurations import ct_su_b1
 from ctgraph_rl.tasks.values import random_frames_to_goal
 
@@ -86,6 +86,29 @@ def test_tasks_are_learned_by_the_share_of_their_own_optimum():
     assert scores(log, doubled)["tasks_learned"].terms == (1.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("rewards", "threshold"),
+    [
+        ({"goal_reward": -2.0, "fail_reward": -12.0}, -1.2),  # any end but the goal pays 0
+        ({"goal_reward": 0.0, "fail_reward": 0.0}, 0.0),
+        ({"step_reward": -0.5}, -1.2),  # failing at once is best, -1, and 6 steps to an end without the goal worst, -3
+        ({"step_reward": -0.5, "fail_reward": -9.0}, -3.0),  # 6 steps to the goal are best, -2, and failing last, -12
+        ({"goal_reward": 2.0, "fail_reward": -1.0}, 1.8),  # 0.9 times a positive optimum, whatever the worst is
+    ],
+)
+def test_the_optimal_policy_masters_a_task_whatever_the_sign_of_its_optimum(rewards, threshold):
+    task = replace(ct_su_b1((1, 1)), **rewards)
+    learned = Curriculum("one", 1, "here", (Block(task, 200),))
+    log, best = RunLog(), task.optimal_value(1.0)
+    evaluate(log, "before", 0, 0, best)
+    evaluate(log, "after", 1, 200, best)
+
+    found = inputs_of(log, learned, None)["mastered_returns"].item()
+
+    assert found == pytest.approx(threshold, abs=1e-12)
+    assert metrics.tasks_learned(log.curves(learned.trained), found).value == 1
+
+
 def test_without_experts_what_needs_them_is_undefined(log):
     found = scores(log, CURRICULUM)
 
@@ -147,6 +170,26 @@ def test_experts_with_other_evaluations_leave_transfer_undefined_after_a_whole_r
         found = scores(log, CURRICULUM, [other, expert(0.5, 0.5)])
         assert [found[name].undefined for name in TRANSFER] == [reason] * 2
         assert found["average_performance"].value == 0.625
+
+
+def test_a_task_trained_again_leaves_transfer_undefined_for_that_reason(log):
+    again = replace(CURRICULUM, blocks=(*CURRICULUM.blocks, Block(TASKS[0], 200)))
+    evaluate(log, "during", 3, 500, 0.5, 0.5)
+    evaluate(log, "after", 3, 600, 0.5, 0.5)
+
+    found = scores(log, again, [expert(0.5, 0.5), expert(0.5, 0.5)])
+
+    reason = "the definition needs each task trained once, task 1 is in 2 blocks"
+    assert [found[name].undefined for name in TRANSFER] == [reason] * 2
+
+
+def test_one_evaluation_a_block_has_a_mean_and_no_trapezoid(log):
+    log.measurements = [m for m in log.measurements if m.get("moment") != "during"]
+
+    found = scores(log, CURRICULUM, [expert(0.5), expert(0.5)])
+
+    assert found[TRANSFER[0]].terms == (1.0, 1.0)
+    assert found[TRANSFER[1]].undefined == "areas by trapezoids need 2 evaluations, task 1 has 1 in its block"
 
 
 def test_an_expert_without_a_finished_episode_is_none(log):

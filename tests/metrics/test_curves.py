@@ -112,8 +112,17 @@ def test_a_perfect_expert_leaves_nothing_to_gain_and_divides_nothing_by_zero():
         for function in (metrics.continual_world_forward_transfer, metrics.forward_transfer_from_experts)
     ]
 
-    reason = "1 of 3 terms have no value: an evaluation is missing or the expert leaves nothing to gain"
+    reason = "1 of 3 terms have no value: the expert leaves nothing to gain (task 2)"
     assert [(metric.value, metric.undefined, metric.n_undefined) for metric in found] == [(None, reason, 1)] * 2
+
+
+def test_each_cause_of_an_undefined_forward_transfer_is_named_with_its_tasks():
+    experts = tensor([1.0, NAN, 1.0, 0.5])
+
+    metric = metrics.continual_world_forward_transfer(tensor([0.5, 0.5, 0.75, NAN]), experts)
+
+    causes = "an evaluation is missing (task 2, 4); the expert leaves nothing to gain (task 1, 3)"
+    assert metric.undefined == f"4 of 4 terms have no value: {causes}"
 
 
 def test_the_labs_forward_transfer_needs_a_headroom_of_a_thousandth():
@@ -122,6 +131,7 @@ def test_the_labs_forward_transfer_needs_a_headroom_of_a_thousandth():
     metric = metrics.forward_transfer_from_experts(areas, tensor([0.9995, 0.25]))
 
     assert metric.terms == (None, pytest.approx(1 / 3, abs=1e-15))
+    assert metric.undefined == "1 of 2 terms have no value: the expert leaves nothing to gain (task 1)"
 
 
 def test_a_task_trained_twice_has_no_own_stage():
@@ -149,8 +159,9 @@ def test_evaluations_at_unequal_distances_have_no_area():
 def test_cumulative_return_is_the_sum_over_tasks_and_its_total_the_sum_over_time():
     now, total = metrics.instant_cumulative_return(CURVES), metrics.total_performance_over_time(CURVES)
 
-    assert now.terms == total.terms == (0.25, 0.75, 1.75, 1.5, 1.75, 1.5, 1.5)
-    assert (now.value, total.value) == (1.5, 9.0)
+    assert now.terms == (0.25, 0.75, 1.75, 1.5, 1.75, 1.5, 1.5)
+    assert total.terms == now.terms[1:]  # the published protocol has no evaluation before training
+    assert (now.value, total.value) == (1.5, 8.75)
 
 
 def test_relative_forgetting_is_the_share_of_the_best_that_is_gone():

@@ -21,6 +21,7 @@ from torch import Tensor
 from ctgraph_rl import CTGraph, StateType, Task
 from ctgraph_rl.core.tree import State, transition
 from ctgraph_rl.core.tree import tree_params as make_tree
+from ctgraph_rl.tasks.values import worst_value
 
 REWARDS = [(1.0, 0.0), (2.5, -0.5), (1.0, 0.3), (-1.0, 0.0), (-1.0, -0.25), (0.0, 2.0)]
 """goal_reward and fail_reward."""
@@ -179,16 +180,18 @@ def test_the_papers_small_probabilities_follow_from_every_transition_of_the_whol
 # --- the optimal value
 
 
-def best_by_plain_recursion(task: Task, gamma: float, end_reward: Callable[[int], float]) -> float:
+def best_by_plain_recursion(
+    task: Task, gamma: float, end_reward: Callable[[int], float], best: Callable[..., float] = max
+) -> float:
     b, d, p = task.graph.branching_factor, task.graph.depth, task.graph.wait_prob
 
     def wait(path: tuple[int, ...]) -> float:
         arrival = end_reward(sum((a - 1) * b ** (d - 1 - k) for k, a in enumerate(path)))
         if len(path) < d:
-            arrival = gamma * max(task.fail_reward, *(gamma * wait((*path, a)) for a in range(1, b + 1)))
+            arrival = gamma * best(task.fail_reward, *(gamma * wait((*path, a)) for a in range(1, b + 1)))
         value = task.fail_reward
         for _ in range(3000):  # value iteration: stays at most p of the error per sweep
-            value = max(task.fail_reward, (1 - p) * arrival + p * gamma * value)
+            value = best(task.fail_reward, (1 - p) * arrival + p * gamma * value)
         return value
 
     return gamma * wait(())
@@ -249,6 +252,8 @@ def test_the_optimal_value_is_that_of_value_iteration(b, d, p, goal_reward, fail
         expected = best_by_plain_recursion(needle, gamma, lambda leaf: goal_reward * (leaf == needle.goal_leaf))
         assert needle.optimal_value(gamma) == pytest.approx(expected, rel=1e-12)
         assert mixed.optimal_value(gamma) == pytest.approx(best_by_plain_recursion(mixed, gamma, mixed_reward))
+        lowest = best_by_plain_recursion(mixed, gamma, mixed_reward, best=min)
+        assert worst_value(mixed, gamma) == pytest.approx(lowest)
 
 
 def test_failing_at_once_is_optimal_where_it_pays_more():
