@@ -41,14 +41,23 @@ def write_whole(path: Path | str, content: bytes | str) -> None:
         part.unlink(missing_ok=True)
         with part.open("xb") as file:  # a new file, never one that is there, nor a link
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        _sync_folder(path.parent)
+        publish(part, path)
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise cannot_write(path, len(data), error) from error
+
+
+def publish(made: Path, path: Path) -> None:
+    """Move a finished file of the same file system to its place, so that after a power cut it is there whole, or not.
+
+    Raises:
+        OSError: if it cannot be synced or moved.
+    """
+    with made.open("rb") as file:
+        os.fsync(file.fileno())
+    made.replace(path)
+    sync_folder(path.parent)
 
 
 def write_named(path: Path | str, content: bytes | str) -> None:
@@ -73,8 +82,8 @@ def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
     return OSError(error.errno, f"{error.strerror}: cannot write {num_bytes / 1e6:.1f} MB to {path}, {free}")
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last; folders of some file systems cannot be synced, which then do it themselves."""
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder last: new, moved and removed ones; some file systems cannot and need not be told."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,7 +1,8 @@
 """The C code of the package, `kernel.c`, as a library, and its functions that work on tensors.
 
-It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. What
-the functions give are the bits of the tensor code, so it does not matter which of the two has run.
+It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. The
+name of the file holds the SHA-256 of its content, and a library that does not agree with it is not loaded, but made
+again. What the functions give are the bits of the tensor code, so it does not matter which of the two has run.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import stat
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -22,6 +24,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.disk import publish
 
 ROWS_A_THREAD = 2048
 """Rows for which another thread pays."""
@@ -111,14 +114,27 @@ def library() -> ctypes.CDLL:
 def _made() -> ctypes.CDLL:
     source = Path(__file__).with_suffix(".c")
     compiler = shlex.split(os.environ.get("CC", "cc"))
-    path = _cache_folder() / f"native-{_key(source, compiler)}.so"
-    if not path.exists():
-        _compile(source, compiler, path)
-    _require_own(path)
-    made = ctypes.CDLL(str(path))
+    folder, key = _cache_folder(), _key(source, compiler)
+    made = ctypes.CDLL(str(_found(folder, key) or _compiled(source, compiler, folder, key)))
     made.ctgraph_run.restype = ctypes.c_int64
     made.ctgraph_philox.restype = made.ctgraph_noise.restype = None
     return made
+
+
+def _name(key: str, content: bytes) -> str:
+    """The file name of a library, which says what decided its content and the content's SHA-256."""
+    return f"native-{key}-{hashlib.sha256(content).hexdigest()}.so"
+
+
+def _found(folder: Path, key: str) -> Path | None:
+    """Return the library of a key that was made before; remove one whose content has changed, as a crash leaves it."""
+    for path in folder.glob(f"native-{key}-*.so"):
+        with suppress(FileNotFoundError):  # another process has removed it
+            _require_own(path)
+            if path.name == _name(key, path.read_bytes()):
+                return path
+            path.unlink()
+    return None
 
 
 def _key(source: Path, compiler: list[str]) -> str:
@@ -162,16 +178,23 @@ def _require_own(path: Path) -> None:
     require((own, f"{path} must belong to this user and be writable by no other; remove it or set XDG_CACHE_HOME"))
 
 
-def _compile(source: Path, compiler: list[str], path: Path) -> None:
-    """Compile into a file of its own that then takes the place; without OpenMP where the compiler has none."""
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
-        for openmp in (["-fopenmp"], []):
-            command = [*compiler, *_FLAGS, *openmp, str(source), "-o", str(made), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True)
-            if done.returncode == 0:
-                break
-        failed = f'{shlex.join(command)} failed: {done.stderr[-2000:]}; use kernel="auto"'
-        require((done.returncode == 0, f'kernel="required": {failed}'))
+def _compiled(source: Path, compiler: list[str], folder: Path, key: str) -> Path:
+    """Compile into a file of its own that then gets its name; processes that do so at once share nothing else."""
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        made = Path(own) / "native.so"
+        _compile(source, compiler, made)
         made.chmod(0o700)
-        made.replace(path)
+        path = folder / _name(key, made.read_bytes())
+        publish(made, path)
+    return path
+
+
+def _compile(source: Path, compiler: list[str], made: Path) -> None:
+    """Compile the library, without OpenMP where the compiler has none."""
+    for openmp in (["-fopenmp"], []):
+        command = [*compiler, *_FLAGS, *openmp, str(source), "-o", str(made), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode == 0:
+            return
+    failed = f'{shlex.join(command)} failed: {done.stderr[-2000:]}; use kernel="auto"'
+    raise ValueError(f'kernel="required": {failed}')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,6 +37,112 @@ def test_the_kernel_is_compiled_once_into_a_folder_that_is_the_users_alone(own_c
     library.library()
 
     assert made.suffix == ".so" and own_cache.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.fixture
+def loaded(own_cache, monkeypatch) -> Path:
+    """The library, of which a changed copy fails the test instead of ending the process by SIGBUS when it is loaded."""
+    library.library()
+    (path,) = own_cache.iterdir()
+    sound, load = path.read_bytes(), library.ctypes.CDLL
+
+    def checked(name: str) -> object:
+        assert Path(name).read_bytes() == sound, "a changed library was loaded"
+        return load(name)
+
+    monkeypatch.setattr(library.ctypes, "CDLL", checked)
+    monkeypatch.setattr(library, "_compile", lambda source, compiler, made: made.write_bytes(sound))
+    library.library.cache_clear()
+    return path
+
+
+def change(path: Path, content: bytes) -> None:
+    """Put another file in the place of a library: the one of this process is mapped into its memory."""
+    path.unlink()
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("size", [0, 1, 4096, -4096, -1])
+def test_a_truncated_library_is_made_again_and_never_loaded(loaded, size):
+    sound = loaded.read_bytes()
+    change(loaded, sound[:size])
+
+    library.library()
+
+    assert [path.read_bytes() for path in loaded.parent.iterdir()] == [sound]
+
+
+def test_a_library_with_a_changed_byte_is_made_again_and_never_loaded(loaded):
+    sound = loaded.read_bytes()
+    change(loaded, sound[:9000] + bytes([sound[9000] ^ 1]) + sound[9001:])
+
+    library.library()
+
+    assert [path.read_bytes() for path in loaded.parent.iterdir()] == [sound]
+
+
+def test_a_library_reaches_the_disk_before_its_name(loaded, monkeypatch):
+    synced = []
+    monkeypatch.setattr(
+        "ctgraph_rl.disk.os.fsync", lambda number: synced.append(os.readlink(f"/proc/self/fd/{number}"))
+    )
+    loaded.unlink()
+
+    library.library()
+
+    assert [Path(path).name for path in synced] == ["native.so", "ctgraph_rl"] and loaded.exists()
+
+
+def test_two_processes_that_compile_at_once_both_get_a_whole_library(loaded, monkeypatch):
+    alone, sound = library._compile, loaded.read_bytes()
+    change(loaded, sound[:5000])
+
+    def while_another_does(source, compiler, made):
+        monkeypatch.setattr(library, "_compile", alone)
+        made.write_bytes(sound[:100])
+        assert library._made() is not None
+        alone(source, compiler, made)
+
+    monkeypatch.setattr(library, "_compile", while_another_does)
+
+    assert library._made() is not None
+    assert [path.read_bytes() for path in loaded.parent.iterdir()] == [sound]
+
+
+def test_a_library_that_another_process_removes_meanwhile_is_made_again(loaded, monkeypatch):
+    require_own = library._require_own
+
+    def removed(path: Path) -> None:
+        require_own(path)
+        loaded.unlink(missing_ok=True)
+
+    monkeypatch.setattr(library, "_require_own", removed)
+
+    library.library()
+
+    assert loaded.exists()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_from_a_read_only_cache_a_sound_library_is_loaded_and_a_changed_one_is_not(loaded, monkeypatch, is_there):
+    if not is_there:
+        change(loaded, b"")
+    read_only = OSError(errno.EROFS, "Read-only file system", str(loaded))
+    for name in ("os.unlink", "os.mkdir", "os.rename", "os.replace"):
+        monkeypatch.setattr(
+            name, lambda path, *_, **__: raise_(FileExistsError() if Path(path).is_dir() else read_only)
+        )
+
+    if is_there:
+        library.library()
+    else:
+        assert not library.is_available()
+        with pytest.raises(ValueError, match=r'kernel="required" cannot make or load .* Read-only file system: .*\.so'):
+            library.library()
+
+
+def raise_(error: Exception) -> None:
+    raise error
 
 
 def test_without_a_compiler_all_else_works(own_cache, monkeypatch):

@@ -70,7 +70,7 @@ def test_a_kill_between_any_two_steps_keeps_the_old_content_or_has_the_new(tmp_p
     for step in steps:
         with monkeypatch.context() as patch:
             write_whole(tmp_path / "file", b"old")
-            names = {"fsync": "os.fsync", "replace": "Path.replace", "folder": "_sync_folder"}
+            names = {"fsync": "os.fsync", "replace": "Path.replace", "folder": "sync_folder"}
             patch.setattr(f"ctgraph_rl.disk.{names[step]}", kill)
             with pytest.raises(Killed):
                 write_whole(tmp_path / "file", b"new")
