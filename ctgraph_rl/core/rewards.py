@@ -1,7 +1,8 @@
 """g: what an end state pays. One small frozen dataclass per reward, called with tensors.
 
 A reward returns a share of ``Task.goal_reward``: 1 at the goal. Everything it needs is in its argument, so a user's own
-reward is a frozen dataclass (equal and hashable by value) with the same ``__call__``, named by ``_target_`` in yaml.
+reward is a frozen dataclass (equal and hashable by value) with the same ``__call__``, named by ``_target_`` in yaml. It
+may have ``bounds``, as the rewards here; without it, intervals of returns are those of numbers without bounds.
 """
 
 from __future__ import annotations
@@ -51,6 +52,10 @@ class Needle:
         """See `RewardFn`."""
         return (arrival.leaf == arrival.goal_leaf).to(torch.float32)
 
+    def bounds(self, branching_factor: int) -> tuple[float, float]:
+        """Return the lowest and the highest share."""
+        return 0.0, 1.0
+
 
 @dataclass(frozen=True)
 class Gradient:
@@ -68,6 +73,10 @@ class Gradient:
         lost = (weight * arrival.differences()).sum(-1)  # exact: at most b^d - 1
         return (1 - lost.double() / (b**depth - 1).double()).float()
 
+    def bounds(self, branching_factor: int) -> tuple[float, float]:
+        """Return the lowest and the highest share."""
+        return 0.0, 1.0
+
 
 @dataclass(frozen=True)
 class ReferenceLinear:
@@ -82,6 +91,10 @@ class ReferenceLinear:
         depth = arrival.depth
         lost = (place * arrival.differences()).sum(-1)  # the last decision weighs 1, the first one d
         return (1 - lost.double() / (depth * (depth + 1) / 2)).float()
+
+    def bounds(self, branching_factor: int) -> tuple[float, float]:
+        """Return the lowest and the highest share; the lowest is that of decisions as far from the goal's as can be."""
+        return 2.0 - branching_factor, 1.0
 
 
 KERNEL_REWARDS = (Needle, Gradient, ReferenceLinear)

@@ -8,6 +8,14 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import (
+    of_changes_but_one,
+    of_counts,
+    of_lost_shares,
+    of_performance,
+    of_sums,
+    of_sums_over_time,
+)
 from ctgraph_rl.metrics.record import HERE, MASTERED, Undefined, defined, ratio
 
 CONTINUAL_WORLD = "Wolczyk et al. 2021, Continual World (arXiv 2105.10919)"
@@ -85,7 +93,7 @@ class Curves:
         return self.performance[rows[-last:], task].mean()
 
 
-@defined("wolczyk2021/performance", "1/T sum_j p_j(end)", CONTINUAL_WORLD)
+@defined("wolczyk2021/performance", "1/T sum_j p_j(end)", CONTINUAL_WORLD, bounds=of_performance)
 def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
     """P: mean performance on all tasks at the end.
 
@@ -97,7 +105,12 @@ def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
     return torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
 
 
-@defined("wolczyk2021/forgetting", "1/T sum_j (p_j(end of j's block) - p_j(end))", CONTINUAL_WORLD)
+@defined(
+    "wolczyk2021/forgetting",
+    "1/T sum_j (p_j(end of j's block) - p_j(end))",
+    CONTINUAL_WORLD,
+    bounds=of_changes_but_one,
+)
 def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
     """F: the drop on each task from the end of its own block to the end.
 
@@ -113,13 +126,13 @@ def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
     return own - torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
 
 
-@defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1])
+@defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1], bounds=of_sums)
 def instant_cumulative_return(curves: Curves) -> Tensor:
     """ICR(t) = sum_j p_j(t): the return over all tasks at evaluation t; the value is the last, the terms are all."""
     return curves.performance.sum(1)
 
 
-@defined("ben-iwhiwhu2022/tpot", "sum_{t>0} sum_j p_j(t)", LABS, aggregate=torch.sum)
+@defined("ben-iwhiwhu2022/tpot", "sum_{t>0} sum_j p_j(t)", LABS, aggregate=torch.sum, bounds=of_sums_over_time)
 def total_performance_over_time(curves: Curves) -> Tensor:
     """TPOT = sum_{t>0} ICR(t) over all evaluations but those before training, which the published protocol lacks.
 
@@ -134,6 +147,7 @@ def total_performance_over_time(curves: Curves) -> Tensor:
     LABS_CODE,
     partial=True,
     missing="a task never got above 0",
+    bounds=of_lost_shares,
 )
 def relative_forgetting(curves: Curves) -> Tensor:
     """The share of the best performance ever on a task that is gone at the end, over all tasks.
@@ -154,6 +168,7 @@ def relative_forgetting(curves: Curves) -> Tensor:
     HERE,
     aggregate=torch.sum,
     inputs={"threshold": "mastered_returns"},
+    bounds=of_counts,
 )
 def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
     """Number of tasks that are mastered right after the last block that trains them, forgotten later or not.

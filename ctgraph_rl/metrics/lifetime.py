@@ -28,6 +28,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
 from ctgraph_rl.metrics.record import defined
 
 NEW = "New et al. 2022, Lifelong learning metrics (arXiv 2201.08278), as in l2metrics 3.1.0"
@@ -102,16 +103,26 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     return scaled, {task: [_scaled(curve, *scales[task]) for curve in curves] for task, curves in known.items()}
 
 
+ON_THE_SCALE = from_failure_to_best(OFFSET, OFFSET + SCALE)
+
 of_tasks = partial(defined, source=NEW, partial=True, missing="a task has none")
 
 
-@of_tasks("new2022/train-performance", "mean over tasks and regimes of mean training performance")
+@of_tasks(
+    "new2022/train-performance",
+    "mean over tasks and regimes of mean training performance",
+    bounds=ON_THE_SCALE,
+)
 def mean_training_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over training regimes of their mean performance."""
     return _per_task(regimes, lambda task: _mean([r.values.mean().item() for r in _training(regimes, task)]))
 
 
-@of_tasks("new2022/eval-performance", "mean over tasks and regimes of mean evaluation performance")
+@of_tasks(
+    "new2022/eval-performance",
+    "mean over tasks and regimes of mean evaluation performance",
+    bounds=ON_THE_SCALE,
+)
 def mean_evaluation_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over evaluations of their mean performance."""
     tests = [each for each in regimes if not each.training]
@@ -137,6 +148,7 @@ def performance_recovery(regimes: Regimes) -> Tensor:
     "new2022/perf-maintenance-mrlep",
     "mean over tasks and later evaluations e of tp(e) - tp(first evaluation after the last training)",
     missing="a task has no later evaluation",
+    bounds=between(-SCALE, SCALE),
 )
 def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
     """PM (mrlep): change of a task's evaluations against the most recent one right after its training.
@@ -150,6 +162,7 @@ def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
     "new2022/perf-maintenance-mrtlp",
     "mean over tasks and later evaluations e of tp(e) - tp(last training)",
     missing="a task has no later evaluation",
+    bounds=between(-SCALE, SCALE),
 )
 def maintenance_of_training(regimes: Regimes) -> Tensor:
     """PM (mrtlp): as `maintenance_of_evaluation`, against the terminal performance of the most recent training."""
@@ -172,7 +185,9 @@ of_pairs = partial(
 )
 
 
-@of_pairs("new2022/ft-ratio", "mean over pairs (a, b) of tp(e2) / tp(e1) of b around a training of a")
+@of_pairs(
+    "new2022/ft-ratio", "mean over pairs (a, b) of tp(e2) / tp(e1) of b around a training of a", bounds=not_negative
+)
 def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     """FT: what training a task a, before b's first training, does to the evaluations of b right before and after.
 
@@ -183,19 +198,19 @@ def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     return _transfer(regimes, _quotient, forward=True)
 
 
-@of_pairs("new2022/ft-contrast", "as ft-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))")
+@of_pairs("new2022/ft-contrast", "as ft-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def forward_transfer_contrast(regimes: Regimes) -> Tensor:
     """FT as a contrast: in [-1, 1], 0 is neutral; no value only where both are 0. Else as `forward_transfer_ratio`."""
     return _transfer(regimes, _contrast, forward=True)
 
 
-@of_pairs("new2022/bt-ratio", "as ft-ratio, for trainings of a after b's first training")
+@of_pairs("new2022/bt-ratio", "as ft-ratio, for trainings of a after b's first training", bounds=not_negative)
 def backward_transfer_ratio(regimes: Regimes) -> Tensor:
     """BT: what training a task a, after b's first training, does to b. Else as `forward_transfer_ratio`."""
     return _transfer(regimes, _quotient, forward=False)
 
 
-@of_pairs("new2022/bt-contrast", "as bt-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))")
+@of_pairs("new2022/bt-contrast", "as bt-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def backward_transfer_contrast(regimes: Regimes) -> Tensor:
     """BT as a contrast. Else as `backward_transfer_ratio`."""
     return _transfer(regimes, _contrast, forward=False)
@@ -205,6 +220,7 @@ def backward_transfer_contrast(regimes: Regimes) -> Tensor:
     "new2022/relative-performance",
     "mean over tasks of sum of training performance / sum of the expert's, over equally many experiences",
     missing="a task has no expert, or a sum is not positive",
+    bounds=not_negative,
 )
 def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
     """RP: training performance of a task against its experts'; 1 is neutral.
@@ -228,6 +244,7 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
     "new2022/sample-efficiency",
     "mean over tasks of (saturation / expert's) * (expert's experiences to saturation / own)",
     missing="a task has no expert, or a curve is best at its start or not positive",
+    bounds=not_negative,
 )
 def sample_efficiency(regimes: Regimes, experts: Experts) -> Tensor:
     """SE: how high and how soon training saturates against experts; 1 is neutral.

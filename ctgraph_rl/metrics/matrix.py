@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import of_changes, of_gains, of_performance, of_remembering, of_scaled_changes
 from ctgraph_rl.metrics.record import Undefined, defined, ratio
 
 Trained = Sequence[Sequence[int]]
@@ -25,7 +26,7 @@ OUT_OF_ORDER = "the definition needs each task trained once, alone, in the order
 ONE_TASK = "the definition needs at least two tasks"
 
 
-@defined("lopez-paz2017/acc", "1/T sum_j R[T,j]", LOPEZ_PAZ)
+@defined("lopez-paz2017/acc", "1/T sum_j R[T,j]", LOPEZ_PAZ, bounds=of_performance)
 def average_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """ACC = 1/T sum_j R[last, j]: mean performance on all tasks after the last block.
 
@@ -34,7 +35,7 @@ def average_performance(performance: Tensor, trained: Trained | None = None) -> 
     return performance[-1]
 
 
-@defined("lopez-paz2017/fwt", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])", LOPEZ_PAZ)
+@defined("lopez-paz2017/fwt", "1/(T-1) sum_{j=2..T} (R[j-1,j] - R[0,j])", LOPEZ_PAZ, bounds=of_changes)
 def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """FWT = 1/(T-1) sum_{j>1} (R[j-1, j] - R[0, j]).
 
@@ -47,7 +48,7 @@ def forward_transfer(performance: Tensor, trained: Trained | None = None) -> Ten
     return (before_own - performance[0])[1:]
 
 
-@defined("lopez-paz2017/bwt", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])", LOPEZ_PAZ)
+@defined("lopez-paz2017/bwt", "1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])", LOPEZ_PAZ, bounds=of_changes)
 def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """BWT = 1/(T-1) sum_{j<T} (R[T, j] - R[j, j]).
 
@@ -59,7 +60,7 @@ def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Te
     return (performance[-1] - own)[:-1]
 
 
-@defined("chaudhry2018/f", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])", CHAUDHRY)
+@defined("chaudhry2018/f", "1/(T-1) sum_{j=1..T-1} (max_{l=1..T-1} R[l,j] - R[T,j])", CHAUDHRY, bounds=of_changes)
 def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """F = 1/(T-1) sum_{j<T} (max_{1<=l<T} R[l, j] - R[T, j]).
 
@@ -71,7 +72,7 @@ def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
     return (best - performance[-1])[:-1]
 
 
-@defined("diaz-rodriguez2018/a", "2/(T(T+1)) sum_{i>=j} R[i,j]", DIAZ)
+@defined("diaz-rodriguez2018/a", "2/(T(T+1)) sum_{i>=j} R[i,j]", DIAZ, bounds=of_performance)
 def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """A: mean over all pairs of a block i and a task j that was trained by then.
 
@@ -81,7 +82,7 @@ def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> T
     return _pairs(performance, lambda block, task: block >= task)
 
 
-@defined("diaz-rodriguez2018/bwt", "2/(T(T-1)) sum_{i>j} (R[i,j] - R[j,j])", DIAZ)
+@defined("diaz-rodriguez2018/bwt", "2/(T(T-1)) sum_{i>j} (R[i,j] - R[j,j])", DIAZ, bounds=of_changes)
 def backward_transfer_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """BWT after every block: mean change on a task from its own block to each later block.
 
@@ -91,7 +92,11 @@ def backward_transfer_over_time(performance: Tensor, trained: Trained | None = N
 
 
 @defined(
-    "diaz-rodriguez2018/rem", "1 - |min(BWT, 0)|", DIAZ, aggregate=lambda changes: 1 - changes.mean().clamp(max=0).abs()
+    "diaz-rodriguez2018/rem",
+    "1 - |min(BWT, 0)|",
+    DIAZ,
+    aggregate=lambda changes: 1 - changes.mean().clamp(max=0).abs(),
+    bounds=of_remembering,
 )
 def remembering(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """REM = 1 - |min(BWT, 0)| with BWT of `backward_transfer_over_time`; 1 without forgetting.
@@ -101,13 +106,19 @@ def remembering(performance: Tensor, trained: Trained | None = None) -> Tensor:
     return _changes_after_own_block(performance, trained)
 
 
-@defined("diaz-rodriguez2018/bwt+", "max(BWT, 0)", DIAZ, aggregate=lambda changes: changes.mean().clamp(min=0))
+@defined(
+    "diaz-rodriguez2018/bwt+",
+    "max(BWT, 0)",
+    DIAZ,
+    aggregate=lambda changes: changes.mean().clamp(min=0),
+    bounds=of_gains,
+)
 def positive_backward_transfer(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """BWT+ = max(BWT, 0) with BWT of `backward_transfer_over_time`. The terms are those of BWT."""
     return _changes_after_own_block(performance, trained)
 
 
-@defined("diaz-rodriguez2018/fwt", "2/(T(T-1)) sum_{i<j} R[i,j]", DIAZ)
+@defined("diaz-rodriguez2018/fwt", "2/(T(T-1)) sum_{i<j} R[i,j]", DIAZ, bounds=of_performance)
 def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """FWT: mean performance on tasks that are yet to be trained, after each block; row 0 is not part of it.
 
@@ -122,6 +133,7 @@ def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -
     "mean over (i, j), j after i's first block and not training i, of (R[j-1,i] - R[j,i]) / scale[i]",
     CORA,
     missing="an evaluation is missing or a scale is 0",
+    bounds=of_scaled_changes,
 )
 def isolated_forgetting(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
     """F: what one block of another task takes from a task that was trained before; positive when it is forgotten.
@@ -145,6 +157,7 @@ def isolated_forgetting(performance: Tensor, trained: Trained | None = None, sca
     "mean over (i, j), j before i's first block, of (R[j,i] - R[j-1,i]) / scale[i]",
     CORA,
     missing="an evaluation is missing or a scale is 0",
+    bounds=of_scaled_changes,
 )
 def zero_shot_transfer(performance: Tensor, trained: Trained | None = None, scale: Tensor | None = None) -> Tensor:
     """Z: what one block of another task gives a task that was not yet trained.

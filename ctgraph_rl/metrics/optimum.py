@@ -14,6 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
 from ctgraph_rl.metrics.record import HERE, MASTERED, defined, ratio
 
 PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
@@ -29,6 +30,7 @@ STAGES = ("fails", "navigates", "solves")
     "1/T sum_j (R[last,j] - zero_j) / (best_j - zero_j)",
     HERE,
     missing="an evaluation is missing or the best is the zero",
+    bounds=from_failure_to_best(0, 1),
 )
 def normalised_performance(performance: Tensor, best: Tensor, zero: Tensor | float = 0.0) -> Tensor:
     """Mean performance after the last block as a share of what is possible: 1 is optimal.
@@ -43,7 +45,7 @@ def normalised_performance(performance: Tensor, best: Tensor, zero: Tensor | flo
     return ratio(performance[-1] - zero, best - zero)
 
 
-@defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE)
+@defined("ctgraph_rl/stage", "1/T sum_j stage_j, 0 fails, 1 navigates, 2 solves", HERE, bounds=between(0, 2))
 def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MASTERED) -> Tensor:
     """Mean of the stage that the agent reached on each task, by `STAGES`; the terms are the tasks' stages.
 
@@ -62,6 +64,7 @@ def stage_reached(end_rates: Tensor, success_rates: Tensor, mastered: float = MA
     HERE,
     aggregate=torch.sum,
     inputs={"best": "interval_best"},
+    bounds=not_negative,
 )
 def regret(episodes: Tensor, returns: Tensor, best: Tensor) -> Tensor:
     """Return that was lost while learning, against the optimal policy in every finished episode.
@@ -83,6 +86,8 @@ of_first_success = partial(defined, source=PAPER, missing="a goal was never reac
     "ctgraph_rl/first-reward",
     "1/T sum_j frames_j to the first reward / (E[frames of a random episode] / P_R)",
     inputs=_FIRST_BLOCK | {"frames": "first_frames"},
+    bounds=not_negative,
+    is_time=True,
 )
 def frames_to_first_reward(
     frames: Sequence[Tensor],
@@ -107,6 +112,7 @@ def frames_to_first_reward(
     "ctgraph_rl/search-efficiency",
     "1/T sum_j E[kappa_j] / episodes_j to the first reward",
     inputs=_FIRST_BLOCK | {"expected_episodes": "search_episodes"},
+    bounds=not_negative,
 )
 def search_efficiency(
     episodes: Sequence[Tensor], success_rates: Sequence[Tensor], expected_episodes: Sequence[float]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, ParamSpec
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import BoundsOf, unbounded
 from ctgraph_rl.metrics.inputs import INPUTS
 
 HERE = "ctgraph_rl"
@@ -73,6 +74,10 @@ class Entry(NamedTuple):
     """For each argument that is given an input, the name of that in `INPUTS`."""
     required: tuple[str, ...]
     """The inputs without which there is no metric."""
+    bounds: BoundsOf = unbounded
+    """The lowest and the highest value that a run can have."""
+    is_time: bool = False
+    """Whether it is a time, infinite in a run that never got there: where terms have no value."""
 
     def of(self, given: Mapping[str, Any]) -> Metric:
         """Compute the metric of inputs by name; undefined where one of them is `Undefined`, for its reason."""
@@ -98,6 +103,8 @@ def defined(
     missing: str | Callable[..., str] = "an evaluation is missing",
     aggregate: Callable[[Tensor], Tensor] = torch.mean,
     inputs: Mapping[str, str] | None = None,
+    bounds: BoundsOf = unbounded,
+    is_time: bool = False,
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
     """Make a metric of a function that returns the terms of its formula, NaN for a term without a value.
 
@@ -112,6 +119,9 @@ def defined(
         missing: why a term may be without a value, or a function of the same arguments that says why terms are.
         aggregate: makes the value of the terms; the mean of all but a few.
         inputs: the inputs of arguments with other names.
+        bounds: the lowest and the highest value, from what is known of a run; one of `ctgraph_rl.metrics.bounds`.
+            Intervals over seeds stay within.
+        is_time: whether it is a time, which runs that never get there have no value of.
 
     Raises:
         ValueError: for a function without inputs, an argument without default that is no input or whose name is nearly
@@ -129,13 +139,15 @@ def defined(
                 return undefined(metric, str(reason))
 
         metric.definition = meaning  # type: ignore[attr-defined]
-        _register(metric, meaning, inputs or {})
+        _register(metric, meaning, inputs or {}, bounds, is_time)
         return metric
 
     return decorate
 
 
-def _register(metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str]) -> None:
+def _register(
+    metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str], bounds: BoundsOf, is_time: bool
+) -> None:
     """List a metric with the inputs of its arguments."""
     name, arguments = metric.__name__, signature(metric).parameters
     sources = {argument: renamed.get(argument, argument) for argument in arguments}
@@ -150,7 +162,8 @@ def _register(metric: Callable[..., Metric], meaning: Definition, renamed: Mappi
     if name in METRICS or meaning.id in (entry.meaning.id for entry in METRICS.values()):
         raise ValueError(f"metric {name} ({meaning.id}): another metric has its name or its id; choose others")
     inputs = {argument: source for argument, source in sources.items() if source in INPUTS}
-    METRICS[name] = Entry(metric, meaning, inputs, tuple(sources[argument] for argument in required))
+    needed = tuple(sources[argument] for argument in required)
+    METRICS[name] = Entry(metric, meaning, inputs, required=needed, bounds=bounds, is_time=is_time)
 
 
 def undefined(metric: Callable[..., Metric], reason: str) -> Metric:

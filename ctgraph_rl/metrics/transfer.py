@@ -13,6 +13,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from ctgraph_rl.metrics.bounds import at_most_1
 from ctgraph_rl.metrics.curves import CONTINUAL_WORLD, LABS_CODE, Curves
 from ctgraph_rl.metrics.record import Undefined, defined, ratio
 
@@ -76,7 +77,13 @@ def _is_full(expert_areas: Tensor, smallest_headroom: float) -> Tensor:
     return (headroom == 0) | (headroom < smallest_headroom)
 
 
-@defined("wolczyk2021/ft", "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)", CONTINUAL_WORLD, missing=_no_transfer)
+@defined(
+    "wolczyk2021/ft",
+    "1/T sum_j (AUC_j - AUCb_j) / (1 - AUCb_j)",
+    CONTINUAL_WORLD,
+    missing=_no_transfer,
+    bounds=at_most_1,
+)
 def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Tensor:
     """FT: what a task's own block gains by what came before, as a share of what was left to gain; at most 1.
 
@@ -98,6 +105,7 @@ def continual_world_forward_transfer(areas: Tensor, expert_areas: Tensor) -> Ten
     LABS_CODE,
     missing=partial(_no_transfer, smallest_headroom=SMALLEST_HEADROOM),
     inputs={"areas": "trapezoid_areas", "expert_areas": "expert_trapezoid_areas"},
+    bounds=at_most_1,
 )
 def forward_transfer_from_experts(areas: Tensor, expert_areas: Tensor) -> Tensor:
     """FT of the labs that made the CT-graph: as Continual World's, with areas by trapezoids and per seed.

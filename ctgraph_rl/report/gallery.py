@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from ctgraph_rl.report.style import style
 
 FOLDER = "figures"
-INTERVAL = "Student's 95 % interval of the mean over seeds, which one seed or seeds that are all equal do not have"
+INTERVAL = "the 95 % interval of the mean over seeds, within what is possible; one seed has none"
 LONGEST_STEM = 60
 
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure, left_out
-from ctgraph_rl.report.sections import Point, Result, Section, evaluation_curve, training_curve
+from ctgraph_rl.report.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.sections import FEWEST_FOR_BANDS, Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
 from ctgraph_rl.runs.read import Curve
 
@@ -20,6 +20,7 @@ MANY_BLOCKS = 12
 MOST_SEEDS = 20
 """Seeds up to which each has a thin line."""
 
+BANDS = f"the range of seeds, from {FEWEST_FOR_BANDS} seeds on the 95 % interval of their mean"
 COLUMNS = 4
 PLACES = 160
 """Means over equal numbers of frames that the return while training is shown as, in all blocks together."""
@@ -32,7 +33,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
     caption = (
         f"Mean return on each task at every evaluation, over the frames learned from.{tasks} {_agents(section)} Lines: "
-        f"means over seeds, where each has a value; bands: {INTERVAL}; thin lines: single seeds, up to {MOST_SEEDS}. "
+        f"means over seeds, where each has a value; bands: {BANDS}; thin lines: single seeds, up to {MOST_SEEDS}. "
         "Grey: blocks that train the task; dashed: ends of blocks."
     )
     return CaptionedFigure("curves", "Learning curves", caption, draw_tasks(section))
@@ -44,7 +45,7 @@ def training_curves(section: Section) -> CaptionedFigure | None:
         return None
     caption = (
         f"Return of the episodes that were finished while training, means over equal numbers of frames. "
-        f"{_agents(section)} Lines: means over seeds; bands: {INTERVAL}. Dashed: ends of blocks."
+        f"{_agents(section)} Lines: means over seeds; bands: {BANDS}. Dashed: ends of blocks."
     )
     return CaptionedFigure("training", "Return while training", caption, draw_training(section))
 
@@ -67,7 +68,7 @@ def draw_tasks(section: Section) -> Any:
         _mark_blocks(axes, section, task)
         for position, result in enumerate(section.results[:MOST_AGENTS]):
             seeds = [run.history.evaluations.get(label, []) for run in result.finished if run.history]
-            _draw(axes, position, [evaluation_curve(result.finished, label)], seeds)
+            _draw(axes, position, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
         axes.set_title(short(label))
     _finish(figure, grid, section, "mean return")
     return figure
@@ -81,7 +82,11 @@ def draw_training(section: Section) -> Any:
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
     for position, result in enumerate(section.results[:MOST_AGENTS]):
-        pieces = [training_curve(result.finished, block, *ends, places) for block, ends in blocks]
+        runs, bounds = result.finished, result.bounds.of_returns
+        pieces = [
+            training_curve(runs, block, start=start, end=end, places=places, bounds=bounds)
+            for block, (start, end) in blocks
+        ]
         _draw(axes, position, pieces, ())
     _finish(figure, [[axes]], section, "return while training")
     return figure
@@ -112,15 +117,9 @@ def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequen
     for points in pieces:
         if points:
             frames = [point.frames for point in points]
-            axes.plot(frames, [point.estimate.value for point in points], markevery=_every(points), zorder=3, **look)
-            lows, highs = zip(*map(_band, points), strict=True)
+            axes.plot(frames, [point.value for point in points], markevery=_every(points), zorder=3, **look)
+            lows, highs = zip(*((point.low, point.high) for point in points), strict=True)
             axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
-
-
-def _band(point: Point) -> tuple[float | None, float | None]:
-    """The interval; without width where there is none."""
-    estimate = point.estimate
-    return (estimate.value, estimate.value) if estimate.low is None else (estimate.low, estimate.high)
 
 
 def _every(points: Sequence[Point]) -> int:

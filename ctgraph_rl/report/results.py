@@ -15,7 +15,7 @@ import math
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from typing import NamedTuple
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.report import statistics
+from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 
@@ -60,8 +61,8 @@ AT_END = {
 NO_RUN_FINISHED = "every_metric"
 """The measure of the only row of an agent none of whose runs finished."""
 
-MEANS = "mean [Student's 95 % interval]"
-LEGEND = f"{MEANS}, share of solved seeds [exact one]"
+MEANS = "mean [95 % interval]"
+LEGEND = f"{MEANS}, share of solved seeds [exact one], median of times [exact one]"
 
 HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
 
@@ -89,24 +90,30 @@ class Row:
 
 def table(runs: Sequence[Run]) -> list[Row]:
     """Every metric, and how tasks ended, for each agent on each curriculum."""
-    lines = {which: (*_metrics(by_seed), *_at_the_end(by_seed)) for which, by_seed in grouped(runs).items()}
+    found, bounds = grouped(runs), bounds_by_curriculum(runs)
+    lines = {
+        (name, agent): (*_metrics(by_seed, bounds[name]), *_at_the_end(by_seed, bounds[name]))
+        for (name, agent), by_seed in found.items()
+    }
     return [Row(name, agent, *line) for (name, agent), of_agent in lines.items() for line in of_agent]
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
-    """Every pair of agents on the same curriculum and seeds, by (curriculum, first, second).
+    """Every pair of agents on the same curriculum and seeds, by (curriculum, first, second), with corrected p.
 
     Raises:
         ValueError: if no run has the metric; lists those that there are.
     """
     choices = dict.fromkeys(name for run in runs for name in run.metrics)
     require((metric in choices, f"no run has a metric {metric!r}; there are: {', '.join(choices) or 'none'}"))
-    found = {}
+    found, bounds = {}, bounds_by_curriculum(runs)
     for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
         if first[0] == second[0] and list(one) == list(other):
             values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
-            found[first[0], first[1], second[1]] = statistics.compare(values, others)
-    return found
+            limits = bounds[first[0]].of_metric(metric)
+            found[first[0], first[1], second[1]] = statistics.compare(values, others, bounds=limits)
+    corrected = statistics.holm([each.p_value for each in found.values()])
+    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), corrected, strict=True)}
 
 
 def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Row]:
@@ -242,7 +249,7 @@ def latex_text(plain: str) -> str:
     return "".join(rf"\{each}" if each in "&%$#_{}" else commands.get(each, each) for each in plain)
 
 
-def _metrics(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
     """A line for each metric; one for all if no run finished."""
     present = [run for run in by_seed.values() if run is not None]
     if not any(run.metrics for run in present):
@@ -250,31 +257,43 @@ def _metrics(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
         yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
     for metric in dict.fromkeys(metric for run in present for metric in run.metrics):
         definition = next(run.metrics[metric]["definition"] for run in present if metric in run.metrics)
-        estimate = mean([_value(run, metric) for run in by_seed.values()])
+        estimate = _estimate(by_seed, metric, bounds)
         yield metric, estimate, definition, _note(by_seed, metric, estimate)
 
 
-def _at_the_end(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns) -> Estimate:
+    """Return a metric over seeds; a time as its median, infinite for a seed that never got there."""
+    if metric in metrics.METRICS and metrics.METRICS[metric].is_time:
+        return statistics.median_time([_time(run, metric) for run in by_seed.values()])
+    return mean([_value(run, metric) for run in by_seed.values()], bounds=bounds.of_metric(metric))
+
+
+def _time(run: Run | None, metric: str) -> float | None:
+    never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
+    return math.inf if never else _value(run, metric)
+
+
+def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
     """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
     if any(run is not None and run.tasks for run in by_seed.values()):
-        yield from _over_tasks(by_seed)
+        yield from _over_tasks(by_seed, bounds)
     tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
     if tasks:
         returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
-        estimate = statistics.interquartile_mean(returns)
+        estimate = statistics.interquartile_mean(returns, bounds=bounds.of_returns)
         yield _ended("interquartile_return", estimate, by_seed)
     for task in tasks:
         estimate = statistics.solved_rate([_solved(run, task) for run in by_seed.values()])
         yield _ended(f"solved {task}", estimate, by_seed)
 
 
-def _over_tasks(by_seed: BySeed) -> Iterator[tuple[str, Estimate, str, str]]:
+def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
     """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
     runs = by_seed.values()
     returns = [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in runs]
-    yield _ended("mean_final_return", mean(returns), by_seed)
+    yield _ended("mean_final_return", mean(returns, bounds=bounds.of_returns), by_seed)
     solved = [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in runs]
-    yield _ended("solved_rate", mean(solved), by_seed)
+    yield _ended("solved_rate", mean(solved, bounds=(0.0, 1.0)), by_seed)
 
 
 def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
@@ -361,12 +380,18 @@ def _parser() -> argparse.ArgumentParser:
 
 def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:
     record = f"better in {found.wins}, equal in {found.ties}, worse in {found.losses}"
-    p_value = "" if found.p_value is None else f"; sign-flip p = {found.p_value:.3g}"
+    p_value = "" if found.p_value is None else f"; sign-flip p = {found.p_value:.3g}, {_verdict(found)}"
     sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}{p_value}"
     if difference is None or not found.std:
         return sentence
     seeds = statistics.seeds_needed(difference, found.std, paired=True)
     return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
+
+
+def _verdict(found: Comparison) -> str:
+    """Return the p-value corrected for all pairs, and what it does not say."""
+    unclear = found.holm is None or found.holm > 1 - statistics.LEVEL
+    return f"Holm {found.holm:.3g}" + (f": not distinguishable with {found.difference.n} seeds" if unclear else "")
 
 
 if __name__ == "__main__":

@@ -7,12 +7,14 @@ as one that is missing: n = 9/10.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise, zip_longest
 from typing import NamedTuple
 
+from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped
@@ -21,11 +23,18 @@ Matrix = list[list[Estimate]]
 """Estimates over seeds, [blocks][tasks]."""
 
 
+FEWEST_FOR_BANDS = 10
+"""Seeds from which on bands of curves are intervals: with fewer, these would fill a panel."""
+
+
 class Point(NamedTuple):
     """A place on a curve over seeds."""
 
     frames: float
-    estimate: Estimate
+    value: float  # mean over seeds
+    low: float  # ends of the band: the interval, or the range of fewer than `FEWEST_FOR_BANDS` seeds
+    high: float
+    n: int
 
 
 @dataclass(frozen=True)
@@ -35,10 +44,12 @@ class Result:
     Args:
         agent: its name.
         by_seed: its runs.
+        bounds: of what they measure.
     """
 
     agent: str
     by_seed: BySeed
+    bounds: BoundsOfRuns = NO_BOUNDS
 
     @property
     def runs(self) -> list[Run]:
@@ -58,17 +69,20 @@ class Result:
 
     def performance(self) -> Matrix:
         """Mean return on each task before training and after each block."""
-        return self._over_seeds([history.performance for history in _histories(self.finished)])
+        return self._over_seeds([each.performance for each in _histories(self.finished)], self.bounds.of_task)
 
     def transfer(self) -> Matrix:
         """Changes of each task by each block: differences of successive rows of the performance matrix."""
-        return self._over_seeds([_differences(history.performance) for history in _histories(self.finished)])
+        changes = [_differences(history.performance) for history in _histories(self.finished)]
+        return self._over_seeds(changes, self.bounds.of_change)
 
-    def _over_seeds(self, matrices: Sequence[list[list[float]]]) -> Matrix:
+    def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Matrix:
         missing = [None] * (len(self.by_seed) - len(matrices))
         shape = max(map(len, matrices), default=0), max((len(row) for rows in matrices for row in rows), default=0)
+        labels = next((history.labels for history in _histories(self.finished)), ())
+        limits = [bounds(labels[j]) if j < len(labels) else UNBOUNDED for j in range(shape[1])]
         return [
-            [mean([*(_at(rows, i, j) for rows in matrices), *missing]) for j in range(shape[1])]
+            [mean([*(_at(rows, i, j) for rows in matrices), *missing], bounds=limits[j]) for j in range(shape[1])]
             for i in range(shape[0])
         ]
 
@@ -126,20 +140,23 @@ class Section:
 def sections(runs: Sequence[Run]) -> list[Section]:
     """A section for each curriculum, in the order of the runs."""
     agents: dict[str, list[Result]] = {}
+    bounds = bounds_by_curriculum(runs)
     for (curriculum, agent), by_seed in grouped(runs).items():
-        agents.setdefault(curriculum, []).append(Result(agent, by_seed))
+        agents.setdefault(curriculum, []).append(Result(agent, by_seed, bounds[curriculum]))
     rows: dict[str, list[Row]] = {}
     for row in table(runs):
         rows.setdefault(row.curriculum, []).append(row)
     return [Section(name, tuple(results), rows[name]) for name, results in agents.items()]
 
 
-def evaluation_curve(runs: Iterable[Run], label: str) -> list[Point]:
+def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED) -> list[Point]:
     """Mean return on a task at all evaluations at which every run has a value."""
-    return over_seeds([history.evaluations.get(label, []) for history in _histories(runs)])
+    return over_seeds([history.evaluations.get(label, []) for history in _histories(runs)], bounds)
 
 
-def training_curve(runs: Iterable[Run], block: int, start: int, end: int, places: int) -> list[Point]:
+def training_curve(
+    runs: Iterable[Run], block: int, *, start: int, end: int, places: int, bounds: Bounds = UNBOUNDED
+) -> list[Point]:
     """Return while training in a block, as means over equal spans of frames in which every run has a value.
 
     Args:
@@ -148,19 +165,29 @@ def training_curve(runs: Iterable[Run], block: int, start: int, end: int, places
         start: frames before it.
         end: frames at its end.
         places: number of spans.
+        bounds: of a return.
     """
     curves = [_in_places(history.training.get(block, []), start, end, places) for history in _histories(runs)]
-    return over_seeds(curves)
+    return over_seeds(curves, bounds)
 
 
-def over_seeds(curves: Sequence[Curve]) -> list[Point]:
-    """Means over curves, with intervals, where all have a value."""
+def over_seeds(curves: Sequence[Curve], bounds: Bounds = UNBOUNDED) -> list[Point]:
+    """Means over curves, with their bands, where all have a value."""
     values: dict[int, list[float]] = {}
     for curve in curves:
         for frames, value in dict(curve).items():
             if not math.isnan(value):
                 values.setdefault(frames, []).append(value)
-    return [Point(frames, mean(some)) for frames, some in sorted(values.items()) if len(some) == len(curves)]
+    complete = {frames: some for frames, some in sorted(values.items()) if len(some) == len(curves)}
+    return [_point(frames, some, bounds) for frames, some in complete.items()]
+
+
+def _point(frames: int, values: Sequence[float], bounds: Bounds) -> Point:
+    centre, low, high = math.fsum(values) / len(values), min(values), max(values)
+    if len(values) >= FEWEST_FOR_BANDS:
+        estimate = mean(values, bounds=bounds)
+        low, high = (low, high) if estimate.low is None or estimate.high is None else (estimate.low, estimate.high)
+    return Point(frames, centre, low, high, len(values))
 
 
 def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:

@@ -1,28 +1,32 @@
 """Statistics over seeds: what n runs of one agent say, and what they leave open.
 
-Returns of solved and stuck runs have two humps. For such, Student's interval of a mean covers what it should from about
-ten seeds on, and bootstraps of few seeds are too narrow; so means have Student's, shares of solved seeds the exact
-interval, and the interquartile mean has a bootstrap from ten seeds on. A seed without a value is counted, never
-replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
+There is one rule for each kind of number, and ``docs/statistics.md`` has their coverage by simulation:
+
+- A share, and a mean of values with known bounds: Gaffke's interval. It assumes no distribution, stays within the
+  bounds, has a width where all seeds agree, and is that of Clopper and Pearson for two outcomes at the bounds.
+- A mean of values without two known bounds: Student's interval, cut at a bound that is known.
+- A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
+- A number of two groups' means, such as forward transfer: both groups are weighted at random as in Gaffke's interval.
+
+A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from ctgraph_rl.checks import fraction, is_int, positive, require
+from ctgraph_rl.report.intervals import UNBOUNDED, Bounds, gaffke, median_ranks, scipy, student, within_bounds
 
 LEVEL = 0.95
 LEAST_FOR_BOOTSTRAP = 10
 RESAMPLES = 10_000
-MOST_FLIPPED = 13
+MOST_FLIPPED = 16
 """Pairs up to which all flips of signs are tried."""
 
 ROUNDING = 1e-12
@@ -69,12 +73,13 @@ class Comparison:
     """Two agents on the same seeds.
 
     Args:
-        difference: mean of first minus second, with Student's interval; pairs without both values are undefined.
+        difference: mean of first minus second, with its interval; pairs without both values are undefined.
         std: standard deviation of the differences, for `seeds_needed`; None below two pairs.
         p_value: of the test that flips signs of differences at random; exact up to `MOST_FLIPPED` pairs.
         wins: pairs in which the first is better.
         ties: pairs without a difference.
         losses: pairs in which the second is better.
+        holm: the p-value corrected for all comparisons that were made; None where that is not known.
     """
 
     difference: Estimate
@@ -83,84 +88,166 @@ class Comparison:
     wins: int
     ties: int
     losses: int
+    holm: float | None = None
 
 
-def mean(values: Values, level: float = LEVEL) -> Estimate:
-    """Mean with Student's t interval.
+def mean(values: Values, level: float = LEVEL, bounds: Bounds = UNBOUNDED) -> Estimate:
+    """Return the mean with Gaffke's interval where both bounds are known, else with Student's.
 
-    One seed has no interval, nor have seeds that are all equal: theirs would have no width, which they do not support.
+    One seed has no interval, nor have seeds that are all equal where a bound is not known.
 
     Args:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
+        bounds: the lowest and the highest possible value. If a value is outside, they are none.
     """
-    _scipy_stats()
-    require(*fraction(level=level))
+    scipy("stats")
+    require(*fraction(level=level), *_bounds_rules(bounds))
     known, missing = _known(values)
-    method = f"mean, Student t {level:.0%}"
+    within = within_bounds(known, bounds)
+    bounded = within and math.isfinite(bounds[1] - bounds[0])
+    method = f"mean, {'Gaffke' if bounded else 'Student t'} {level:.0%}"
     if len(known) == 0:
         return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
-    centre = math.fsum(known) / len(known)
-    if len(known) == 1 or min(known) == max(known):
-        reason = "one seed has no interval" if len(known) == 1 else "all seeds are equal: no spread to estimate"
-        return Estimate(centre, None, None, len(known), missing, method=method, reason=reason)
-    half = _student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known))
-    return Estimate(centre, float(centre - half), float(centre + half), len(known), missing, method=method)
+    centre, reason = math.fsum(known) / len(known), None if within else f"a value is outside {_shown(bounds)}"
+    low: float | None = None
+    high: float | None = None
+    if len(known) == 1:
+        reason = "one seed has no interval"
+    elif bounded:
+        low, high = gaffke(known, bounds, level)
+    elif min(known) == max(known):
+        reason = "all seeds are equal: no spread to estimate"
+    else:
+        half = float(student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known)))
+        lowest, highest = bounds if within else UNBOUNDED
+        low, high = max(lowest, centre - half), min(highest, centre + half)
+    return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
 
 
 def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate:
-    """Share of seeds that solved a task, with the exact interval of Clopper and Pearson.
+    """Return the share of seeds that solved a task, with the exact interval of Clopper and Pearson.
 
     Args:
         solved: one per seed; None for a seed without result.
         level: coverage of the interval.
     """
-    stats = _scipy_stats()
     require(*fraction(level=level))
-    known = [each for each in solved if each is not None]
-    n, k, missing = len(known), sum(known), len(solved) - len(known)
-    method = f"share, Clopper-Pearson {level:.0%}"
-    if n == 0:
+    known = [float(each) for each in solved if each is not None]
+    missing, method = len(solved) - len(known), f"share, Clopper-Pearson {level:.0%}"
+    if not known:
         return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a result")
-    interval = stats.binomtest(k, n).proportion_ci(level, method="exact")
-    return Estimate(k / n, low=float(interval.low), high=float(interval.high), n=n, n_undefined=missing, method=method)
+    low, high = gaffke(known, (0.0, 1.0), level)
+    return Estimate(sum(known) / len(known), low=low, high=high, n=len(known), n_undefined=missing, method=method)
+
+
+def median_time(times: Values, level: float = LEVEL) -> Estimate:
+    """Return the median of times with the interval of its order statistics.
+
+    The interval goes from the k-th smallest time to the k-th largest, with the largest k that keeps the level. Fewer
+    seeds than six have none at 95 %: theirs goes from 0 to infinity.
+
+    Args:
+        times: one per seed, >= 0; infinite for a seed that never got there, None or NaN for one without result.
+        level: coverage of the interval.
+    """
+    require(*fraction(level=level))
+    known, missing = _known(times)
+    require((min(known, default=0.0) >= 0, f"times must be >= 0, got {min(known, default=0.0)}"))
+    n, method = len(known), f"median, order statistics {level:.0%}"
+    if n == 0:
+        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+    ordered, k = [0.0, *sorted(known), math.inf], median_ranks(n, level)
+    centre = (ordered[(n + 1) // 2] + ordered[n // 2 + 1]) / 2
+    reason = None if k else f"the range of the times covers {1 - 0.5 ** (n - 1):.0%}"
+    low, high = ordered[k], ordered[n + 1 - k]
+    return Estimate(centre, low=low, high=high, n=n, n_undefined=missing, method=method, reason=reason)
 
 
 def interquartile_mean(
-    values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0
+    values: Sequence[Values],
+    level: float = LEVEL,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    *,
+    bounds: Bounds = UNBOUNDED,
 ) -> Estimate:
-    """Mean of the middle half of all values of all tasks, with a percentile bootstrap stratified by task.
+    """Return the mean of the middle half of all values of all tasks, with a bootstrap stratified by task.
 
-    Only from ten seeds on: with fewer the interval covers far less than it says.
+    Seeds have random weights, each task's of their own; where bounds are known, one more value stands at them, as in
+    Gaffke's interval. Only from ten seeds on: with fewer the interval of unbounded values covers far less than it says.
 
     Args:
         values: for each task, one value per seed; None or NaN for a seed without.
         level: coverage of the interval.
         resamples: bootstrap samples.
         seed: of the bootstrap.
+        bounds: the lowest and the highest possible value.
     """
     require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
-    require((len(values) > 0, "interquartile_mean needs the values of at least one task"))
+    require((len(values) > 0, "interquartile_mean needs the values of at least one task"), *_bounds_rules(bounds))
     known, missing = zip(*(_known(task) for task in values), strict=True)
     n, undefined = min(map(len, known)), max(missing)
-    method = f"IQM, stratified percentile bootstrap {level:.0%}"
+    method = f"IQM, stratified bootstrap {level:.0%}"
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
         return Estimate(None, low=None, high=None, n=n, n_undefined=undefined, method=method, reason=reason)
-    rng = np.random.default_rng(seed)
-    samples = [rng.choice(task, (resamples, len(task))) for task in known]
-    low, high = np.quantile(_middle_mean(np.concatenate(samples, axis=1)), [(1 - level) / 2, (1 + level) / 2])
-    value = _middle_mean(np.concatenate(known)[None])[0]
-    return Estimate(float(value), low=float(low), high=float(high), n=n, n_undefined=undefined, method=method)
+    rng, limits = np.random.default_rng(seed), []
+    for bound, tail in zip(bounds, ((1 - level) / 2, (1 + level) / 2), strict=True):
+        added = [bound] if math.isfinite(bound) else []
+        tasks = [[*task, *added] for task in known]
+        weights = [rng.dirichlet(np.ones(len(task)), resamples) / len(tasks) for task in tasks]
+        limits.append(float(np.quantile(_middle_mean(np.concatenate(tasks), np.concatenate(weights, axis=1)), tail)))
+    pooled = np.sort(np.concatenate(known))
+    cut = len(pooled) // 4
+    value = float(pooled[cut : len(pooled) - cut].mean())
+    low, high = min(limits[0], value), max(limits[1], value)
+    return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method)
 
 
-def compare(first: Values, second: Values, level: float = LEVEL) -> Comparison:
-    """The paired comparison of two agents.
+def of_two_groups(
+    first: np.ndarray,
+    second: np.ndarray,
+    measure: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    bounds: Bounds = (0.0, 1.0),
+    level: float = LEVEL,
+) -> Estimate:
+    """Return a number of the means of two groups of seeds, such as forward transfer, with the uncertainty of both.
+
+    The seeds of each group have random weights, and one more seed stands at the bound that makes the number small for
+    its lower limit, and large for its upper one: Gaffke's interval for two groups. Groups are weighted independently,
+    which is too wide rather than too narrow where seeds of both are alike.
+
+    Args:
+        first: what the number rises with, float64 [seeds, tasks].
+        second: what it falls with, float64 [other seeds, tasks].
+        measure: the number of two means, [..., tasks] and [..., tasks] to [...]; monotone, and may be infinite.
+        bounds: the lowest and the highest possible value of either group.
+        level: coverage of the interval.
+    """
+    require(*fraction(level=level), *_bounds_rules(bounds))
+    method, n = f"two groups, weighted {level:.0%}", min(len(first), len(second))
+    value = float(measure(first.mean(0), second.mean(0)))
+    if n < 2:
+        return Estimate(value, None, None, n, 0, method=method, reason="one seed has no interval")
+    rng, limits = np.random.default_rng(0), []
+    for ends, tail in ((bounds, (1 - level) / 2), (bounds[::-1], (1 + level) / 2)):
+        means = [
+            rng.dirichlet(np.ones(len(group) + 1), RESAMPLES) @ np.vstack([group, np.full(group.shape[1], end)])
+            for group, end in zip((first, second), ends, strict=True)
+        ]
+        limits.append(float(np.quantile(measure(*means), tail, method="lower" if tail < 0.5 else "higher")))
+    return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
+
+
+def compare(first: Values, second: Values, level: float = LEVEL, bounds: Bounds = UNBOUNDED) -> Comparison:
+    """Return the paired comparison of two agents.
 
     Args:
         first: one value per seed.
         second: the other agent's on the same seeds in the same order, with the same curriculum.
         level: coverage of the interval.
+        bounds: the lowest and the highest possible value.
 
     Raises:
         ValueError: for different numbers of seeds.
@@ -172,7 +259,23 @@ def compare(first: Values, second: Values, level: float = LEVEL) -> Comparison:
     signs = [(each > 0) - (each < 0) for each in known]
     std, p_value = (float(np.std(known, ddof=1)), _sign_flip(known)) if len(known) > 1 else (None, None)
     wins, ties, losses = (signs.count(sign) for sign in (1, 0, -1))
-    return Comparison(mean(differences, level), std, p_value, wins=wins, ties=ties, losses=losses)
+    spread = bounds[1] - bounds[0]
+    difference = mean(differences, level, (-spread, spread))
+    return Comparison(difference, std, p_value, wins=wins, ties=ties, losses=losses)
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Return p-values corrected for their number by Holm's procedure, at most 1; None stays and does not count.
+
+    The chance that any of them is below 0.05 where there is no difference is at most 5 %.
+    """
+    known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, i) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * p))
+        corrected[i] = largest
+    return corrected
 
 
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:
@@ -188,7 +291,7 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
     Raises:
         ValueError: for values out of range, and if `MOST_SEEDS` are not enough.
     """
-    stats = _scipy_stats()
+    stats = scipy("stats")
     require(*positive(difference=difference, std=std), *fraction(level=level, power=power))
 
     def finds(n: int) -> bool:
@@ -207,10 +310,13 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
     return high
 
 
-@cache
-def _student(level: float, freedom: int) -> float:
-    """Half the width of Student's interval in standard errors; a report asks for it thousands of times."""
-    return float(_scipy_stats().t.ppf((1 + level) / 2, freedom))
+def _bounds_rules(bounds: Bounds) -> list[tuple[bool, str]]:
+    low, high = bounds
+    return [(low <= high, f"bounds must be a lowest and a highest value, got {bounds}")]
+
+
+def _shown(bounds: Bounds) -> str:
+    return f"[{bounds[0]:g}, {bounds[1]:g}]"
 
 
 def _sign_flip(differences: Sequence[float]) -> float:
@@ -225,10 +331,12 @@ def _sign_flip(differences: Sequence[float]) -> float:
     return float((sums >= sums[0] * (1 - ROUNDING)).mean())
 
 
-def _middle_mean(samples: np.ndarray) -> np.ndarray:
-    """Mean of each row without its lowest and highest quarter, rounded down."""
-    cut = samples.shape[1] // 4
-    return np.sort(samples, axis=1)[:, cut : samples.shape[1] - cut].mean(axis=1)
+def _middle_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the mean of the middle half of weighted values, for each row of weights; a row sums to 1."""
+    order = np.argsort(values)
+    below = np.clip(np.cumsum(weights[:, order], axis=1), 0.25, 0.75)
+    parts = np.diff(below, axis=1, prepend=0.25)
+    return 2 * parts @ values[order]
 
 
 def _known(values: Values) -> tuple[list[float], int]:
@@ -239,16 +347,3 @@ def _known(values: Values) -> tuple[list[float], int]:
 
 def _number(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else float(value)
-
-
-def _scipy_stats() -> Any:
-    """``scipy.stats``.
-
-    Raises:
-        ModuleNotFoundError: without scipy; names the extra to install.
-    """
-    try:
-        from scipy import stats
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("statistics over seeds need scipy: pip install 'ctgraph_rl[stats]'") from error
-    return stats

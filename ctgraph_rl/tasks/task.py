@@ -192,6 +192,11 @@ class Task:
         return values.memoryless_ceiling(self, deterministic)
 
     @property
+    def return_bounds(self) -> tuple[float, float]:
+        """The lowest and the highest undiscounted return of an episode; see `values.return_bounds`."""
+        return values.return_bounds(self)
+
+    @property
     def image_seed(self) -> int | None:
         """The seed of a generated image set, None for sets without."""
         return getattr(self.images, "seed", None)

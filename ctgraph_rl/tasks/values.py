@@ -119,6 +119,20 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     return task.goal_reward * math.prod(share**count for share, count in zip(shares, counts, strict=True))
 
 
+def return_bounds(task: Task) -> tuple[float, float]:
+    """Return the lowest and the highest undiscounted return of an episode, infinite where nothing bounds it.
+
+    An end state pays ``goal_reward`` times a share within the reward's ``bounds``, and the fail state ``fail_reward``.
+    Noise of rewards is normal, which has no bounds; nor has the sum of a ``step_reward``, as an agent may wait on.
+    """
+    bounds = getattr(task.reward_fn, "bounds", None)
+    if bounds is None or task.reward_std > 0:
+        return -math.inf, math.inf
+    paid = [*(share * task.goal_reward for share in bounds(task.graph.branching_factor)), task.fail_reward]
+    low = min(paid) if task.step_reward >= 0 else -math.inf
+    return low, max(paid) if task.step_reward <= 0 else math.inf
+
+
 def random_episode_length(task: Task) -> float:
     """Return the mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
 

@@ -189,11 +189,8 @@ def test_curves_are_means_where_every_seed_has_a_value(tmp_path):
     evaluations = evaluation_curve(found, "goal1")
     training = training_curve(found, block=1, start=0, end=1000, places=1)
 
-    assert [(point.frames, point.estimate.value, point.estimate.n) for point in evaluations] == [
-        (0, 0.0, 2),
-        (2000, 0.375, 2),
-    ]
-    assert [(point.frames, point.estimate.value) for point in training] == [(1000, 0.75)]
+    assert evaluations == [(0, 0.0, 0.0, 0.0, 2), (2000, 0.375, 0.25, 0.5, 2)]
+    assert training == [(1000, 0.75, 0.5, 1.0, 2)]
 
 
 def test_more_agents_than_colours_are_in_the_tables_and_it_is_said(tmp_path):

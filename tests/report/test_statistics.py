@@ -5,10 +5,22 @@ from __future__ import annotations
 import math
 import sys
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ctgraph_rl.report import statistics
-from ctgraph_rl.report.statistics import compare, interquartile_mean, mean, seeds_needed, solved_rate
+from ctgraph_rl.report.statistics import (
+    compare,
+    holm,
+    interquartile_mean,
+    mean,
+    median_time,
+    of_two_groups,
+    seeds_needed,
+    solved_rate,
+)
 
 pytest.importorskip("scipy")
 
@@ -55,6 +67,142 @@ def test_solved_rates_have_the_exact_interval(solved, low, high):
     assert (estimate.low, estimate.high) == pytest.approx((low, high), abs=5e-6)
 
 
+FIVE_OF_FIVE = 0.025 ** (1 / 5)
+"""Clopper and Pearson's lower limit of 5 of 5: the rate whose chance of 5 of 5 is 2.5 %."""
+
+
+def test_five_of_five_is_a_share_above_0_48_and_so_is_a_mean_of_five_ones_in_its_bounds():
+    share, average = solved_rate([True] * 5), mean([1.0] * 5, bounds=(0, 1))
+
+    assert pytest.approx(0.4782, abs=5e-5) == FIVE_OF_FIVE
+    assert (share.low, share.high) == (pytest.approx(FIVE_OF_FIVE, abs=1e-12), 1.0)
+    assert (average.low, average.high) == (share.low, share.high)
+    assert str(average) == "1.00 [0.48, 1.00] n = 5"
+
+
+@pytest.mark.parametrize("ones", range(5))
+def test_two_outcomes_at_the_bounds_have_the_interval_of_a_share(ones):
+    values = [1.0] * ones + [0.0] * (4 - ones)
+
+    average, share = (
+        mean([3 * value - 1 for value in values], bounds=(-1, 2)),
+        solved_rate([value == 1 for value in values]),
+    )
+
+    assert (average.low, average.high) == pytest.approx((3 * share.low - 1, 3 * share.high - 1), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("values", "level", "low", "high"),
+    [
+        ((0.5, 0.5), 0.95, 0.5 * 0.025**0.5, 1 - 0.5 * 0.025**0.5),  # the weight of the two has P(W < w) = w**2
+        ((0.5, 1.0), 0.5, 0.125**0.5, None),  # a triangle over 0, 0.5 and 1: P(mean < m) = 2 m**2 below 0.5
+        ((0.0, 0.5), 0.5, None, 1 - 0.125**0.5),
+    ],
+)
+def test_a_mean_in_its_bounds_has_gaffkes_interval_by_hand(values, level, low, high):
+    estimate = mean(values, level, bounds=(0, 1))
+
+    assert low is None or estimate.low == pytest.approx(low, abs=1e-9)
+    assert high is None or estimate.high == pytest.approx(high, abs=1e-9)
+
+
+def test_a_mean_in_its_bounds_has_the_quantiles_of_random_weights():
+    values = [0.2, 0.4, 0.5, 0.9, 1.0]
+    weights = np.random.default_rng(0).dirichlet(np.ones(6), 200_000)
+
+    estimate = mean(values, bounds=(0, 1))
+
+    assert estimate.low == pytest.approx(np.quantile(weights @ [*values, 0.0], 0.025), abs=2e-3)
+    assert estimate.high == pytest.approx(np.quantile(weights @ [*values, 1.0], 0.975), abs=2e-3)
+
+
+MILLIONTHS = st.integers(-(10**6), 2 * 10**6).map(lambda number: number / 10**6)
+RETURNS = st.lists(st.one_of(st.sampled_from([-1.0, 0.0, 2.0]), MILLIONTHS), min_size=2, max_size=12)
+LEVELS = st.integers(5, 99).map(lambda percent: percent / 100)
+
+
+@settings(max_examples=150, deadline=None)
+@given(RETURNS, LEVELS, LEVELS)
+def test_an_interval_in_bounds_is_never_outside_nor_empty_and_grows_with_its_level(values, one, other):
+    narrow, wide = (mean(values, level, bounds=(-1, 2)) for level in sorted((one, other)))
+
+    assert -1 <= wide.low <= narrow.low <= narrow.high <= wide.high <= 2
+    assert narrow.low < narrow.high
+    assert narrow.low - 1e-9 <= narrow.value <= narrow.high + 1e-9 or min(one, other) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("values", "bounds", "low", "high"),
+    [([1.0, 2.0, 3.0], (0, math.inf), 0.0, 2 + 4.302653 / 3**0.5), ([1.0, 1.0, 0.0], (-math.inf, 1), -0.76755, 1.0)],
+)
+def test_students_interval_is_cut_at_the_one_bound_that_is_known(values, bounds, low, high):
+    estimate = mean(values, bounds=bounds)
+
+    assert estimate.method == "mean, Student t 95%"
+    assert (estimate.low, estimate.high) == pytest.approx((low, high), abs=1e-5)
+
+
+def test_bounds_that_a_value_leaves_are_none():
+    estimate = mean([0.5, 1.5, 1.0], bounds=(0, 1))
+
+    assert (estimate.method, estimate.reason) == ("mean, Student t 95%", "a value is outside [0, 1]")
+    assert estimate.low == mean([0.5, 1.5, 1.0]).low
+
+
+@pytest.mark.parametrize(
+    ("times", "value", "low", "high"),
+    [
+        ((3.0, 1.0, 2.0, 6.0, 5.0, 4.0), 3.5, 1.0, 6.0),  # 1 - 2 / 2**6 = 0.97
+        ((1.0, 2.0, 3.0, 4.0, 5.0), 3.0, 0.0, math.inf),  # 1 - 2 / 2**5 = 0.94
+        (tuple(map(float, range(1, 10))), 5.0, 2.0, 8.0),  # 1 - 2 (1 + 9) / 2**9 = 0.96
+        ((1.0, math.inf, 2.0, math.inf, 3.0, math.inf), math.inf, 1.0, math.inf),
+        ((7.0,), 7.0, 0.0, math.inf),
+    ],
+)
+def test_times_have_the_order_statistics_of_their_median_and_never_is_infinite(times, value, low, high):
+    estimate = median_time(times)
+
+    assert (estimate.value, estimate.low, estimate.high) == (value, low, high)
+
+
+def test_a_seed_that_never_got_there_is_no_seed_without_a_result():
+    estimate = median_time([math.inf, 1.0, None])
+
+    assert (estimate.n, estimate.n_undefined, estimate.value) == (2, 1, math.inf)
+    assert estimate.reason == "the range of the times covers 50%"
+
+
+def gain(runs, experts):
+    """Continual World's forward transfer of mean areas."""
+    return ((runs - experts) / (1 - experts)).mean(-1)
+
+
+def test_a_number_of_two_groups_has_the_uncertainty_of_both():
+    runs, experts = np.array([[0.9], [0.8], [1.0], [0.9], [0.9]]), np.array([[0.5], [0.6], [0.4], [0.5], [0.5]])
+    certain = np.repeat(experts.mean(0, keepdims=True), 10_000, 0)
+
+    both, one = of_two_groups(runs, experts, gain), of_two_groups(runs, certain, gain)
+
+    assert both.value == one.value == pytest.approx(0.8)
+    assert both.low < one.low < 0.8 < one.high <= both.high <= 1
+    with np.errstate(divide="ignore"):
+        nothing_to_gain = of_two_groups(runs, np.array([[1.0], [1.0], [0.99], [1.0], [1.0]]), gain)
+    assert nothing_to_gain.low < -50
+
+
+def test_p_values_are_corrected_for_their_number():
+    assert holm([0.01, None, 0.04, 0.03]) == pytest.approx([0.03, None, 0.06, 0.06])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_a_difference_of_bounded_values_is_bounded():
+    comparison = compare([1.0] * 5, [0.0] * 5, bounds=(0, 1))
+
+    assert (comparison.difference.low, comparison.difference.high) == (pytest.approx(2 * FIVE_OF_FIVE - 1), 1.0)
+
+
 def test_failed_runs_are_shown_in_a_solved_rate():
     estimate = solved_rate([True, None, False])
 
@@ -73,12 +221,10 @@ def test_the_interquartile_mean_is_of_the_middle_half_of_all_tasks_together():
 def test_the_bootstrap_is_stratified_so_tasks_without_spread_stay_as_they_are():
     estimate = interquartile_mean([[0.0] * 10, [1.0] * 10])
 
-    assert (estimate.low, estimate.value, estimate.high) == (0.5, 0.5, 0.5)
+    assert (estimate.low, estimate.value, estimate.high) == pytest.approx((0.5, 0.5, 0.5), abs=1e-12)
 
 
 def test_the_bootstrap_interval_covers_about_what_it_should_at_twenty_seeds():
-    import numpy as np
-
     rng = np.random.default_rng(1)
     samples = rng.normal(size=(200, 20))
 
@@ -151,6 +297,8 @@ def test_seeds_needed_are_those_of_published_power_tables(effect, paired, n):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: mean([1.0], bounds=(1.0, 0.0)), "bounds must be a lowest and a highest value, got"),
+        (lambda: median_time([-1.0]), "times must be >= 0, got -1.0"),
         (lambda: mean([1.0], level=95), r"level must be in \[0, 1\], got 95"),
         (lambda: compare([1.0], []), "pairs need equally many seeds, got 1 and 0"),
         (lambda: interquartile_mean([]), "needs the values of at least one task"),

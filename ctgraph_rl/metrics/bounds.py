@@ -1,0 +1,100 @@
+"""The lowest and the highest value that metrics can have, from what is known of a run before it starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Known(NamedTuple):
+    """What is known of the numbers of a run."""
+
+    low: float  # lowest mean return on any task; -inf where nothing bounds it
+    high: float  # highest one
+    tasks: int
+    evaluations: int  # of each task, after those before training
+    failure_is_lowest: bool  # whether no return is below that of a failure
+
+
+Bounds = tuple[float, float]
+BoundsOf = Callable[[Known], Bounds]
+"""What a metric says of its values: their bounds, infinite where there are none."""
+
+
+def unbounded(known: Known) -> Bounds:
+    """Return the bounds of anything."""
+    return -math.inf, math.inf
+
+
+def not_negative(known: Known) -> Bounds:
+    """Return the bounds of ratios and of what is lost against the best."""
+    return 0.0, math.inf
+
+
+def at_most_1(known: Known) -> Bounds:
+    """Return the bounds of a share of what there was to gain."""
+    return -math.inf, 1.0
+
+
+def between(low: float, high: float) -> BoundsOf:
+    """Return what says the same bounds of every run."""
+    return lambda known: (low, high)
+
+
+def of_performance(known: Known) -> Bounds:
+    """Return the bounds of means of performance."""
+    return known.low, known.high
+
+
+def of_changes(known: Known) -> Bounds:
+    """Return the bounds of differences of two performances."""
+    return known.low - known.high, known.high - known.low
+
+
+def of_changes_but_one(known: Known) -> Bounds:
+    """Return the bounds of means over tasks of such differences, of which that of one task is 0."""
+    share = (known.tasks - 1) / known.tasks
+    return share * (known.low - known.high) if share else 0.0, share * (known.high - known.low) if share else 0.0
+
+
+def of_gains(known: Known) -> Bounds:
+    """Return the bounds of the part of a change that is not negative."""
+    return 0.0, known.high - known.low
+
+
+def of_remembering(known: Known) -> Bounds:
+    """Return the bounds of 1 less the size of a loss."""
+    return 1 + known.low - known.high, 1.0
+
+
+def of_scaled_changes(known: Known) -> Bounds:
+    """Return the bounds of changes that are divided by the largest size of a performance."""
+    largest = 1.0 if known.low >= 0 or known.high <= 0 else 2.0
+    return -largest, largest
+
+
+def of_lost_shares(known: Known) -> Bounds:
+    """Return the bounds of the share of the best performance that is lost."""
+    return 0.0, 1.0 if known.low >= 0 else math.inf
+
+
+def of_sums(known: Known) -> Bounds:
+    """Return the bounds of a sum of performance over tasks."""
+    return known.tasks * known.low, known.tasks * known.high
+
+
+def of_sums_over_time(known: Known) -> Bounds:
+    """Return the bounds of a sum of performance over tasks and evaluations."""
+    count = known.tasks * known.evaluations
+    return count * known.low, count * known.high
+
+
+def of_counts(known: Known) -> Bounds:
+    """Return the bounds of a number of tasks."""
+    return 0.0, float(known.tasks)
+
+
+def from_failure_to_best(low: float, high: float) -> BoundsOf:
+    """Return the bounds of performance on a scale on which a failure is ``low`` and the optimum ``high``."""
+    return lambda known: (low if known.failure_is_lowest else -math.inf, high)

@@ -1,0 +1,84 @@
+"""What bounds the numbers of a curriculum's runs: the rewards of its tasks say it of returns, each metric of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.metrics.bounds import Known, of_changes, of_performance
+from ctgraph_rl.metrics.record import METRICS
+from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
+from ctgraph_rl.runs.read import Run, grouped
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+NOTHING_KNOWN = Known(*UNBOUNDED, tasks=1, evaluations=1, failure_is_lowest=False)
+
+
+@dataclass(frozen=True)
+class BoundsOfRuns:
+    """The bounds of what the runs of a curriculum measure; infinite where nothing is known.
+
+    Args:
+        returns: of each task by its label.
+        known: what the metrics' bounds follow from.
+    """
+
+    returns: Mapping[str, Bounds] = field(default_factory=dict)
+    known: Known = NOTHING_KNOWN
+
+    @property
+    def of_returns(self) -> Bounds:
+        """Of the mean return on any task."""
+        return of_performance(self.known)
+
+    def of_task(self, label: str) -> Bounds:
+        """Of the mean return on a task."""
+        return self.returns.get(label, UNBOUNDED)
+
+    def of_change(self, label: str) -> Bounds:
+        """Of the difference of two mean returns on a task."""
+        low, high = self.of_task(label)
+        return of_changes(self.known._replace(low=low, high=high))
+
+    def of_metric(self, name: str) -> Bounds:
+        """Of a metric; one of another version has none."""
+        return METRICS[name].bounds(self.known) if name in METRICS else UNBOUNDED
+
+
+NO_BOUNDS = BoundsOfRuns()
+"""Of runs of which nothing is known."""
+
+
+def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
+    """Return the bounds of what the runs of each curriculum measure, by the curriculum's name in tables."""
+    of: dict[str, list[Run]] = {}
+    for (name, _), by_seed in grouped(runs).items():
+        of.setdefault(name, []).extend(run for run in by_seed.values() if run is not None)
+    return {name: bounds_of(some) for name, some in of.items()}
+
+
+def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
+    """Return the bounds of runs of one curriculum, from the first of them whose directory has the curriculum."""
+    for run in runs:
+        curriculum = _curriculum(run)
+        if curriculum is not None and run.history is not None:
+            returns = {
+                label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
+            }
+            lows, highs = zip(*returns.values(), strict=True)
+            failure = all(task.fail_reward == task.return_bounds[0] for task in curriculum.tasks)
+            curves = run.history.evaluations.values()
+            evaluations = max((sum(frames > 0 for frames, _ in curve) for curve in curves), default=1)
+            known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
+            return BoundsOfRuns(returns, known)
+    return NO_BOUNDS
+
+
+def _curriculum(run: Run) -> Curriculum | None:
+    """Return what a run learned; None where its directory does not say, or says another one."""
+    try:
+        found = Curriculum.from_json(run.path / CURRICULUM)
+    except (OSError, ValueError):
+        return None
+    return found if found.fingerprint == run.about["fingerprint"] else None

@@ -1,0 +1,97 @@
+"""Intervals of a mean and of a median, and the bounds of what they are of; `statistics` says which is for what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+Bounds = tuple[float, float]
+"""Lowest and highest possible value; infinite where it is not known."""
+
+UNBOUNDED: Bounds = (-math.inf, math.inf)
+
+ROUNDING = 1e-6
+"""By how much of its bounds a value may be outside of them: rewards are float32."""
+
+SCALED_DIGITS = 12
+"""Digits of values that are scaled to bounds of 0 and 1: the last bits decide nothing."""
+
+GRID = 65
+"""Places at which a distribution is computed to find a quantile, `REFINEMENTS` times, closer and closer to it."""
+
+REFINEMENTS = 3
+
+
+@cache
+def student(level: float, freedom: int) -> float:
+    """Half the width of Student's interval in standard errors; a report asks for it thousands of times."""
+    return float(scipy("stats").t.ppf((1 + level) / 2, freedom))
+
+
+def gaffke(values: Sequence[float], bounds: Bounds, level: float) -> Bounds:
+    """Return Gaffke's interval of a mean of values within bounds."""
+    low, high = bounds
+    spread = high - low
+    if spread == 0:
+        return bounds
+    scaled = np.sort(np.clip((np.array(values) - low) / spread, 0, 1).round(SCALED_DIGITS))
+    tail = (1 - level) / 2
+    least = _least_mean(tuple(scaled.tolist()), tail)
+    most = 1 - _least_mean(tuple((1 - scaled[::-1]).round(SCALED_DIGITS).tolist()), tail)
+    return low + spread * least, low + spread * most
+
+
+@lru_cache(maxsize=2**16)
+def _least_mean(values: tuple[float, ...], tail: float) -> float:
+    """Return a quantile of the mean of values and one more 0, whose weights are uniform over all that sum to 1.
+
+    Such a mean has the density of a B-spline whose knots are the values (Curry and Schoenberg 1966). For zeros and ones
+    it is a beta distribution, as of Clopper and Pearson.
+
+    Args:
+        values: in [0, 1], rising.
+        tail: the probability below.
+    """
+    n, ones = len(values), sum(value == 1 for value in values)
+    if ones + sum(value == 0 for value in values) == n:
+        return float(scipy("special").betaincinv(ones, n - ones + 1, tail)) if ones else 0.0
+    if values[0] == values[-1]:
+        return values[0] * tail ** (1 / n)
+    below = scipy("interpolate").BSpline.basis_element([0.0, *values]).antiderivative()
+    grid = np.linspace(0, values[-1], GRID)
+    for _ in range(REFINEMENTS):
+        shares = below(grid) * (n / values[-1])
+        place = int(np.clip(np.searchsorted(shares, tail), 1, GRID - 1))
+        lower, upper, at, to = grid[place - 1], grid[place], shares[place - 1], shares[place]
+        grid = np.linspace(lower, upper, GRID)
+    return float(lower + (upper - lower) * (tail - at) / (to - at)) if to > at else float(lower)
+
+
+def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
+    """Return whether values are within bounds, rounding apart."""
+    slack = ROUNDING * max([1.0, *(abs(bound) for bound in bounds if math.isfinite(bound))])
+    return all(bounds[0] - slack <= value <= bounds[1] + slack for value in known)
+
+
+@cache
+def median_ranks(n: int, level: float) -> int:
+    """Return the largest k for which the k-th smallest and k-th largest of n values cover the median; 0 for none."""
+    return sum(scipy("special").bdtr(i, n, 0.5) <= (1 - level) / 2 for i in range((n + 1) // 2))
+
+
+def scipy(part: str) -> Any:
+    """Return a module of scipy.
+
+    Raises:
+        ModuleNotFoundError: without scipy; names the extra to install.
+    """
+    try:
+        import_module("scipy")
+        return import_module(f"scipy.{part}")
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("statistics over seeds need scipy: pip install 'ctgraph_rl[stats]'") from error
