@@ -209,16 +209,20 @@ class CTGraphEnv(EnvBase):
         require((not wrong, f"rows {wrong} of the given state are finished or no states of their trees"))
         if mask is None:
             return RowState(*(value.clone() for value in state))
-        return RowState(*(torch.where(mask, new, old) for old, new in zip(present, state, strict=True)))
+        return dynamics.choose(mask, state, present)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._tensordict(self.step_data(tensordict.get("action", None)))
+        mask = tensordict.get("_step", None)
+        mask = None if mask is None else mask.view(self.batch_size)
+        return self._tensordict(self.step_data(tensordict.get("action", None), mask))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """The standard method without its question whether any row is done and without its merge of two TensorDicts.
 
         The data are equal to those of the standard method, which TorchRL takes when the environment is wrapped.
         """
+        if "_step" in tensordict:
+            return super()._step_and_maybe_reset(tensordict)
         tensordict = self.step(tensordict.to(self.device) if tensordict.device != self.device else tensordict)
         tensordict_ = self._step_mdp(tensordict)
         if self._post_step_mdp_hooks is not None:
@@ -260,22 +264,28 @@ class CTGraphEnv(EnvBase):
         self._steps.extend(steps)
         return [step.empty() for step in steps[:1]]
 
-    def step_data(self, action: Tensor | None) -> dict[str, Tensor]:
-        """Step all rows with actions, int64 [N]; return the data after the step by key, ``reward`` among them.
+    def step_data(self, action: Tensor | None, mask: Tensor | None = None) -> dict[str, Tensor]:
+        """Step all rows; return the data after the step by key, ``reward`` among them.
 
         This and `restart_data` are a step for loops that keep tensors. Values may share memory with each other and with
         the rows' state: do not write into them.
+
+        Args:
+            action: int64 [N].
+            mask: bool [N], TorchRL's ``_step``: the rows to step. The others stay as they are, draw nothing and have
+                the data of before, with reward 0. None: all rows.
 
         Raises:
             ValueError: for actions that ``check_actions`` refuses.
         """
         if self.check_actions:
-            self.rows.check_actions(action)
-        shown = self.rows.step(action)  # type: ignore[arg-type]
-        done = shown.done.unsqueeze(-1)
-        data = self._data(shown.observation, done, torch.zeros_like(done), shown)
-        data["reward"] = self.rows.reward.unsqueeze(-1)
-        return data
+            self.rows.check_actions(action, mask)
+        shown = self.rows.step(action, mask)  # type: ignore[arg-type]
+        done, reward = shown.done.unsqueeze(-1), self.rows.reward
+        is_init = torch.zeros_like(done)
+        if mask is not None:
+            is_init, reward = (~mask & (self.rows.step_count == 0)).unsqueeze(-1), reward * mask
+        return self._data(shown.observation, done, is_init, shown) | {"reward": reward.unsqueeze(-1)}
 
     def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.

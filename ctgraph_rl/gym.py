@@ -26,7 +26,7 @@ from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.text_render import as_text
 from ctgraph_rl.checks import as_tuple, is_int, require
-from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, RowState, Shown
+from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.task import Task
 
@@ -318,10 +318,9 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
 
     def _only(self, mask: NDArray[np.bool_], change: Callable[[], None]) -> None:
         """A change that ends all episodes, in the rows of a mask only."""
-        before, rows = self.rows.state, torch.from_numpy(mask)
+        before = self.rows.state
         change()
-        after = zip(self.rows.state, before, strict=True)
-        self.rows.state = RowState(*(torch.where(rows, new, old) for new, old in after))
+        self.rows.state = choose(torch.from_numpy(mask), self.rows.state, before)
 
     def render(self) -> tuple[Frame, ...] | None:
         """The present state of every row as a picture, uint8 [192, 384, 3], or as text."""

@@ -288,9 +288,17 @@ class Rows(nn.Module):
         self._start_episodes(mask)
         return self._keep(*self.engine.reset(self.state, mask))
 
-    def step(self, action: Tensor) -> Shown:
-        """One step of all rows with actions, int64 [N]; what they show. The reward is in ``state``."""
-        return self._keep(*self.engine.step(self.state, action))
+    def step(self, action: Tensor, mask: Tensor | None = None) -> Shown:
+        """One step of all rows, or of those of a mask, bool [N], with actions, int64 [N]; what all rows show.
+
+        The reward is in ``state``. Rows outside the mask stay as they are, draw nothing, and may have any action.
+        """
+        before, engine = self.state, self.engine
+        state, shown = engine.step(before, action if mask is None else action * mask)
+        if mask is not None:
+            state = dynamics.choose(mask, state, before)
+            shown = dynamics.choose(mask, shown, engine.reset(before, torch.zeros_like(mask))[1])
+        return self._keep(state, shown)
 
     def act(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """`step` with less, for rows none of which is finished: what all rows observe, and which are done, bool [N].
@@ -335,12 +343,8 @@ class Rows(nn.Module):
         """bool [N]: rows whose episode is over."""
         return dynamics.is_done(self.state, self.params.tree)
 
-    def check_actions(self, action: Tensor | None) -> None:
-        """Refuse actions of a wrong shape, dtype or range, and steps of finished rows.
-
-        Raises:
-            ValueError: saying which.
-        """
+    def check_actions(self, action: Tensor | None, mask: Tensor | None = None) -> None:
+        """Refuse with a ValueError actions of a wrong shape, dtype or range, and steps of finished rows; see `step`."""
         spec = f"action must be int64 of shape [{self.num_rows}] with values in 0..{self.max_branching}"
         require((action is not None, f"{spec}, got none: a policy must write it before a step"))
         assert action is not None
@@ -349,6 +353,7 @@ class Rows(nn.Module):
             (action.shape == (self.num_rows,), f"{spec}, got shape {list(action.shape)}"),
         )
         outside, finished = (action < 0) | (action > self.max_branching), self.is_done
+        outside, finished = (outside, finished) if mask is None else (outside & mask, finished & mask)
         if (outside | finished).any():
             require(
                 (not outside.any(), f"{spec}, got {action[outside][:5].tolist()}"),

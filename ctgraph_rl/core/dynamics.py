@@ -8,7 +8,7 @@ Shapes: N rows; every tensor is [N] unless said otherwise. All that is random is
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -61,6 +61,15 @@ class Shown(NamedTuple):
     outcome: Tensor  # uint8
     leaf: Tensor  # int64
     done: Tensor  # bool
+
+
+Batch = TypeVar("Batch", RowState, Shown)
+
+
+def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:
+    """Return the rows of a mask, bool [N], as they are in one value, and the others as they are in another."""
+    pairs = zip(new, old, strict=True)
+    return type(new)(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)

@@ -147,6 +147,13 @@ CONFIGURATIONS: dict[str, Callable[..., Task]] = {
 Json = str | PathLike[str] | Mapping[str, Any]
 
 
+class UnknownFieldError(ValueError, TypeError):
+    """A keyword argument that names no field.
+
+    It is a ``TypeError`` as of any Python function, too: TorchRL's ``GymEnv`` leaves out an argument that is refused so.
+    """
+
+
 def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
     """A task from what ``gymnasium.make`` is given.
 
@@ -157,6 +164,7 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
             task and config also the arguments of `ct_graph`.
 
     Raises:
+        UnknownFieldError: a ``ValueError``, for changes that are no fields.
         ValueError: for unknown names, and values out of range.
     """
     require((task is None or config is None, "give a task or a config, not both"))
@@ -186,6 +194,8 @@ def _changed(task: Task, changes: dict[str, Any]) -> Task:
     parts = (Task, type(task.graph), type(task.observations))
     known = ["config", "task", "task_pool", "image_seed", *(field.name for part in parts for field in fields(part))]
     close = [f"; did you mean {match!r}?" for name in unknown for match in get_close_matches(name, known, 1)]
-    message = f"no field of a task, its graph or its observations: {', '.join(unknown)}{''.join(close)}"
-    require((not unknown, message))
+    if unknown:
+        python = "; ".join(f"unexpected keyword argument {name!r}" for name in unknown)
+        message = f"no field of a task, its graph or its observations: {', '.join(unknown)}{''.join(close)}"
+        raise UnknownFieldError(f"{python}: {message}")
     return replace(task, **changes)
