@@ -150,7 +150,7 @@ Json = str | PathLike[str] | Mapping[str, Any]
 class UnknownFieldError(ValueError, TypeError):
     """A keyword argument that names no field.
 
-    It is a ``TypeError`` as of any Python function, too: TorchRL's ``GymEnv`` leaves out an argument that is refused so.
+    It is a ``TypeError``, too, as of any Python function: TorchRL's ``GymEnv`` tries without an argument refused so.
     """
 
 

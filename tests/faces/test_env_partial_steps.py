@@ -37,7 +37,7 @@ def test_rows_outside_the_mask_keep_their_state_and_their_data_without_a_reward(
     after = env.step(masked(root, [0] * N, mask))["next"]
     whole = twin.step(root.clone().set("action", torch.zeros(N, dtype=torch.int64)))["next"]
 
-    assert all((after[key][~mask] == root[key][~mask]).all() for key in root.keys() if key != "action")
+    assert all((after[key][~mask] == root[key][~mask]).all() for key in root.keys(True) if key != "action")
     assert not after["reward"][~mask].any() and (after[mask] == whole[mask]).all()
     assert all(torch.equal(getattr(env.rows, name)[~mask], state[name][~mask]) for name in STATE)
     assert all(torch.equal(getattr(env.rows, name)[mask], getattr(twin.rows, name)[mask]) for name in STATE)
@@ -68,7 +68,7 @@ def test_a_mask_that_is_all_true_is_a_step_and_one_that_is_all_false_is_none(ker
     none = env.step(masked(root, actions, torch.zeros(shape, dtype=torch.bool)))["next"]
     every = env.step(masked(root, actions, torch.ones(shape, dtype=torch.bool)))["next"]
 
-    assert all((none[key] == root[key]).all() for key in root.keys()) and not none["reward"].any()
+    assert all((none[key] == root[key]).all() for key in root.keys(True)) and not none["reward"].any()
     assert (every == twin.step(root.clone().set("action", actions))["next"]).all()
 
 
@@ -96,7 +96,7 @@ def test_a_rollout_until_all_rows_are_done_leaves_each_where_its_episode_ended(k
     data = env.rollout(50, break_when_all_done=True)
 
     lengths = (1 + data["next", "done"].int().argmax(1)).flatten().tolist()
-    assert len(set(lengths)) > 1 and max(lengths) == data.shape[1] and "_step" not in data.keys()
+    assert len(set(lengths)) > 1 and max(lengths) == data.shape[1] and "_step" not in data
     assert env.rows.step_count.tolist() == lengths
     whole = alone.rollout(data.shape[1], actions=list(data["action"].T), break_when_any_done=False)
     for row, length in enumerate(lengths):
