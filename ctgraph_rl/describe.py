@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
+from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_lines, terminal_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -188,34 +188,30 @@ def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
     console = Console() if console is None else console
     if not console.is_terminal:
         console.width = 200
-    table = Table(title=Text(sheet.title), title_justify="left", caption_justify="left")
+    table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
     for i, (name, side) in enumerate(sheet.columns.items()):
-        table.add_column(Text(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
+        table.add_column(_shown(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
     for row in sheet.rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*map(_shown, row))
     console.print(table)
     for note in sheet.notes:
-        console.print(Text(note))
+        console.print(_shown(note))
+
+
+def _shown(text: str) -> Text:
+    return Text(terminal_text(text))
 
 
 def to_markdown(sheet: Sheet) -> str:
     """A table in Markdown, with its title as a heading."""
     sides = ["--:" if side == "r" else ":--" for side in sheet.columns.values()]
-    lines = ["| " + " | ".join(map(_markdown, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
-    notes = [line for note in sheet.notes for line in ("", f"{_markdown(note)}")]
-    return "\n".join([f"## {_markdown(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""])
+    lines = ["| " + " | ".join(map(markdown_text, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
+    notes = [line for note in sheet.notes for line in ("", f"{markdown_text(note)}")]
+    return "\n".join(
+        [f"## {markdown_text(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""]
+    )
 
 
-def _markdown(text: str) -> str:
-    """Text that Markdown shows as it is; underscores within words mean nothing there."""
-    return re.sub(r"([\\|`*<>\[\]])|(?<!\w)_|_(?!\w)", lambda found: "\\" + found[0], " ".join(text.split()))
-
-
-LATEX = {
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
-}
 MATHS = {"P_R": "$P_R$", "E[rho]": r"$E[\rho]$", "b": "$b$", "d": "$d$", "p": "$p$"}
 WIDE = 60
 """Characters from which on a column of a LaTeX table is broken into lines."""
@@ -224,19 +220,15 @@ WIDE = 60
 def to_latex(sheet: Sheet) -> str:
     """A table in LaTeX, for the package booktabs; title and notes as comments."""
     sides = [_latex_side(i, side, sheet.rows) for i, side in enumerate(sheet.columns.values())]
-    header = " & ".join(MATHS.get(name, _latex(name)) for name in sheet.columns)
-    lines = [" & ".join(map(_latex, row)) + r" \\" for row in sheet.rows]
-    notes = [f"% {' '.join(line.split())}" for line in (sheet.title, *sheet.notes)]
+    header = " & ".join(MATHS.get(name, latex_text(name)) for name in sheet.columns)
+    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in sheet.rows]
+    notes = [f"% {terminal_text(line)}" for line in (sheet.title, *sheet.notes)]
     begin, end = rf"\begin{{tabular}}{{{''.join(sides)}}}", r"\end{tabular}"
     return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
 
 
 def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
     return r"p{0.6\linewidth}" if any(len(row[column]) > WIDE for row in rows) else side
-
-
-def _latex(text: str) -> str:
-    return "".join(LATEX.get(character, character) for character in " ".join(text.split()))
 
 
 def _show(sheets: Sequence[Sheet], form: str) -> None:
@@ -272,7 +264,7 @@ def main(
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
 
 
 def _parser(prog: str | None) -> argparse.ArgumentParser:

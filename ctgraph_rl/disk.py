@@ -22,7 +22,7 @@ PART = ".part"
 """Ending of a file that is being written."""
 
 
-def write_whole(path: Path | str, content: bytes | str) -> None:
+def write_whole(path: str | os.PathLike[str], content: bytes | str) -> None:
     """Write a file so that whoever reads it, also after a crash, finds the old content or the new.
 
     A link at its place is replaced, its target stays as it is.
@@ -124,12 +124,13 @@ def open_own(path: Path, mode: str) -> BinaryIO:
         ValueError: for a symbolic link, a file with a second name elsewhere, and what is no regular file.
     """
     require_no_link(path)
+    rule = f"{path} must be a regular file without another name, as hard links are; remove it"
+    require((not path.exists() or path.is_file(), rule))
     opener = _opener(os.O_NOFOLLOW | os.O_NONBLOCK)
     file: BinaryIO = open(path, mode, 0, opener=opener)  # type: ignore[assignment] # noqa: SIM115 - it is returned
-    found = os.fstat(file.fileno())
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+    if os.fstat(file.fileno()).st_nlink > 1:
         file.close()
-        raise ValueError(f"{path} must be a regular file without another name, as hard links are; remove it")
+        raise ValueError(rule)
     return file
 
 

@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, sweepable
 
@@ -52,7 +53,7 @@ def show(run_dir: Path, report: bool) -> None:
     print_summary(run_dir)
     here = Path.cwd()
     shown = run_dir.relative_to(here) if run_dir.is_relative_to(here) else run_dir
-    print(f"results: {shown}")
+    print(f"results: {terminal_text(shown)}")
     how = f"ctgraph-rl report {shlex.quote(str(shown))}"
     print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
 
@@ -83,7 +84,7 @@ def main() -> None:
     except (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError) as error:
         if full_error:
             raise
-        print(f"error: {explain(error)}", file=sys.stderr)
+        print(f"error: {terminal_lines(explain(error))}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)

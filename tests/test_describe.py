@@ -136,12 +136,12 @@ ODD = Sheet("a_b & [c]", {"x_1": "l", "E[rho]": "r"}, (("_a|b*\\\n", "1"), ("50%
 
 def test_markdown_shows_texts_as_they_are():
     assert to_markdown(ODD).splitlines() == [
-        r"## a_b & \[c\]",
+        r"## a_b &amp; \[c\]",
         "",
         r"| x_1 | E\[rho\] |",
         "| :-- | --: |",
         r"| \_a\|b\*\\ | 1 |",
-        r'| 50% \<#\>$~^{} | " |',
+        r'| 50% &lt;#&gt;\$\~^{} | " |',
         "",
         r"note_1 \|",
     ]
@@ -155,7 +155,7 @@ def test_latex_shows_texts_as_they_are():
         r"\toprule",
         r"x\_1 & $E[\rho]$ \\",
         r"\midrule",
-        r"\_a\textbar{}b*\textbackslash{} & 1 \\",
+        r"\_a\textbar{}b{*}\textbackslash{} & 1 \\",
         r"50\% \textless{}\#\textgreater{}\$\textasciitilde{}\textasciicircum{}\{\} & \textquotedbl{} \\",
         r"\bottomrule",
         r"\end{tabular}",

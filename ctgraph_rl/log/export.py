@@ -17,6 +17,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import write_tables
@@ -65,11 +67,11 @@ def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
     for (block, kind), rows in tables.items():
         where = folder / WORKER / f"{block}-{kind}"
         where.mkdir(parents=True)
-        (where / "data-log.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        write_whole(where / "data-log.tsv", "\n".join(rows) + "\n")
     about = {"metrics_columns": ["reward"], "log_format_version": "1.1"}
     scenario = {"complexity": "1-low", "difficulty": "1-easy", "scenario_type": "custom"}
-    (folder / "logger_info.json").write_text(json.dumps(about) + "\n", encoding="utf-8")
-    (folder / "scenario_info.json").write_text(json.dumps(scenario) + "\n", encoding="utf-8")
+    write_whole(folder / "logger_info.json", json.dumps(about) + "\n")
+    write_whole(folder / "scenario_info.json", json.dumps(scenario) + "\n")
 
 
 def numbered(regimes: Sequence[Regime]) -> Iterator[tuple[int, Regime]]:
@@ -108,7 +110,7 @@ def main() -> None:
         else:
             write_l2logger(log.regimes(), arguments.out)
     except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
     print(f"{arguments.format}: {arguments.out}")
 
 

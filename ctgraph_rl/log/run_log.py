@@ -22,7 +22,6 @@ the only field that differs between two equal runs. A reader in three lines, for
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -35,7 +34,8 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import cannot_write, write_whole
+from ctgraph_rl.disk import cannot_write, open_own, write_whole
+from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Curves, Regime
 
@@ -66,7 +66,7 @@ class RunLog:
         self._path = None if path is None else Path(path)
         self._file: BinaryIO | None = None
         if self._path is not None:
-            self._file = self._path.open("xb", buffering=0)
+            self._file = open_own(self._path, "xb")
 
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
@@ -78,10 +78,11 @@ class RunLog:
         path, size = Path(path), int(position["bytes"])
         there = path.stat().st_size
         require((there >= size, f"{path} has {there} bytes and the checkpoint needs {size}: restore the file"))
-        os.truncate(path, size)
+        with open_own(path, "r+b") as file:
+            file.truncate(size)
         log = cls.read(path)
         require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
-        log._path, log._file = path, path.open("ab", buffering=0)
+        log._path, log._file = path, open_own(path, "ab")
         log._start -= position["seconds"]
         return log
 
@@ -274,12 +275,9 @@ def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> N
         log: the run's log.
         labels: a name per task, the last columns.
     """
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["block", "frames", *labels])
-        so_far = zip(log.ends(), log.performance().tolist(), strict=False)
-        for block, (frames, row) in enumerate(so_far):
-            writer.writerow([block, frames, *row])
+    so_far = zip(log.ends(), log.performance().tolist(), strict=False)
+    rows = ([block, frames, *row] for block, (frames, row) in enumerate(so_far))
+    write_whole(path, csv_text([["block", "frames", *labels], *rows], "\r\n"))
 
 
 def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:

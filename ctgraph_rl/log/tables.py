@@ -13,11 +13,13 @@ and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("eva
 
 from __future__ import annotations
 
-import csv
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.log.escape import csv_text, utf8_text
 from ctgraph_rl.log.run_log import RunLog
 
 RUN = {
@@ -78,8 +80,7 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
         types = _types(log, kind, columns)
         rows = list(_rows(log, kind, list(types)))
         written.append(Path(folder) / f"{name}.csv")
-        with written[-1].open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows([list(types), *rows])
+        write_whole(written[-1], csv_text([list(types), *rows]))
         arrow = None if parquet is False else _pyarrow(needed=parquet is True)
         if arrow is not None:
             written.append(Path(folder) / f"{name}.parquet")
@@ -107,8 +108,11 @@ def _write_parquet(arrow: Any, path: Path, types: dict[str, str], rows: Sequence
     from pyarrow import parquet
 
     schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])
-    values = [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in types]
-    parquet.write_table(arrow.table(values, schema=schema), path)
+    columns = zip(*rows, strict=True) if rows else ([] for _ in types)
+    values = [[utf8_text(value) for value in column] for column in columns]
+    buffer = io.BytesIO()
+    parquet.write_table(arrow.table(values, schema=schema), buffer)
+    write_whole(path, buffer.getvalue())
 
 
 def _pyarrow(needed: bool) -> Any:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import METRICS
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_summary
@@ -22,10 +23,10 @@ def main() -> None:
             print_summary(arguments.runs[0])
         report = write_report(arguments.runs, arguments.out)
     except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
     for problem in report.problems:
-        print(f"left out: {problem.reason}", file=sys.stderr)
-    print(f"report of {len(report.runs)} runs: {report.page}")
+        print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
+    print(f"report of {len(report.runs)} runs: {terminal_text(report.page)}")
     if report.problems:
         sys.exit(1)
 

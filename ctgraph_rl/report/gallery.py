@@ -8,7 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.report.style import style
+from ctgraph_rl.visualize.style import picture
 
 FOLDER = "figures"
 INTERVAL = "the 95 % interval of the mean over seeds, within what is possible; one seed has none"
@@ -48,7 +50,7 @@ class Gallery:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._taken: set[str] = set()
-        (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+        made_folder(folder / FOLDER)
 
     def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
         """Draw and write figures, skipping None; their file names start with ``names``."""
@@ -56,11 +58,11 @@ class Gallery:
         with style():
             for one in filter(None, figures):
                 path = f"{FOLDER}/{self._stem(*names, one.kind)}"
-                one.figure.savefig(self.folder / f"{path}.png")
+                png = picture(one.figure, "png")
                 one.figure.set_layout_engine("none")  # its work is done, and is most of the time of a figure
-                one.figure.savefig(self.folder / f"{path}.pdf")
-                png = base64.b64encode((self.folder / f"{path}.png").read_bytes()).decode()
-                written.append(Written(f"{path}.png", one.title, one.caption, png))
+                write_whole(self.folder / f"{path}.png", png)
+                write_whole(self.folder / f"{path}.pdf", picture(one.figure, "pdf"))
+                written.append(Written(f"{path}.png", one.title, one.caption, base64.b64encode(png).decode()))
         return written
 
     def _stem(self, *names: str) -> str:

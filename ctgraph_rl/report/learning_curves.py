@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import FEWEST_FOR_BANDS, Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
@@ -149,4 +150,5 @@ def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
 
 
 def _named(result: Result) -> str:
-    return f"{result.agent if len(result.agent) <= 60 else result.agent[:59] + '…'} (n = {result.n})"
+    agent = terminal_text(result.agent)
+    return figure_text(f"{agent if len(agent) <= 60 else agent[:59] + '…'} (n = {result.n})")

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
+from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 from ctgraph_rl.report import results
 from ctgraph_rl.report.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.heatmaps import MOST_NAMES, transfer_maps
@@ -91,7 +93,7 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
     runs, problems = find_runs(paths)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
     if folder is None:
-        folder = Path(paths[0]) / "report" if len(paths) == 1 else Path("report")
+        folder = made_folder(Path(paths[0]) / "report" if len(paths) == 1 else Path("report"))
     gallery = Gallery(Path(folder))
     parts = [_part(section, gallery) for section in sections(runs)]
     about = {
@@ -107,8 +109,8 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
     }
     page = Path(folder) / "report.html"
     for name in ("report.html", "report.md"):
-        (Path(folder) / name).write_text(_rendered(name, about), encoding="utf-8")
-    (Path(folder) / "tables.tex").write_text(_latex(parts), encoding="utf-8")
+        write_whole(Path(folder) / name, _rendered(name, about))
+    write_whole(Path(folder) / "tables.tex", _latex(parts))
     return Report(page, runs, problems)
 
 
@@ -119,8 +121,14 @@ def _rendered(name: str, about: Mapping[str, Any]) -> str:
     loader, style = FileSystemLoader(Path(__file__).parent), {"trim_blocks": True, "lstrip_blocks": True}
     escapes = name.endswith(".html")
     environment = SandboxedEnvironment(loader=loader, autoescape=escapes, undefined=StrictUndefined, **style)
-    environment.filters["line"] = lambda value: results.markdown_text(str(value))
+    environment.finalize = _one_line if escapes else None
+    environment.filters["line"] = lambda value: markdown_text(value)
     return environment.get_template(f"{name}.j2").render(about)
+
+
+def _one_line(value: Any) -> Any:
+    """Return a text without control characters; what is HTML already and what is no text as it is."""
+    return terminal_text(value) if type(value) is str else value
 
 
 def _title(parts: Sequence[Part]) -> str:
@@ -239,9 +247,9 @@ def _latex(parts: Sequence[Part]) -> str:
 
 
 def _latex_table(caption: str, numbers: Numbers) -> str:
-    rows = [[*map(results.latex_text, numbers.head)], *([*map(results.latex_value, row)] for row in numbers.rows)]
+    rows = [[*map(latex_text, numbers.head)], *([*map(results.latex_value, row)] for row in numbers.rows)]
     lines = [" & ".join(row) + r" \\" for row in rows]
-    title, columns = rf"\caption{{{results.latex_text(caption)}}}", "l" * len(numbers.head)
+    title, columns = rf"\caption{{{latex_text(caption)}}}", "l" * len(numbers.head)
     head = [r"\begin{table}", title, rf"\begin{{tabular}}{{{columns}}}"]
     tail = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
     return "\n".join([*head, r"\toprule", lines[0], r"\midrule", *lines[1:], *tail])

@@ -9,8 +9,6 @@ undefined metric is counted, as in n = 9/10. What cannot be read is named and le
 from __future__ import annotations
 
 import argparse
-import csv
-import html
 import math
 import sys
 import textwrap
@@ -18,10 +16,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
+from ctgraph_rl.disk import write_named
+from ctgraph_rl.log.escape import csv_text, latex_text, markdown_text, terminal_lines, terminal_text
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
@@ -137,14 +137,14 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Ro
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
-    """Write the table, empty cells for what is undefined."""
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(HEADER)
-        for row in rows:
-            e = row.estimate
-            numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
-            writer.writerow([row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note])
+    """Write the table, empty cells for what is undefined; see `ctgraph_rl.log.escape.csv_text`."""
+    write_named(path, csv_text([HEADER, *map(_cells, rows)], "\r\n"))
+
+
+def _cells(row: Row) -> list[Any]:
+    e = row.estimate
+    numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
+    return [row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note]
 
 
 def text(rows: Sequence[Row]) -> str:
@@ -163,6 +163,9 @@ def latex(rows: Sequence[Row]) -> str:
 
 
 FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
+SENTENCES: dict[str, Callable[[str], str]] = {
+    **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
+}
 
 
 class Line(NamedTuple):
@@ -198,15 +201,16 @@ def _line(row: Row, notes: list[str]) -> Line:
 
 
 def _text(page: Page) -> str:
-    measures, values, counts = (max(len(line[i]) for line in page.lines) for i in (1, 2, 3))
-    shown, agent = [page.curriculum], None
-    for line in page.lines:
+    lines = [Line(*map(terminal_text, line)) for line in page.lines]
+    measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
+    shown, agent = [terminal_text(page.curriculum)], None
+    for line in lines:
         if line.agent != agent:
             agent = line.agent
             shown.append(f"  {agent}")
         note = f"({line.mark})" if line.mark else ""
         shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
-    notes = (f"({number}) {note}" for number, note in enumerate(page.notes, 1))
+    notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
     shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
     return "\n".join(shown)
 
@@ -217,11 +221,6 @@ def _markdown(page: Page) -> str:
     lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
     notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
     return "\n".join([*head, *lines, *([""] if notes else []), *notes])
-
-
-def markdown_text(plain: str) -> str:
-    """Text of one line without meaning to HTML or to a table in Markdown."""
-    return html.escape(" ".join(plain.split()), quote=False).replace("|", "\\|")
 
 
 def _latex(page: Page) -> str:
@@ -241,12 +240,6 @@ def _latex_line(line: Line) -> str:
 def latex_value(value: str) -> str:
     """A number and its interval with signs, or a dash for none."""
     return "--" if value == "-" else value.replace("-", "$-$")
-
-
-def latex_text(plain: str) -> str:
-    """Text without meaning to LaTeX; a bracket after a line's end would be an argument."""
-    commands = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "[": "{[}"}
-    return "".join(rf"\{each}" if each in "&%$#_{}" else commands.get(each, each) for each in plain)
 
 
 def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
@@ -353,14 +346,13 @@ def main() -> None:
             write_csv(arguments.csv, rows)
         if arguments.compare is not None:
             for pair, found in comparisons(runs, arguments.compare).items():
-                comment = "% " if arguments.format == "latex" else ""
-                print(f"\n{comment}{_sentence(*pair, found, arguments.difference)}")
+                print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
     except BrokenPipeError:
         raise
     except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
     for problem in problems:
-        print(f"left out: {problem.reason}", file=sys.stderr)
+        print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
     if problems:
         sys.exit(1)
 

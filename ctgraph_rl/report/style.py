@@ -8,6 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.log.escape import figure_text, terminal_text
+
 STYLE = Path(__file__).with_name("style.mplstyle")
 
 PACKAGES = ("matplotlib", "jinja2", "scipy")
@@ -61,9 +63,9 @@ def agent_style(position: int) -> dict[str, Any]:
 
 
 def short(name: str) -> str:
-    """A name that fits into a figure: its middle is left out."""
-    half = LONGEST_NAME // 2
-    return name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
+    """A name that fits into a figure: its middle is left out; for matplotlib, which shows it as it is."""
+    name, half = terminal_text(name), LONGEST_NAME // 2
+    return figure_text(name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}")
 
 
 def frames_axis(axes: Any) -> None:

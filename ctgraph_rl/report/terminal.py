@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.runs.read import Curve, History, read_run
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
@@ -44,6 +45,10 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
         console.print(table)
 
 
+def _text(plain: str) -> Text:
+    return Text(terminal_text(plain))
+
+
 def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS) -> dict[str, str]:
     """A line of text for each task: its mean return at all evaluations, in time order, on one scale for all tasks.
 
@@ -69,9 +74,9 @@ def _shared(curve: Curve) -> list[list[float]]:
 
 def _matrix(name: str, history: History) -> Table:
     """Return the performance matrix: mean return on each task after each block."""
-    table = Table(title=Text(f"{name}: mean return on each task after each block"))
+    table = Table(title=_text(f"{name}: mean return on each task after each block"))
     for heading in ("block", "frames", *history.labels):
-        table.add_column(Text(heading), justify="right")
+        table.add_column(_text(heading), justify="right")
     for block, (frames, values) in enumerate(_blocks(history)):
         table.add_row(str(block), f"{frames:,}", *map(_shown, values))
     return table
@@ -82,7 +87,7 @@ def _curves(curves: Mapping[str, str]) -> Table:
     for name in ("task", "mean return at every evaluation"):
         table.add_column(name)
     for label, curve in curves.items():
-        table.add_row(Text(label), Text(curve))
+        table.add_row(_text(label), _text(curve))
     return table
 
 
@@ -92,7 +97,7 @@ def _task_table(name: str, history: History, curves: Mapping[str, str]) -> Table
     The block of a best that is not above 0 is left out: that is of no block.
     """
     where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
-    table = Table(title=Text(f"{name}: mean return on each task; {where}"))
+    table = Table(title=_text(f"{name}: mean return on each task; {where}"))
     for heading in ("task", "before", "best", "best after block", "at the end", "curve"):
         table.add_column(heading, justify="left" if heading in ("task", "curve") else "right")
     by_task = zip(*(values for _, values in _blocks(history)), strict=True)
@@ -101,7 +106,7 @@ def _task_table(name: str, history: History, curves: Mapping[str, str]) -> Table
         best, block = max(known, default=(math.nan, 0))
         after = str(-block) if best > 0 else "-"
         cells = (_shown(values[0]), _shown(best), after, _shown(values[-1]))
-        table.add_row(Text(label), *cells, Text(curves.get(label, "")))
+        table.add_row(_text(label), *cells, _text(curves.get(label, "")))
     return table
 
 
@@ -122,5 +127,5 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
     for name in (*ALWAYS, *(name for name in WITH_EXPERTS if metrics.get(name, {}).get("value") is not None)):
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
-        table.add_row(name.replace("_", " "), value, Text(metric["undefined"] or metric["formula"]))
+        table.add_row(name.replace("_", " "), value, _text(metric["undefined"] or metric["formula"]))
     return table

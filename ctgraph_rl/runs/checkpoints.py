@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from ctgraph_rl.checks import is_int
-from ctgraph_rl.disk import PART, write_whole
+from ctgraph_rl.disk import PART, made_folder, require_no_link, write_whole
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
@@ -83,7 +83,7 @@ class Checkpoints:
         path, content = self.folder / f"{state['frames']:012d}.pt", encoded(state)
         if self._last is None:
             _require_plain(content)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        made_folder(self.folder)
         try:
             write_whole(path, content)
         except OSError as error:
@@ -97,7 +97,12 @@ class Checkpoints:
             other.unlink(missing_ok=True)
 
     def files(self) -> list[Path]:
-        """Return the checkpoints, newest first."""
+        """Return the checkpoints, newest first.
+
+        Raises:
+            ValueError: if a link is in place of their folder.
+        """
+        require_no_link(self.folder)
         return sorted((file for file in self.folder.glob("*.pt") if file.stem.isdecimal()), key=_frames, reverse=True)
 
     def newest(self) -> State | None:
@@ -122,6 +127,7 @@ class Checkpoints:
 
     def tidy(self) -> None:
         """Remove what was being written when a process was killed."""
+        require_no_link(self.folder)
         for part in self.folder.glob("*" + PART):
             part.unlink(missing_ok=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import is_int, positive, require
+from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.settings import digest, parameters_of
 
@@ -127,11 +129,18 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:
     """Write the files that Hydra writes, but only after all checks."""
-    folder.mkdir(exist_ok=True)
-    OmegaConf.save(cfg, folder / "config.yaml")
+    made_folder(folder)
+    save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():
-        OmegaConf.save(HydraConfig.instance().cfg, folder / "hydra.yaml")
-        OmegaConf.save(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+        save_yaml(HydraConfig.instance().cfg, folder / "hydra.yaml")
+        save_yaml(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+
+
+def save_yaml(settings: Any, path: Path) -> None:
+    """Write settings as Hydra does."""
+    buffer = io.StringIO()
+    OmegaConf.save(settings, buffer)
+    write_whole(path, buffer.getvalue())
 
 
 def explain(error: BaseException) -> str:

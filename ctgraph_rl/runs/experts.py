@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.files import LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
@@ -104,7 +105,7 @@ def find_or_train(
 
 def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callable[[], object]) -> None:
     """Train into the directory, or resume what was begun there; wait while another process trains into it."""
-    run_dir.mkdir(parents=True, exist_ok=True)
+    made_folder(run_dir)
     with locked(run_dir, waiting):
         if not _is_trained(run_dir):
             learn(curriculum, run_dir)

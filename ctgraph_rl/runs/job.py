@@ -17,6 +17,7 @@ from rich.console import Console
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
+from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import versions
 from ctgraph_rl.log.run_log import RunLog
@@ -197,7 +198,7 @@ def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
     except Exception as error:
         if failed_before or (run_dir / LOG).exists() or config.in_sweep():
             with suppress(OSError):
-                mark.write_text(f"{type(error).__name__}: {config.explain(error)}\n", encoding="utf-8")
+                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n")
         raise
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS
 
 DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
@@ -109,7 +110,7 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
     twice = f" ({repeated} more are the same as others)" if repeated else ""
     lines = [f"sweep of {len(statuses)} cells{twice}: {numbers}"]
     left = [(name, found) for name, found in statuses.items() if found.state != DONE]
-    lines += [f"  {state:<7}  {name}  {' '.join(reason.split())}" for name, (state, reason) in left[:most]]
+    lines += [f"  {state:<7}  {name}  {terminal_text(reason)}" for name, (state, reason) in left[:most]]
     if most is not None and len(left) > most:
         lines.append(f"  and {len(left) - most} more")
     if left:

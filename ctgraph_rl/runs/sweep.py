@@ -19,6 +19,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.runs.config import save_yaml
 from ctgraph_rl.runs.status import DONE, NOTHING, SHOWN, Outcome, SweepProgress, report, status_of
 
 if TYPE_CHECKING:
@@ -126,14 +128,14 @@ class Sweeper(Base):
         assert self.config is not None and self.launcher is not None
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(self.config, folder / "multirun.yaml")
+        save_yaml(self.config, folder / "multirun.yaml")
         folders, size = list(cells), self.max_batch_size or len(cells)
         for first in range(0, len(folders), size):
             batch = folders[first : first + size]
             try:
                 jobs = self.launcher.launch([cells[cell] for cell in batch], initial_job_idx=first)
             except Exception as error:  # such as a worker that was killed: the cells' directories say how far they are
-                print(f"the launcher stopped: {type(error).__name__}: {error}", file=sys.stderr)
+                print(f"the launcher stopped: {type(error).__name__}: {terminal_text(error)}", file=sys.stderr)
                 return
             failed = [(cell, job) for cell, job in zip(batch, jobs, strict=True) if job.status == JobStatus.FAILED]
             errors.update({cell: why(job) for cell, job in failed})

@@ -21,6 +21,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.trackio import TrackioLogger
 
 from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.disk import require_no_link
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.run_log import RunLog
 
@@ -61,6 +62,7 @@ class Tracker:
         self, make_logger: Callable[[Path], Logger], run_dir: Path, hyperparameters: Mapping[str, Any]
     ) -> None:
         folder = run_dir.resolve() / FOLDER
+        require_no_link(folder)
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         self.name = getattr(make_logger, "func", make_logger).__name__

@@ -17,6 +17,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import append_line, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import machine, provenance
 from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
@@ -134,7 +135,7 @@ def write_curriculum(curriculum: Curriculum, run_dir: Path) -> None:
     try:
         curriculum.to_json(run_dir / CURRICULUM)
     except ValueError as error:
-        print(f"note: {CURRICULUM} is not written, so loading this run needs the curriculum: {error}")
+        print(f"note: {CURRICULUM} is not written, so loading this run needs the curriculum: {terminal_text(error)}")
 
 
 def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:

@@ -17,13 +17,14 @@ from dataclasses import fields
 from difflib import get_close_matches
 from functools import partial
 from os import PathLike
-from pathlib import Path
+from os.path import lexists
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
+from ctgraph_rl.disk import write_whole
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
@@ -52,7 +53,7 @@ _DERIVED = "about"
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:
     """Return a curriculum as JSON; see `Curriculum.to_json`."""
-    require((path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"))
+    require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
     places = {task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))}
     content = {
         "schema": SCHEMA,
@@ -66,7 +67,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         _check_form(content)
     content[_DERIVED] = _about(curriculum)
     if path is not None:
-        Path(path).write_text(_text(content) + "\n", encoding="utf-8")
+        write_whole(path, _text(content) + "\n")
     return content
 
 

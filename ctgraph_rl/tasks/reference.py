@@ -10,12 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from os import PathLike
+from os.path import lexists
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
+from ctgraph_rl.disk import write_whole
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
@@ -203,7 +205,7 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
 def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> dict[str, Any]:
     """A task as a configuration file of the 2023 dialect; see `Task.to_json`."""
     require(
-        (path is None or not Path(path).exists(), f"{path} exists: choose another path, nothing is overwritten"),
+        (path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"),
         (is_int(general_seed, 0, MAX_SEED), f"general_seed must be in [0, 2**32), got {general_seed!r}"),
         *((holds, f"the file cannot express {what}") for holds, what in _expressible(task)),
     )
@@ -212,7 +214,7 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
     for name, (section, key) in _places("2023").items():
         content[section][key] = values[name]
     if path is not None:
-        Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(content, indent=2) + "\n")
     return content
 
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
-from ctgraph_rl.visualize.style import DPI, Point, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
+from ctgraph_rl.visualize.style import Point, draw_lines, goal_mark, mark, new_figure, save_figure, shape_of, stub_lines
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
@@ -39,14 +40,15 @@ def draw_graphs(curriculum: Curriculum, path: Path | str) -> None:
     rows = math.ceil(len(panels) / columns)
     figure = new_figure(max(4.4 * columns, 6), 3.4 * rows + 0.9)
     left_out = f" ({len(goals) - len(panels)} more graphs not drawn)" if len(goals) > len(panels) else ""
-    figure.suptitle(f"{curriculum.name}, version {curriculum.version}, {curriculum.fingerprint}{left_out}", fontsize=11)
+    name = figure_text(curriculum.name)
+    figure.suptitle(f"{name}, version {curriculum.version}, {curriculum.fingerprint}{left_out}", fontsize=11)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel, graph in zip(axes, panels, strict=False):
         _draw_panel(panel, graph, goals[graph])
     for panel in axes[len(panels) :]:
         panel.axis("off")
     figure.supxlabel("diamond: decision state    square: end state    star: goal, with its decisions", fontsize=9)
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path)
 
 
 def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:

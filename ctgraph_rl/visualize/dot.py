@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.visualize import states as drawn
 from ctgraph_rl.visualize.layout import lay_out
@@ -64,5 +65,5 @@ def _attributes(what: str, **values: str) -> str:
 
 def _quoted(text: str) -> str:
     """Text that DOT shows as it is."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + escaped.replace("\r", "").replace("\n", "\\n") + '"'
+    escaped = terminal_lines(text).replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + escaped.replace("\n", "\\n") + '"'

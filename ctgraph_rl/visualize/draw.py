@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.disk import write_named
+from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.dot import to_dot
 from ctgraph_rl.visualize.gif import save_gif
 from ctgraph_rl.visualize.image_figure import image_figure
-from ctgraph_rl.visualize.style import DPI
+from ctgraph_rl.visualize.style import DPI, save_figure
 from ctgraph_rl.visualize.task_figure import task_figure
 
 
@@ -25,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         _write(select(arguments), arguments)
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -46,9 +48,9 @@ def _write(selection: Selection, arguments: argparse.Namespace) -> None:
     film = arguments.gif is None or selection.policy is not None, "a film needs a policy: name a --policy or a --run"
     require(film, *at_least_one(dpi=arguments.dpi, episodes=arguments.episodes))
     if arguments.figure is not None:
-        _figure(selection, arguments).savefig(arguments.figure, dpi=arguments.dpi)
+        save_figure(_figure(selection, arguments), arguments.figure, arguments.dpi)
     if arguments.dot is not None:
-        arguments.dot.write_text(to_dot(selection.task, selection.name), encoding="utf-8")
+        write_named(arguments.dot, to_dot(selection.task, selection.name))
     if arguments.gif is not None:
         save_gif(selection.player(arguments.seed, not arguments.sampled), arguments.gif)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.disk import write_named
 from ctgraph_rl.visualize.player import Player
 
 LAST = 3
@@ -35,7 +37,9 @@ def save_gif(player: Player, path: Path | str, seconds: float = 0.6, size: int =
         raise ModuleNotFoundError("GIFs need pillow: pip install 'ctgraph_rl[plot]'") from error
     first, *others = [Image.fromarray(frame.numpy()) for frame in _frames(player, size, most_frames)]
     stay = [round(1000 * seconds)] * len(others) + [round(1000 * seconds * LAST)]
-    first.save(path, "GIF", save_all=True, append_images=others, duration=stay, loop=0)
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=stay, loop=0)
+    write_named(path, buffer.getvalue())
 
 
 def _frames(player: Player, size: int, most: int) -> list[Tensor]:

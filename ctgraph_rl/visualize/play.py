@@ -24,6 +24,7 @@ from rich.tree import Tree
 from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.layout import lay_out
@@ -258,7 +259,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         selection = select(arguments)
         game = Game(selection.player(arguments.seed, not arguments.sampled), Console(highlight=False))
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(str(error))
+        parser.error(terminal_lines(error))
     try:
         _run(game, selection, arguments)
     except KeyboardInterrupt:

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.similarity import MEASURES
-from ctgraph_rl.visualize.style import DPI, new_figure
+from ctgraph_rl.visualize.style import new_figure, save_figure
 
 MOST_NUMBERS, MOST_LABELS = 8, 40
 """Tasks up to which a heat map shows numbers and labels."""
@@ -30,13 +31,13 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
         ValueError: for tasks too large for a measure.
     """
     figure = new_figure(12, 7.6)
-    figure.suptitle(f"{curriculum.name}: similarity of {len(curriculum.tasks)} tasks")
+    figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(curriculum.tasks)} tasks")
     *panels, last = figure.subplots(2, 3).flat
     for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
         image = _draw_matrix(axes, measure(curriculum.tasks), curriculum.labels, title)
     last.axis("off")
     figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path)
 
 
 def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -> Any:

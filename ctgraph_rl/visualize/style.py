@@ -5,11 +5,14 @@ A grey print and any colour vision keep the kinds apart.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.batch.render import GOAL, PALETTE
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.disk import write_named
 from ctgraph_rl.visualize.layout import Layout
 
 DPI = 160
@@ -31,6 +34,24 @@ def new_figure(width: float, height: float) -> Any:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def picture(figure: Any, form: str, dpi: float | None = None) -> bytes:
+    """Return a figure in a format, such as ``png``."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=form, dpi="figure" if dpi is None else dpi)
+    return buffer.getvalue()
+
+
+def save_figure(figure: Any, path: Path | str, dpi: float = DPI) -> None:
+    """Write a figure into the file that the user has named; its ending decides the format, ``.png`` where it has none.
+
+    Raises:
+        ValueError: for an unknown ending.
+    """
+    path = Path(path)
+    path = path if path.suffix else path.with_name(f"{path.name}.png")
+    write_named(path, picture(figure, path.suffix[1:].lower(), dpi))
 
 
 def colour(number: int) -> str:

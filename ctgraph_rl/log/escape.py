@@ -1,0 +1,95 @@
+"""Names, labels, sources, settings and reasons as text, whatever they hold: one function for each kind of output.
+
+They may be a stranger's. `terminal_text` also stands for HTML, where the template escapes what it gives, and for JSON,
+whose own quoting is enough. What cannot be printed, such as escape sequences, marks of writing direction and halves of
+surrogate pairs, is shown as in Python, ``\\x1b``.
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import re
+from collections.abc import Iterable
+from typing import Any
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
+"""Beginnings of a CSV cell that programs for tables may take for a formula, and the mark itself."""
+
+MARK = "'"
+"""Stands before a text of a CSV file that begins with one of `FORMULA`; a reader takes one off."""
+
+_INACTIVE = re.compile(r"-?[\d,]+(\.\d+)?( \[-?[\d.]+, -?[\d.]+\])?( n = [\d/]+)?")
+_MARKDOWN = re.compile(
+    r"[\\`*|~$@\[\]]|(?<![^\W_])_|_(?![^\W_])"  # anywhere; underscores between letters mean nothing
+    r"|:(?=//)|(?<=www)\."  # addresses
+    r"|^#(?=[# ]|$)|^[-+=](?=[-= ]|$)",  # at the start of a line
+    re.IGNORECASE,
+)
+_NUMBERED = re.compile(r"^(\d{1,9})([.)])(?= |$)")
+_LATEX = {
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
+    **{"[": "{[}", "*": "{*}"},  # which would belong to the end of the line before
+}
+
+
+def terminal_text(text: object) -> str:
+    """Return one line without a character that a terminal obeys."""
+    return _printable(" ".join(str(text).split()))
+
+
+def terminal_lines(text: object) -> str:
+    """Return lines without a character that a terminal obeys."""
+    return "\n".join(map(_printable, str(text).split("\n")))
+
+
+def _printable(text: str) -> str:
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def markdown_text(text: object) -> str:
+    """Return one line that Markdown shows as it is: no link, no image, no HTML, no formula and no end of a cell."""
+    line = terminal_text(text)
+    if _INACTIVE.fullmatch(line):
+        return line
+    line = _MARKDOWN.sub(lambda found: "\\" + found[0], html.escape(line, quote=False))
+    return _NUMBERED.sub(r"\1\\\2", line)
+
+
+def latex_text(text: object) -> str:
+    """Return one line that LaTeX shows as it is, after the end of a table's row too."""
+    return "".join(_LATEX.get(character, character) for character in terminal_text(text))
+
+
+def figure_text(text: object) -> str:
+    """Return one line that matplotlib shows as it is, without formulas."""
+    return terminal_text(text).replace("$", r"\$")
+
+
+def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
+    """Return rows as CSV; a text that begins with one of `FORMULA` has `MARK` before it.
+
+    Args:
+        rows: cells; None is an empty one.
+        end: of a line.
+    """
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator=end).writerows([_cell(value) for value in row] for row in rows)
+    return file.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    return MARK + value if isinstance(value, str) and value.startswith(FORMULA) else value
+
+
+def from_csv(cell: str) -> str:
+    """Return the text that a cell of `csv_text` stands for."""
+    return cell.removeprefix(MARK)
+
+
+def utf8_text(text: object) -> object:
+    """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; any other value as it is."""
+    return text.encode("utf-8", "backslashreplace").decode() if isinstance(text, str) else text
