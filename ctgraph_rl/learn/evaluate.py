@@ -157,12 +157,12 @@ class Evaluator:
     def tasks_at(self, frames: int) -> dict[Task, tuple[int, str]]:
         """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""
         curriculum = self.curriculum
-        held_out = curriculum.evaluation.held_out
-        named = dict(zip((*curriculum.tasks, *held_out), enumerate(curriculum.evaluated_labels, 1), strict=True))
+        evaluated = *curriculum.tasks, *curriculum.evaluation.held_out
+        named = dict(zip(evaluated, enumerate(curriculum.evaluated_labels, 1), strict=True))
         if curriculum.evaluation.tasks == "all":
             return named
-        seen = {task for block in curriculum.blocks[: curriculum.block_at(frames)] for task in block.tasks}
-        return {task: name for task, name in named.items() if task in seen or task in held_out}
+        seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
+        return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
 
     def _policy(self, agent: Agent, tasks: Iterable[Task]) -> Policy:
         """Return the agent's policy; where task ids are given, the one for each task."""

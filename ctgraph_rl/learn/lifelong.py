@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, Protocol
@@ -86,7 +87,7 @@ def learn_curriculum(
                 progress.update(curriculum.block_at(frames), frames, episode_return)
             if checkpoint is not None:
                 state = partial(_state, frames, agent, env, carried=carried, log=log)
-                checkpoint(state, frames in curriculum.ends)
+                checkpoint(state, curriculum.is_end(frames))
         agent.end_task()
         evaluator.evaluate_if_due(agent, frames)
     return log
@@ -173,10 +174,11 @@ def _log_training(
     return episodes["return_mean"]
 
 
-def _of_one_block(batch: TensorDictBase, start: int, ends: Iterable[int]) -> Iterator[TensorDictBase]:
+def _of_one_block(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
     """Cut a batch that begins after ``start`` frames where blocks end within it."""
     rows, steps = batch.shape
-    cuts = [0, *((end - start) // rows for end in ends if start < end < start + batch.numel()), steps]
+    first, last = bisect_right(ends, start), bisect_left(ends, start + batch.numel())
+    cuts = [0, *((end - start) // rows for end in ends[first:last]), steps]
     return (batch[:, first:last] for first, last in pairwise(cuts))
 
 
@@ -221,10 +223,12 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     evaluation = curriculum.evaluation
     evaluation.check((*curriculum.tasks, *evaluation.held_out))
     rules: dict[Any, tuple[bool, str]] = {"every": evaluation.every_rule(num_envs)}
-    for block in curriculum.blocks:
+    alike: dict[int, list[str]] = {}
+    for number, block in enumerate(curriculum.blocks, 1):
         block.rows(num_envs)
-        alike = [str(i) for i, other in enumerate(curriculum.blocks, 1) if other.num_frames == block.num_frames]
-        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike)}")
+        alike.setdefault(block.num_frames, []).append(str(number))
+    for block in {block.num_frames: block for block in curriculum.blocks}.values():
+        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike[block.num_frames])}")
     require(*rules.values())
 
 

@@ -37,7 +37,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import cannot_write, open_own, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.metrics import Curves, Regime
+from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable
 
 MOST_CELLS = 10**7
 """Largest table that is made of a log."""
@@ -177,6 +177,13 @@ class RunLog:
         intervals = [m for m in self.of_kind("training") if block in (None, m["block"])]
         return _row([m.get(name) for m in intervals])
 
+    def training_by_block(self, name: str) -> dict[int, Tensor]:
+        """`training` of each block that has intervals, by its number."""
+        values: dict[int, list[float | None]] = {}
+        for m in self.of_kind("training"):
+            values.setdefault(m["block"], []).append(m.get(name))
+        return {block: _row(of_block) for block, of_block in values.items()}
+
     def last(self, name: str, num_tasks: int = 0) -> Tensor:
         """A field of the last evaluation of each task at a boundary, float64 [tasks]; NaN where there is none.
 
@@ -205,6 +212,12 @@ class RunLog:
         return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
 
     def regimes(self, trained: Sequence[Sequence[int]] | None = None) -> list[Regime]:
+        """Return `regime_table` as a list of regimes."""
+        return list(self.regime_table(trained))
+
+    def regime_table(
+        self, trained: Sequence[Sequence[int]] | None = None, labels: Sequence[str] | None = None
+    ) -> RegimeTable:
         """The run as the lifelong metrics see it: a regime per training block and per evaluation at its boundaries.
 
         An experience is a training interval with finished episodes. Evaluations during blocks and of held-out tasks
@@ -212,6 +225,7 @@ class RunLog:
 
         Args:
             trained: for each block, its tasks counted from 0; default: as the log says.
+            labels: the name of each task; default: as its evaluations say, ``task 1`` and so on where they do not.
 
         Raises:
             ValueError: for a block that trains several tasks, whose effects cannot be told apart, one without a
@@ -221,16 +235,27 @@ class RunLog:
         mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
         several = f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several"
         require((not mixed, several))
-        labels = {m["task"] - 1: m["label"] for m in self._evaluations(during=True)}
-        require((all(block[0] in labels for block in tasks), "lifelong metrics need an evaluation of every task"))
-        regimes = []
+        said = {m["task"]: str(m.get("label", f"task {m['task']}")) for m in self._evaluations(during=True)}
+        require((all(block[0] + 1 in said for block in tasks), "lifelong metrics need an evaluation of every task"))
+        label = said if labels is None else dict(enumerate(labels, 1))
+        names: dict[str, int] = {}
+        regimes = list(self._stays([block[0] + 1 for block in tasks]))
+        rows = [(names.setdefault(label[task], len(names)), training, len(own)) for task, training, own in regimes]
+        values = [value for _, _, own in regimes for value in own]
+        return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
+
+    def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
+        """Yield the number of the task, whether it is trained and the returns of each regime of a run."""
+        at_end: dict[int, list[dict[str, Any]]] = {}
+        for m in self._evaluations(during=False):
+            at_end.setdefault(m["block"], []).append(m)
+        returns = self.training_by_block("return_mean")
         for block in range(len(tasks) + 1):
             if block:
-                returns = self.training("return_mean", block)
-                regimes.append(Regime(labels[tasks[block - 1][0]], True, returns[~returns.isnan()]))
-            at_end = [m for m in self._evaluations(during=False) if m["block"] == block]
-            regimes += [Regime(m["label"], False, _row([m["return_mean"]])) for m in at_end]
-        return regimes
+                own = returns.get(block, _row([]))
+                yield tasks[block - 1], True, own[~own.isnan()].tolist()
+            for m in at_end.get(block, ()):
+                yield m["task"], False, [m["return_mean"]]
 
     def _trained(self, trained: Sequence[Sequence[int]] | None) -> tuple[tuple[int, ...], ...]:
         if trained is None:
@@ -240,18 +265,18 @@ class RunLog:
 
     def _said(self) -> list[list[int]]:
         """The tasks of each block, counted from 0, if the first line says them."""
-        said = [run["trained"] for run in self.of_kind("run") if "trained" in run]
-        return [[number - 1 for number in block] for block in said[0]] if said else []
+        said = (m["trained"] for m in self.measurements if m["kind"] == "run" and "trained" in m)
+        return [[number - 1 for number in block] for block in next(said, ())]
 
-    def _evaluations(self, during: bool) -> Iterator[dict[str, Any]]:
+    def _evaluations(self, during: bool) -> list[dict[str, Any]]:
         """Evaluations of the curriculum's own tasks."""
-        own = (m for m in self.of_kind("evaluation") if not m.get("held_out"))
-        return (m for m in own if during or m.get("moment") != "during")
+        own = [m for m in self.of_kind("evaluation") if not m.get("held_out")]
+        return own if during else [m for m in own if m.get("moment") != "during"]
 
     def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
         """Rows of values by task number, NaN where a row has none."""
         trained = [number + 1 for block in self._said() for number in block]
-        evaluated = [m["task"] for m in self._evaluations(during=True)]
+        evaluated = {m["task"] for m in self._evaluations(during=True)}
         tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
         rows = list(rows)
         size = len(rows) * len(tasks)

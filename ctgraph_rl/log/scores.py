@@ -113,7 +113,8 @@ def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
 
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor) -> Tensor:
     """Return the optimum of the block that each interval ends in; NaN where tasks of a block differ in it."""
-    values = [{best[task].item() for task in block} for block in curriculum.trained]
+    of_task = best.tolist()
+    values = [{of_task[task] for task in block} for block in curriculum.trained]
     alone = torch.tensor([each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64)
     return alone[log.training("block").long() - 1]
 
@@ -121,26 +122,29 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor) -> Tensor:
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
     """Return the intervals of each task in the block that trains it first, which must train it alone."""
     blocks, tasks = curriculum.trained, range(len(curriculum.tasks))
-    first = [min(i for i, block in enumerate(blocks) if task in block) for task in tasks]
+    firsts = {task: i for i, block in reversed([*enumerate(blocks)]) for task in block}
+    first = [firsts[task] for task in tasks]
     reason = None
-    if any(len(curriculum.trained[block]) > 1 for block in first):
+    if any(len(blocks[block]) > 1 for block in first):
         reason = "needs first blocks that train one task each"
     elif curriculum.protocol.boundaries == "hidden":
         reason = "needs announced boundaries: an episode of one task may end in the block of the next"
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))
-    starts = (0, *curriculum.ends)
+    starts, nothing = (0, *curriculum.ends), torch.empty(0, dtype=torch.float64)
+    names = ("frames", "episodes", "success_rate")
+    frames, episodes, success_rates = (log.training_by_block(name) for name in names)
     return {
-        "first_frames": [log.training("frames", block + 1) - starts[block] for block in first],
-        "first_episodes": [log.training("episodes", block + 1) for block in first],
-        "first_success_rates": [log.training("success_rate", block + 1) for block in first],
+        "first_frames": [frames.get(block + 1, nothing) - starts[block] for block in first],
+        "first_episodes": [episodes.get(block + 1, nothing) for block in first],
+        "first_success_rates": [success_rates.get(block + 1, nothing) for block in first],
     }
 
 
 def _regimes(log: RunLog, curriculum: Curriculum, best: Tensor, experts: Sequence[RunLog] | None) -> dict[str, Any]:
     """Return the run and its experts as the lifelong metrics see them."""
     try:
-        regimes = log.regimes(curriculum.trained)
+        regimes = log.regime_table(curriculum.trained, curriculum.labels)
         require((not best.isnan().any(), "a task's optimal value is not known: its graph is too large"))
     except ValueError as error:
         return dict.fromkeys(("regimes", "experts"), Undefined(str(error)))

@@ -15,10 +15,11 @@ from typing import Any
 from torch import Tensor
 
 from ctgraph_rl.metrics.curves import Curves
-from ctgraph_rl.metrics.lifetime import Regime, prepare
+from ctgraph_rl.metrics.lifetime import prepare
 from ctgraph_rl.metrics.matrix import Trained, average_performance, backward_transfer, forgetting, forward_transfer
 from ctgraph_rl.metrics.optimum import STAGES
 from ctgraph_rl.metrics.record import MASTERED, METRICS, Definition, Entry, Metric, Undefined, undefined
+from ctgraph_rl.metrics.regimes import Column, Regime, RegimeTable
 from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, trapezoid_area
 
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
@@ -101,6 +102,6 @@ def __dir__() -> list[str]:
 
 
 __all__ = ["AGAINST_EXPERTS", "MASTERED", "METRICS", "STAGES", "SUMMARY"]
-__all__ += ["Curves", "Definition", "Metric", "Regime", "Trained", "Undefined"]
+__all__ += ["Column", "Curves", "Definition", "Metric", "Regime", "RegimeTable", "Trained", "Undefined"]
 __all__ += ["definitions", "of_curves", "of_inputs", "of_matrix", "of_regimes", "prepare", "summary", "undefined"]
 __all__ += ["check_experts", "mean_area", "stage_areas", "trapezoid_area"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import torch
@@ -52,7 +54,7 @@ class Curves:
 
     def of_block(self, block: int) -> list[int]:
         """Positions of the evaluations in and after a block."""
-        return [i for i, other in enumerate(self.blocks) if other == block]
+        return list(range(bisect_left(self.blocks, block), bisect_right(self.blocks, block)))
 
     @property
     def ends(self) -> Tensor:
@@ -70,12 +72,21 @@ class Curves:
 
     def own_block(self, task: int) -> int:
         """The one block that trains a task, counted from 1."""
-        own = [block for block, tasks in enumerate(self.trained, 1) if task in tasks]
+        own = self._own_blocks.get(task, [])
         if len(own) != 1:
             raise Undefined(f"the definition needs each task trained once, task {task + 1} is in {len(own)} blocks")
         if len(set(self.trained[own[0] - 1])) > 1:
             raise Undefined(f"the definition needs tasks trained alone, block {own[0]} trains several")
         return own[0]
+
+    @cached_property
+    def _own_blocks(self) -> dict[int, list[int]]:
+        """For each task, the blocks that train it, counted from 1."""
+        found: dict[int, list[int]] = {}
+        for block, tasks in enumerate(self.trained, 1):
+            for task in dict.fromkeys(tasks):
+                found.setdefault(task, []).append(block)
+        return found
 
     def own_stage(self, task: int) -> Tensor:
         """The curve of a task while it was trained: evaluations in and after its block, at equal distances."""

@@ -19,17 +19,18 @@ Means leave out tasks and pairs without a value as l2metrics does; here they are
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import combinations, pairwise, permutations
-from statistics import median
+from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
 from ctgraph_rl.metrics.record import defined
+from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 
 NEW = "New et al. 2022, Lifelong learning metrics (arXiv 2201.08278), as in l2metrics 3.1.0"
 SCALE, OFFSET = 100.0, 1.0
@@ -41,37 +42,10 @@ ROUNDING = 1e-12
 """Relative difference below which two values are equal."""
 
 
-@dataclass(frozen=True)
-class Regime:
-    """A stay on one task.
-
-    Args:
-        task: name of the task.
-        training: True for training, False for an evaluation.
-        values: performance of each experience in order, float64 [experiences].
-
-    Raises:
-        ValueError: for no values, or one that is not finite.
-    """
-
-    task: str
-    training: bool
-    values: Tensor
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 1 or len(self.values) == 0 or not self.values.isfinite().all():
-            raise ValueError(f"a regime of {self.task} needs finite values [experiences], got {self.values}")
-
-    @property
-    def terminal(self) -> float:
-        """Terminal performance: mean of the last tenth of a training, of all of an evaluation."""
-        start = int((1 - 0.1) * len(self.values)) if self.training else 0
-        return self.values[start:].mean().item()
-
-
 Regimes = Sequence[Regime]
 Experts = Mapping[str, Sequence[Tensor]]
 Ranges = Mapping[str, tuple[float, float]]
+Measure = Callable[[Any, Any], Any]
 
 
 def smooth(values: Tensor) -> Tensor:
@@ -94,13 +68,15 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
         ranges: lowest and highest performance of each task; by default those of the smoothed run and its experts. A
             task with an empty range is 1 throughout.
     """
-    smoothed = [replace(each, values=smooth(each.values)) if each.training else each for each in regimes]
+    table = RegimeTable.of(regimes)
+    smoothed = table.replaced(_smoothed(table))
     expert_curves = {task: [smooth(curve) for curve in curves] for task, curves in (experts or {}).items()}
-    found = {each.task: _range([*_of_task(smoothed, each.task), *expert_curves.get(each.task, [])]) for each in regimes}
-    scales = found if ranges is None else ranges
-    scaled = [replace(each, values=_scaled(each.values, *scales[each.task])) for each in smoothed]
+    scales = _ranges(smoothed, expert_curves) if ranges is None else ranges
+    low, high = (torch.tensor([scales[task][i] for task in table.names], dtype=torch.float64) for i in (0, 1))
+    of_task = torch.from_numpy(table.task.repeat(table.length))
+    scaled = smoothed.replaced(_scaled(smoothed.values, low[of_task], high[of_task]))
     known = {task: curves for task, curves in expert_curves.items() if task in scales}
-    return scaled, {task: [_scaled(curve, *scales[task]) for curve in curves] for task, curves in known.items()}
+    return scaled, {task: [_scaled_by(scales[task], curve) for curve in curves] for task, curves in known.items()}
 
 
 ON_THE_SCALE = from_failure_to_best(OFFSET, OFFSET + SCALE)
@@ -115,7 +91,8 @@ of_tasks = partial(defined, source=NEW, partial=True, missing="a task has none")
 )
 def mean_training_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over training regimes of their mean performance."""
-    return _per_task(regimes, lambda task: _mean([r.values.mean().item() for r in _training(regimes, task)]))
+    table = RegimeTable.of(regimes)
+    return _tensor([_mean([table.values_of(i).mean().item() for i in own]) for own in table.places(training=True)])
 
 
 @of_tasks(
@@ -125,8 +102,8 @@ def mean_training_performance(regimes: Regimes) -> Tensor:
 )
 def mean_evaluation_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over evaluations of their mean performance."""
-    tests = [each for each in regimes if not each.training]
-    return _per_task(regimes, lambda task: _mean([r.values.mean().item() for r in tests if r.task == task]))
+    table = RegimeTable.of(regimes)
+    return _tensor([_mean(table.terminal[own].tolist()) for own in table.places(training=False)])
 
 
 @of_tasks(
@@ -141,7 +118,8 @@ def performance_recovery(regimes: Regimes) -> Tensor:
     terminal performance of the task's regime before, and one more than all of them if none is. The slope is
     Theil-Sen's. A task needs three training regimes.
     """
-    return _per_task(regimes, lambda task: -theil_sen(recovery_times(_training(regimes, task))))
+    table = RegimeTable.of(regimes)
+    return _tensor([-theil_sen(recovery_times([table[i] for i in own])) for own in table.places(training=True)])
 
 
 @of_tasks(
@@ -155,7 +133,7 @@ def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
 
     Not negative when nothing is forgotten. A task that is trained last has no later evaluation.
     """
-    return _per_task(regimes, lambda task: _mean(list(_maintenance(regimes, task, to_evaluation=True))))
+    return _maintenance(RegimeTable.of(regimes), to_evaluation=True)
 
 
 @of_tasks(
@@ -166,15 +144,20 @@ def maintenance_of_evaluation(regimes: Regimes) -> Tensor:
 )
 def maintenance_of_training(regimes: Regimes) -> Tensor:
     """PM (mrtlp): as `maintenance_of_evaluation`, against the terminal performance of the most recent training."""
-    return _per_task(regimes, lambda task: _mean(list(_maintenance(regimes, task, to_evaluation=False))))
+    return _maintenance(RegimeTable.of(regimes), to_evaluation=False)
 
 
 def _quotient(before: float, after: float) -> float:
     return after / before if before > 0 and after >= 0 else math.nan
 
 
-def _contrast(before: float, after: float) -> float:
-    return (after - before) / (before + after) if min(before, after) >= 0 < before + after else math.nan
+def _quotients(before: Any, after: Any) -> Any:
+    return np.divide(after, before, out=np.full_like(before, math.nan), where=(before > 0) & (after >= 0))
+
+
+def _contrasts(before: Any, after: Any) -> Any:
+    has_value = (np.minimum(before, after) >= 0) & (before + after > 0)
+    return np.divide(after - before, before + after, out=np.full_like(before, math.nan), where=has_value)
 
 
 of_pairs = partial(
@@ -195,25 +178,25 @@ def forward_transfer_ratio(regimes: Regimes) -> Tensor:
     value: without an evaluation before any training, all of the first task. Nor have those with tp(e1) = 0, however
     large the gain: sparse rewards want `forward_transfer_contrast`.
     """
-    return _transfer(regimes, _quotient, forward=True)
+    return _transfer(regimes, _quotients, forward=True)
 
 
 @of_pairs("new2022/ft-contrast", "as ft-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def forward_transfer_contrast(regimes: Regimes) -> Tensor:
     """FT as a contrast: in [-1, 1], 0 is neutral; no value only where both are 0. Else as `forward_transfer_ratio`."""
-    return _transfer(regimes, _contrast, forward=True)
+    return _transfer(regimes, _contrasts, forward=True)
 
 
 @of_pairs("new2022/bt-ratio", "as ft-ratio, for trainings of a after b's first training", bounds=not_negative)
 def backward_transfer_ratio(regimes: Regimes) -> Tensor:
     """BT: what training a task a, after b's first training, does to b. Else as `forward_transfer_ratio`."""
-    return _transfer(regimes, _quotient, forward=False)
+    return _transfer(regimes, _quotients, forward=False)
 
 
 @of_pairs("new2022/bt-contrast", "as bt-ratio, of (tp(e2) - tp(e1)) / (tp(e1) + tp(e2))", bounds=between(-1, 1))
 def backward_transfer_contrast(regimes: Regimes) -> Tensor:
     """BT as a contrast. Else as `backward_transfer_ratio`."""
-    return _transfer(regimes, _contrast, forward=False)
+    return _transfer(regimes, _contrasts, forward=False)
 
 
 @of_tasks(
@@ -232,12 +215,14 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
         experts: for each task, the training curves of its experts; the mean over them counts.
     """
 
-    def of_task(task: str) -> float:
-        own = torch.cat([each.values for each in _training(regimes, task)])
-        pairs = [(curve[: len(own)], own[: len(curve)]) for curve in experts[task]]
+    table = RegimeTable.of(regimes)
+
+    def of_task(curves: Sequence[Tensor], trainings: list[int]) -> float:
+        own = _joined(table, trainings)
+        pairs = [(curve[: len(own)], own[: len(curve)]) for curve in curves]
         return _mean([_quotient(expert.sum().item(), trained.sum().item()) for expert, trained in pairs])
 
-    return _per_task(regimes, lambda task: of_task(task) if experts.get(task) else math.nan, only_trained=True)
+    return _against(table, experts, of_task)
 
 
 @of_tasks(
@@ -258,13 +243,14 @@ def sample_efficiency(regimes: Regimes, experts: Experts) -> Tensor:
         experts: for each task, the training curves of its experts; the mean over them counts.
     """
 
-    def of_task(task: str) -> float:
-        own = torch.cat([each.values for each in _training(regimes, task)])
-        level, time = _saturation(own)
-        falls = _falls(regimes, task)
-        return _mean([_efficiency(level, time, *_saturation(curve), falls) for curve in experts[task]])
+    table = RegimeTable.of(regimes)
 
-    return _per_task(regimes, lambda task: of_task(task) if experts.get(task) else math.nan, only_trained=True)
+    def of_task(curves: Sequence[Tensor], trainings: list[int]) -> float:
+        level, time = _saturation(_joined(table, trainings))
+        falls = _falls(table, trainings)
+        return _mean([_efficiency(level, time, *_saturation(curve), falls) for curve in curves])
+
+    return _against(table, experts, of_task)
 
 
 def recovery_times(training: Regimes) -> list[int]:
@@ -274,8 +260,9 @@ def recovery_times(training: Regimes) -> list[int]:
 
 def theil_sen(values: Sequence[float]) -> float:
     """Median slope over all pairs of values at the positions 0, 1, ...; NaN for fewer than two."""
-    slopes = [(values[j] - values[i]) / (j - i) for i, j in combinations(range(len(values)), 2)]
-    return median(slopes) if slopes else math.nan
+    given = np.asarray(values, dtype=np.float64)
+    slopes = [(given[lag:] - given[:-lag]) / lag for lag in range(1, len(given))]
+    return float(np.median(np.concatenate(slopes))) if slopes else math.nan
 
 
 def _first_at_least(values: Tensor, level: float) -> int:
@@ -284,44 +271,55 @@ def _first_at_least(values: Tensor, level: float) -> int:
     return int(reached[0]) if len(reached) else len(values) + 1
 
 
-def _maintenance(regimes: Regimes, task: str, to_evaluation: bool) -> Iterator[float]:
-    """Changes against the reference at every evaluation of a task that is no reference itself."""
-    training: Regime | None = None
-    reference: Regime | None = None
-    for each in (each for each in regimes if each.task == task):
-        if each.training:
-            training, reference = each, None
-        elif training is not None and reference is None:
-            reference = each
-        elif training is not None and reference is not None:
-            yield each.terminal - (reference if to_evaluation else training).terminal
+def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
+    """Mean over a task's evaluations that are no reference themselves of the change against the reference."""
+    training, terminal = table.training.tolist(), table.terminal.tolist()
+    last: list[float | None] = [None] * len(table.names)
+    reference: list[float | None] = [None] * len(table.names)
+    changes: list[list[float]] = [[] for _ in table.names]
+    for i, task in enumerate(table.task.tolist()):
+        trained, evaluated = last[task], reference[task]
+        if training[i]:
+            last[task], reference[task] = terminal[i], None
+        elif trained is not None and evaluated is None:
+            reference[task] = terminal[i]
+        elif trained is not None and evaluated is not None:
+            changes[task].append(terminal[i] - (evaluated if to_evaluation else trained))
+    return _tensor(list(map(_mean, changes)))
 
 
-def _transfer(regimes: Regimes, measure: Callable[[float, float], float], forward: bool) -> Tensor:
+def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
     """The first value of every ordered pair (a, b) in which a is trained before, or after, b's first training."""
-    terms = []
-    for a, b in permutations(_tasks(regimes), 2):
-        start = _first_training(regimes, b)
-        trainings = [i for i, r in enumerate(regimes) if r.training and r.task == a and (i < start) == forward]
-        if trainings:
-            terms.append(_first_value(regimes, b, trainings, measure))
-    return _tensor(terms)
+    table = RegimeTable.of(regimes)
+    count, trainings = len(table.names), list(table.places(training=True))
+    first = np.array([own[0] if own else len(table) for own in trainings])
+    last = np.array([own[-1] if own else -1 for own in trainings])
+    has_term = first[:, None] < first if forward else last[:, None] > first
+    np.fill_diagonal(has_term, False)
+    values = np.full((count, count), math.nan)
+    by, of, value = _values_around_training(table, measure)
+    chosen = ((by < first[of]) == forward) & ~np.isnan(value)
+    pairs, places = np.unique(table.task[by[chosen]] * count + of[chosen], return_index=True)
+    values.flat[pairs] = value[chosen][places]
+    return torch.from_numpy(values[has_term])
 
 
-def _first_training(regimes: Regimes, task: str) -> int:
-    """Position of a task's first training, behind all regimes if there is none."""
-    return next((i for i, each in enumerate(regimes) if each.training and each.task == task), len(regimes))
+def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, Any, Any]:
+    """Every two evaluations of a task in a row, with trainings of one task alone between them, in order for each task.
 
-
-def _first_value(regimes: Regimes, task: str, trainings: list[int], measure: Callable[[float, float], float]) -> float:
-    evaluations = [i for i, each in enumerate(regimes) if not each.training and each.task == task]
-    for before, after in pairwise(evaluations):
-        between = [i for i in range(before, after) if regimes[i].training]
-        alone = len({regimes[i].task for i in between}) == 1
-        value = measure(regimes[before].terminal, regimes[after].terminal)
-        if alone and between[-1] in trainings and not math.isnan(value):
-            return value
-    return math.nan
+    Returns:
+        The position of the last training between, the number of the evaluated task and the value, [pairs] each.
+    """
+    evaluated, trained = np.flatnonzero(~table.training), np.flatnonzero(table.training)
+    ordered = evaluated[np.argsort(table.task[evaluated], kind="stable")]
+    before, after = ordered[:-1], ordered[1:]
+    changes = np.flatnonzero(np.diff(table.task[trained], prepend=-1))  # where other trainings begin
+    start, end = (np.searchsorted(trained, places) for places in (before, after))
+    of_end = np.searchsorted(changes, end, "left") - 1
+    alone = (table.task[before] == table.task[after]) & (end > start)
+    alone[alone] &= changes[of_end[alone]] <= start[alone]
+    values = measure(table.terminal[before[alone]], table.terminal[after[alone]])
+    return trained[end[alone] - 1], table.task[after[alone]], values
 
 
 def _saturation(values: Tensor) -> tuple[float, int]:
@@ -339,39 +337,44 @@ def _efficiency(level: float, time: int, expert_level: float, expert_time: int, 
     return _quotient(expert_level, level) * expert_time / time
 
 
-def _falls(regimes: Regimes, task: str) -> bool:
+def _falls(table: RegimeTable, trainings: Sequence[int]) -> bool:
     """Whether the least-squares line through a task's training falls, over the experiences of the whole run."""
-    starts = torch.tensor([0] + [len(each.values) for each in regimes]).cumsum(0)
-    own = [i for i, each in enumerate(regimes) if each.training and each.task == task]
-    times = torch.cat([starts[i] + torch.arange(len(regimes[i].values)) for i in own]).double()
-    values = torch.cat([regimes[i].values for i in own])
+    times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1]) for i in trainings]).double()
+    values = _joined(table, trainings)
     return bool(((times - times.mean()) * (values - values.mean())).sum() < 0)
 
 
-def _per_task(regimes: Regimes, value: Callable[[str], float], only_trained: bool = False) -> Tensor:
-    """A value for each task, in the order of first appearance."""
-    return _tensor([value(task) for task in _tasks(regimes) if not only_trained or _training(regimes, task)])
+def _joined(table: RegimeTable, places: Sequence[int]) -> Tensor:
+    return torch.cat([table.values_of(i) for i in places])
 
 
-def _tasks(regimes: Regimes) -> list[str]:
-    return list(dict.fromkeys(each.task for each in regimes))
+def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Tensor], list[int]], float]) -> Tensor:
+    """A value for each task that is trained, in the order of first appearance; NaN for one without experts."""
+    trained = zip(table.names, table.places(training=True), strict=True)
+    return _tensor([value(experts[task], own) if experts.get(task) else math.nan for task, own in trained if own])
 
 
-def _training(regimes: Regimes, task: str) -> list[Regime]:
-    return [each for each in regimes if each.training and each.task == task]
+def _smoothed(table: RegimeTable) -> Tensor:
+    values = table.values.clone()
+    for i in np.flatnonzero(table.training).tolist():
+        values[table.starts[i] : table.starts[i + 1]] = smooth(table.values_of(i))
+    return values
 
 
-def _of_task(regimes: Regimes, task: str) -> list[Tensor]:
-    return [each.values for each in regimes if each.task == task]
+def _ranges(table: RegimeTable, experts: Experts) -> Ranges:
+    """Lowest and highest value of each task and its experts."""
+    both = zip(table.names, table.places(training=True), table.places(training=False), strict=True)
+    curves = {task: [_joined(table, [*own, *tests]), *experts.get(task, [])] for task, own, tests in both}
+    values = {task: torch.cat(of_task) for task, of_task in curves.items()}
+    return {task: (each.min().item(), each.max().item()) for task, each in values.items()}
 
 
-def _range(curves: Sequence[Tensor]) -> tuple[float, float]:
-    values = torch.cat(list(curves))
-    return values.min().item(), values.max().item()
+def _scaled(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return torch.where(low == high, OFFSET, (values - low) / (high - low) * SCALE + OFFSET)
 
 
-def _scaled(values: Tensor, low: float, high: float) -> Tensor:
-    return torch.full_like(values, OFFSET) if low == high else (values - low) / (high - low) * SCALE + OFFSET
+def _scaled_by(limits: tuple[float, float], values: Tensor) -> Tensor:
+    return _scaled(values, *torch.tensor(limits, dtype=torch.float64))
 
 
 def _mean(values: Sequence[float]) -> float:

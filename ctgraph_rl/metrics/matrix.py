@@ -79,7 +79,7 @@ def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> T
     Undefined unless each task is trained once, alone, in order. Defined for a single task.
     """
     _in_order(performance, trained)
-    return _pairs(performance, lambda block, task: block >= task)
+    return _pairs(performance, torch.ge)
 
 
 @defined("diaz-rodriguez2018/bwt", "2/(T(T-1)) sum_{i>j} (R[i,j] - R[j,j])", DIAZ, bounds=of_changes)
@@ -125,7 +125,7 @@ def zero_shot_performance(performance: Tensor, trained: Trained | None = None) -
     Not the same as `forward_transfer`: nothing is subtracted. Undefined as `backward_transfer`.
     """
     _several_in_order(performance, trained)
-    return _pairs(performance, lambda block, task: block < task)
+    return _pairs(performance, torch.lt)
 
 
 @defined(
@@ -171,13 +171,13 @@ def zero_shot_transfer(performance: Tensor, trained: Trained | None = None, scal
 def _changes_after_own_block(performance: Tensor, trained: Trained | None) -> Tensor:
     _several_in_order(performance, trained)
     own = performance[1:].diagonal()
-    return _pairs(torch.cat([performance[:1], performance[1:] - own]), lambda block, task: block > task)
+    return _pairs(torch.cat([performance[:1], performance[1:] - own]), torch.gt)
 
 
-def _pairs(matrix: Tensor, chosen: Callable[[int, int], bool]) -> Tensor:
-    """Entries [block, task] of the rows 1.. for which ``chosen(block, task)`` holds."""
-    count = matrix.shape[1]
-    return torch.stack([matrix[i, j - 1] for i in range(1, count + 1) for j in range(1, count + 1) if chosen(i, j)])
+def _pairs(matrix: Tensor, chosen: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Entries [block, task] of the rows 1.. for which ``chosen(block, task)`` holds, row by row."""
+    count = torch.arange(matrix.shape[1])
+    return matrix[1 : len(count) + 1][chosen(count.unsqueeze(1), count)]
 
 
 def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tensor | None, before: bool) -> Tensor:
@@ -188,10 +188,11 @@ def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tens
         raise Undefined(ONE_TASK)
     scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else torch.as_tensor(scale)
     changes = ratio(performance.diff(dim=0), scale.to(performance).expand(performance.shape[0] - 1, tasks))
-    first = [alone.index(task) if task in alone else len(alone) for task in range(tasks)]
-    pairs = [(block, task) for task in range(tasks) for block, other in enumerate(alone) if other != task]
-    terms = [changes[block, task] for block, task in pairs if (block < first[task]) == before]
-    return torch.stack(terms) if terms else performance.new_empty(0)
+    first_blocks = {task: block for block, task in reversed([*enumerate(alone)])}
+    first = torch.tensor([first_blocks.get(task, len(alone)) for task in range(tasks)]).unsqueeze(1)
+    others = torch.tensor(alone) != torch.arange(tasks).unsqueeze(1)
+    chosen = others & ((torch.arange(len(alone)) < first) == before)
+    return changes.T[chosen]
 
 
 def _alone(performance: Tensor, trained: Trained | None) -> list[int]:

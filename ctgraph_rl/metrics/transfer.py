@@ -126,7 +126,8 @@ def check_experts(curves: Curves, experts: Sequence[Tensor]) -> None:
     Raises:
         ValueError: names the task and both numbers.
     """
+    first = {task: block for block, tasks in reversed([*enumerate(curves.trained, 1)]) for task in tasks}
     for task, expert in enumerate(experts):
-        count = len(curves.of_block(next(i for i, block in enumerate(curves.trained, 1) if task in block)))
+        count = len(curves.of_block(first[task]))
         if len(expert) != count:
             raise ValueError(f"the expert of task {task + 1} needs {count} evaluations as its block, got {len(expert)}")

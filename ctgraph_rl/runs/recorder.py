@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from inspect import Parameter, signature
-from itertools import takewhile
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -120,9 +119,10 @@ class Recorder:
         require((frames > self._frames, f"frames must grow: {frames} comes after {self._frames}"))
         acts = self._adapted(policy, policy_for, frames)
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
+        before = len(self.log.measurements)
         self._evaluator.evaluate(acts, frames, where)
         self._frames = frames
-        return {m["label"]: m["return_mean"] for m in _last(self.log.of_kind("evaluation"), frames)}
+        return {m["label"]: m["return_mean"] for m in self.log.measurements[before:]}
 
     def training(self, frames: int, **values: Any) -> None:
         """Log what was measured while training since the last time, or the start of the block.
@@ -196,11 +196,6 @@ def _is_json(about: object) -> bool:
 def _number(value: Any) -> Any:
     """A scalar of NumPy, torch or JAX as a number of Python; anything else as it is."""
     return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
-
-
-def _last(measurements: list[dict[str, Any]], frames: int) -> Iterable[dict[str, Any]]:
-    """Return the measurements after ``frames`` frames, which are the last ones, in order."""
-    return reversed(list(takewhile(lambda m: m["frames"] == frames, reversed(measurements))))
 
 
 def adapt(policy: Any, greedy: bool, shows_ids: bool = False) -> Policy:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from os import PathLike
 from typing import Any
@@ -62,7 +64,8 @@ class Curriculum:
         everything = (*self.tasks, *self.evaluation.held_out)
         shapes = list(dict.fromkeys(task.images.shape for task in everything))
         one_shape = len(shapes) == 1 or all(len(shape) == 1 for shape in shapes)
-        trained_too = [task for task in self.evaluation.held_out if task in self.tasks]
+        trained = set(self.tasks)
+        trained_too = [task for task in self.evaluation.held_out if task in trained]
         one_each = self.protocol.task_id != "at_boundaries" or all(len(set(block.tasks)) == 1 for block in self.blocks)
         return [
             (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
@@ -76,17 +79,17 @@ class Curriculum:
         at_once = how.before and (how.tasks == "all" or bool(how.held_out))
         return how.at_block_ends or at_once or 0 < how.every <= self.num_frames
 
-    @property
+    @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """The different tasks, in the order of first appearance."""
         return tuple(dict.fromkeys(task for block in self.blocks for task in block.tasks))
 
-    @property
+    @cached_property
     def num_frames(self) -> int:
         """Frames of all blocks."""
         return sum(block.num_frames for block in self.blocks)
 
-    @property
+    @cached_property
     def ends(self) -> tuple[int, ...]:
         """Frames of the run at the end of each block."""
         return tuple(accumulate(block.num_frames for block in self.blocks))
@@ -95,13 +98,18 @@ class Curriculum:
         """The number of the block, from 1, that the last of the run's first ``frames`` frames is of; 0 for none."""
         return bisect_left(self.ends, frames) + 1 if frames else 0
 
+    def is_end(self, frames: int) -> bool:
+        """Whether a block ends after the run's first ``frames`` frames."""
+        block = self.block_at(frames)
+        return block > 0 and block <= len(self.ends) and self.ends[block - 1] == frames
+
     def moment(self, frames: int) -> str | None:
         """Return the evaluation due after ``frames`` frames: ``before``, ``during`` or ``after`` a block, or None."""
         how = self.evaluation
         within = how.every > 0 and frames % how.every == 0
         if frames == 0:
             return "before" if how.before else None
-        if frames in self.ends:
+        if self.is_end(frames):
             return "after" if how.at_block_ends or within else None
         return "during" if within else None
 
@@ -124,16 +132,19 @@ class Curriculum:
         """A different short name for each of ``tasks``: the goal, and what else differs between them."""
         return self.evaluated_labels[: len(self.tasks)]
 
-    @property
+    @cached_property
     def evaluated_labels(self) -> tuple[str, ...]:
         """`labels`, and in the same manner those of the held-out tasks."""
         parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
         differing = [name for name in parts[0] if name == "goal" or len({part[name] for part in parts}) > 1]
-        labels = ["-".join(part[name] for name in differing) for part in parts]
-        counts = [labels[:i].count(label) for i, label in enumerate(labels)]
-        return tuple(f"{label}#{count + 1}" if count else label for label, count in zip(labels, counts, strict=True))
+        counts: Counter[str] = Counter()
+        labels = []
+        for label in ("-".join(part[name] for name in differing) for part in parts):
+            counts[label] += 1
+            labels.append(f"{label}#{counts[label]}" if counts[label] > 1 else label)
+        return tuple(labels)
 
-    @property
+    @cached_property
     def trained(self) -> tuple[tuple[int, ...], ...]:
         """For each block, the positions in ``tasks`` of the tasks that it trains."""
         position = {task: number for number, task in enumerate(self.tasks)}

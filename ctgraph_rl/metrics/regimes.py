@@ -1,0 +1,116 @@
+"""Regimes, which are stays on one task, and a table of many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Regime:
+    """A stay on one task.
+
+    Args:
+        task: name of the task.
+        training: True for training, False for an evaluation.
+        values: performance of each experience in order, float64 [experiences].
+
+    Raises:
+        ValueError: for no values, or one that is not finite.
+    """
+
+    task: str
+    training: bool
+    values: Tensor
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 1 or len(self.values) == 0 or not self.values.isfinite().all():
+            raise ValueError(f"a regime of {self.task} needs finite values [experiences], got {self.values}")
+
+    @property
+    def terminal(self) -> float:
+        """Terminal performance: mean of the last tenth of a training, of all of an evaluation."""
+        start = int((1 - 0.1) * len(self.values)) if self.training else 0
+        return self.values[start:].mean().item()
+
+
+class Column(NamedTuple):
+    """What `RegimeTable` holds of each regime."""
+
+    task: Any  # position of its task in the names
+    training: Any  # bool
+    length: Any  # number of its experiences
+
+
+class RegimeTable(Sequence[Regime]):
+    """Regimes as arrays: a run that evaluates T tasks after each of T blocks has more than T^2 of them.
+
+    Args:
+        names: the different tasks, in the order of first appearance.
+        columns: the regimes in order.
+        values: the experiences of all regimes in order, float64 [experiences].
+
+    Raises:
+        ValueError: for a regime that `Regime` refuses.
+    """
+
+    def __init__(self, names: Sequence[str], columns: Column, values: Tensor) -> None:
+        self.names, self.values = tuple(names), values
+        self.task, self.length = (np.asarray(each, dtype=np.int64) for each in (columns.task, columns.length))
+        self.training = np.asarray(columns.training, dtype=bool)
+        self.starts = np.concatenate([[0], self.length.cumsum()])
+        finite = values.isfinite().numpy()
+        wrong = [
+            *np.flatnonzero(self.length == 0),
+            *(np.searchsorted(self.starts, np.flatnonzero(~finite), "right") - 1),
+        ]
+        if wrong:
+            self[int(min(wrong))]
+
+    @classmethod
+    def of(cls, regimes: Sequence[Regime]) -> RegimeTable:
+        """Return regimes as a table; a table as it is."""
+        if isinstance(regimes, RegimeTable):
+            return regimes
+        names = {task: i for i, task in enumerate(dict.fromkeys(each.task for each in regimes))}
+        columns = zip(*((names[each.task], each.training, len(each.values)) for each in regimes), strict=True)
+        values = torch.cat([each.values for each in regimes]) if regimes else torch.empty(0, dtype=torch.float64)
+        return cls([*names], Column(*(columns if regimes else ((), (), ()))), values)
+
+    def replaced(self, values: Tensor) -> RegimeTable:
+        """Return the table with other values of the same experiences."""
+        return RegimeTable(self.names, Column(self.task, self.training, self.length), values)
+
+    def __len__(self) -> int:
+        return len(self.task)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return [self[i] for i in range(*place.indices(len(self)))]
+        return Regime(self.names[self.task[place]], bool(self.training[place]), self.values_of(range(len(self))[place]))
+
+    def values_of(self, place: int) -> Tensor:
+        """Return the experiences of a regime."""
+        return self.values[self.starts[place] : self.starts[place + 1]]
+
+    @cached_property
+    def terminal(self) -> Any:
+        """`Regime.terminal` of each regime, float64 [regimes]."""
+        found = self.values[torch.from_numpy(self.starts[:-1])].double().numpy().copy()
+        for place in np.flatnonzero(self.length > 1).tolist():
+            found[place] = self[place].terminal
+        return found
+
+    def places(self, training: bool) -> Iterator[list[int]]:
+        """Yield, for each task, the positions of its trainings or evaluations."""
+        own = np.flatnonzero(self.training == training)
+        order = own[np.argsort(self.task[own], kind="stable")]
+        ends = np.searchsorted(self.task[order], range(len(self.names) + 1))
+        return (order[first:last].tolist() for first, last in pairwise(ends))
