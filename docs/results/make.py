@@ -1,7 +1,8 @@
 """Makes docs/results.md, docs/lifelong.md and figures from the raw results beside this file; and raw results from runs.
 
 ``python docs/results/make.py`` makes the pages. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
-each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes.
+each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes; for
+``rewards_met``, how often it met the goal's reward while learning.
 """
 
 from __future__ import annotations
@@ -10,15 +11,20 @@ import argparse
 import csv
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import comparison
 from raw import HERE, Raw, groups, mean_of, read, table, write
+
+if TYPE_CHECKING:
+    from ctgraph_rl.runs.load import Trained
 
 PAGE = HERE.parent / "results.md"
 LIFELONG = HERE.parent / "lifelong.md"
 AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
 """Tables of agents that each learned one task."""
+
+REWARDS_MET = "rewards_met"
 
 EPISODES = 1000
 SEED = 2023
@@ -30,11 +36,37 @@ def collect(name: str, folder: Path) -> None:
     from rich.progress import track
 
     runs = sorted(path.parent for path in folder.rglob("run.jsonl") if "experts" not in path.parts)
-    lines = [measured(run) for run in track(runs, f"{len(runs)} runs")]
+    measure = rewards_met if name == REWARDS_MET else measured
+    lines = [measure(run) for run in track(runs, f"{len(runs)} runs")]
     lines.sort(
         key=lambda line: [str(line[key]) for key in ("configuration", "depth", "task", "agent")] + [line["seed"]]
     )
     write(name, lines)
+
+
+def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
+    """The part of a line that says what was learned by whom."""
+    (task,) = trained.curriculum.tasks
+    configured = trained.log.of_kind("run")[0]["config"]["curriculum"]
+    return {
+        "configuration": configured.get("configuration", trained.curriculum.name),
+        "depth": task.graph.depth,
+        "task": ".".join(map(str, task.goal)),
+        "agent": run_dir.name.split("-seed")[0],
+        "seed": trained.seed,
+        "frames": trained.frames,
+        "fingerprint": trained.curriculum.fingerprint,
+    }
+
+
+def rewards_met(run_dir: Path) -> dict[str, Any]:
+    """One line: what was learned by whom, the finished episodes of training, and those that reached the goal."""
+    from ctgraph_rl import load
+
+    trained = load(run_dir)
+    episodes, rates = trained.log.training("episodes"), trained.log.training("success_rate")
+    goals = (episodes * rates.nan_to_num(0)).round().sum()
+    return {**who_learned(run_dir, trained), "episodes": int(episodes.sum()), "rewards_met": int(goals)}
 
 
 def measured(run_dir: Path) -> dict[str, Any]:
@@ -44,16 +76,7 @@ def measured(run_dir: Path) -> dict[str, Any]:
     failed = run_dir / "failed.txt"
     trained = load(run_dir)
     (task,) = trained.curriculum.tasks
-    configured = trained.log.of_kind("run")[0]["config"]["curriculum"]
-    line: dict[str, Any] = {
-        "configuration": configured.get("configuration", trained.curriculum.name),
-        "depth": task.graph.depth,
-        "task": ".".join(map(str, task.goal)),
-        "agent": run_dir.name.split("-seed")[0],
-        "seed": trained.seed,
-        "frames": trained.frames,
-        "fingerprint": trained.curriculum.fingerprint,
-    }
+    line = who_learned(run_dir, trained)
     for way, greedy in (("greedy", True), ("sampled", False)):
         how = {"seed": SEED, "greedy": greedy, "initial_state": trained.agent.initial_state}
         ends = evaluate(trained.policy_for(task), [task], EPISODES, **how, curriculum=trained.curriculum)
@@ -147,13 +170,25 @@ def collect_main_job(folder: Path) -> None:
     write("main_job", lines)
 
 
+def learned_and_met() -> dict[str, str]:
+    """What the page says of A2C on CT-FO-B2: seeds that learned each goal, by sampled episodes, and rewards met."""
+    solved = [line for line in read("baselines_fo_b2") if line["agent"] == "a2c"]
+    met = groups(read(REWARDS_MET), "task")
+    found = {}
+    for task, lines in groups(solved, "task").items():
+        goal, counts = task[0].replace(".", ""), [int(line["rewards_met"]) for line in met[task]]
+        found[f"learned_{goal}"] = f"{sum(float(line['sampled_success']) >= 0.9 for line in lines)} of {len(lines)}"
+        found[f"met_{goal}"] = f"{min(counts)} to {max(counts)}"
+    return found
+
+
 def page() -> str:
     """The page: the template with its tables."""
     small = read("baselines_b1")
     tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
     tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
-    return template.substitute(tables, main_job=main_job(read("main_job")))
+    return template.substitute(tables, main_job=main_job(read("main_job")), **learned_and_met())
 
 
 def lifelong_page() -> str:
@@ -193,7 +228,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     collecting = commands.add_parser("collect", help="raw results from runs")
-    names = ("main_job", *AGENTS, *comparison.EXPERIMENTS)
+    names = ("main_job", *AGENTS, REWARDS_MET, *comparison.EXPERIMENTS)
     collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()

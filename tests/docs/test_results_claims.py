@@ -1,0 +1,106 @@
+"""What docs/results.md and README say of results in words holds of the raw results, and is computed from them."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from helpers.paths import CHECKOUT
+from omegaconf import OmegaConf
+
+import curricula
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.configurations import ct_fo_b2
+
+
+def words(path: str) -> str:
+    return " ".join((CHECKOUT / path).read_text(encoding="utf-8").split())
+
+
+RESULTS, LIFELONG, README = words("docs/results.md"), words("docs/lifelong.md"), words("README.md")
+
+
+@pytest.fixture(scope="module")
+def make():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
+        yield __import__("make")
+        for name in ("make", "comparison", "raw"):
+            sys.modules.pop(name, None)
+
+
+def test_each_seed_of_the_main_job_knows_the_goal_of_the_last_block_alone(make):
+    of = make.groups(make.read("main_job"), "seed", "block")
+
+    assert sorted(of) == [(seed, block) for seed in "01234" for block in "01234"]
+    for (_, block), lines in of.items():
+        assert [float(line["return_mean"]) for line in lines] == [float(task == int(block)) for task in (1, 2, 3, 4)]
+    assert "Mean return over 100 greedy episodes, the same for all of five seeds." in README
+
+
+def test_a2c_on_fo_b2_learns_one_goal_in_some_seeds_and_meets_the_other(make):
+    solved = [line for line in make.read("baselines_fo_b2") if line["agent"] == "a2c"]
+    met = {(line["task"], line["seed"]): int(line["rewards_met"]) for line in make.read("rewards_met")}
+
+    learned = [(line["task"], line["seed"]) for line in solved if float(line["sampled_success"]) >= 0.9]
+    by_chance = [line for line in solved if float(line["greedy_success"]) == 1 and float(line["sampled_success"]) < 0.9]
+
+    assert learned == [("1.1.1", "0"), ("1.1.1", "1"), ("1.1.1", "2")]
+    assert sorted(count for (task, _), count in met.items() if task == "2.1.2") == [8, 8, 9, 17, 18]
+    assert [float(line["sampled_success"]) for line in by_chance] == [0.001]
+    assert "learns one goal in 3 of 5 seeds, by its sampled episodes, and the other in 0 of 5" in RESULTS
+    assert "meets that reward 8 to 18 times" in RESULTS
+    assert "One of its greedy policies is right by chance: sampled, it reaches the goal once in 1,000" in RESULTS
+
+
+def test_rewards_met_are_those_of_the_runs_of_the_table(make):
+    of = {name: {line["fingerprint"] for line in make.read(name)} for name in ("baselines_fo_b2", "rewards_met")}
+
+    assert of["rewards_met"] == of["baselines_fo_b2"]
+
+
+def test_rewards_are_counted_over_all_training_intervals(make, monkeypatch, tmp_path):
+    log = RunLog()
+    for episodes, rate in ((4, 0.25), (0, float("nan")), (10, 0.3)):
+        log.append("training", block=1, frames=8, episodes=episodes, success_rate=rate)
+    monkeypatch.setattr("ctgraph_rl.load", lambda run_dir: type("Trained", (), {"log": log}))
+    monkeypatch.setattr(make, "who_learned", lambda run_dir, trained: {"agent": "a2c"})
+
+    assert make.rewards_met(tmp_path) == {"agent": "a2c", "episodes": 14, "rewards_met": 4}
+
+
+def test_a2c_ends_near_a_policy_that_always_does_the_same_on_posr_b1(make):
+    cells = make.groups(make.read("baselines_b1"), "configuration", "task", "agent")
+
+    sampled = [float(line["sampled_return"]) for goal in ("1.2", "2.1") for line in cells["posr_b1", goal, "a2c"]]
+
+    assert max(sampled) < 0.05
+    assert "A2C ends near a policy that always does the same on CT-POSR-B1, too." in RESULTS
+
+
+def test_the_published_settings_solve_depth_2_and_3_and_not_4_or_5(make):
+    cells = make.groups(make.read("depth_ladder"), "agent", "depth")
+
+    solved = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo_published", depth]) for depth in "2345"]
+
+    assert solved == [5, 5, 0, 0]
+    assert "it solves depth 2 and 3 and not depth 4 or 5." in RESULTS
+
+
+def test_the_chances_of_a_random_episode_are_those_of_the_tasks():
+    probs = {task.graph.depth: task.graph.reward_prob_random for task in curricula.load("ct8_md").tasks}
+
+    assert {depth: round(1 / prob) for depth, prob in probs.items()} == {2: 243, 3: 2187, 4: 19683, 5: 177147}
+    assert "finds the goal of depth 5 once in 177,147 times." in LIFELONG
+    assert "A random episode finds a goal once in 2,187 times." in LIFELONG
+    assert "finds a goal of depth 2 once in 243 times, of depth 3 once in 2,187." in LIFELONG
+    assert round(1 / ct_fo_b2((1, 1, 1)).graph.reward_prob_random) == 16_875
+    assert "One of 16,875 random episodes finds the reward." in RESULTS
+
+
+def test_dqn_explores_as_the_page_says():
+    settings = OmegaConf.load(CHECKOUT / "conf" / "agent" / "dqn.yaml")
+
+    assert (settings.eps_end, settings.annealing_num_steps) == (1 / 20, 51_200)
+    assert "(a random action in twenty)" in RESULTS
+    assert "`dqn` acts at random at first, for 51,200 frames less and less." in RESULTS
