@@ -1,0 +1,75 @@
+"""docs/published_experiments.md: its table has every curriculum that cites a source, and what is missing."""
+
+from __future__ import annotations
+
+import csv
+import re
+from typing import NamedTuple
+
+import pytest
+from helpers.paths import CHECKOUT
+
+import curricula
+
+PAGE = CHECKOUT / "docs" / "published_experiments.md"
+RESULTS = CHECKOUT / "docs" / "results"
+
+
+class Row(NamedTuple):
+    source: str
+    tasks: str
+    published: str
+    curricula: str
+    rerun: str
+    missing: str
+
+
+ROWS = [
+    Row(*line.strip("|").split(" | ")) for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:2] == "| "
+][2:]
+
+
+def names_in(cell: str) -> list[str]:
+    return re.findall(r"`(\w+)`", cell)
+
+
+def curricula_with_results() -> set[str]:
+    """The named curricula that raw results are of."""
+    found = {"su_b1_4tasks"}  # the file of the main job does not name its curriculum
+    for path in RESULTS.glob("*.csv"):
+        with open(path, newline="", encoding="utf-8") as file:
+            lines = csv.DictReader(file)
+            column = "curriculum" if "curriculum" in (lines.fieldnames or ()) else "configuration"
+            found |= {line[column] for line in lines if column in line}
+    return found & set(curricula.names())
+
+
+def test_every_named_curriculum_stands_in_one_row_and_every_name_of_the_table_is_one():
+    assert sorted(name for row in ROWS for name in names_in(row.curricula)) == curricula.names()
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.source[:30])
+def test_a_row_has_the_sources_that_its_curricula_cite(row):
+    for name in names_in(row.curricula):
+        assert all(part in row.source for part in re.split("[;,] ", curricula.load(name).source)), name
+
+
+def test_every_part_that_cannot_be_recovered_stands_in_one_row():
+    named = [name for row in ROWS for name in re.findall(r"\*\*(.*?)\*\*", row.tasks)]
+
+    assert sorted(named) == sorted(entry.name for entry in curricula.MISSING)
+
+
+def test_what_the_table_calls_rerun_has_raw_results_and_what_has_is_called_so():
+    assert {name for row in ROWS for name in names_in(row.rerun)} == curricula_with_results()
+
+
+def test_every_row_says_what_is_missing_and_links_pages_that_exist():
+    for row in ROWS:
+        assert all(cell.strip() for cell in row)
+        assert all((PAGE.parent / link).exists() for link in re.findall(r"\]\(([\w/.]+)", row.rerun))
+
+
+@pytest.mark.parametrize("page", ["results.md", "lifelong.md", "curricula.md"])
+def test_the_pages_of_results_and_curricula_link_the_table(page):
+    assert "[published_experiments.md](published_experiments.md)" in (PAGE.parent / page).read_text(encoding="utf-8")
