@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ctgraph_rl.log.files import CURRICULUM
-from ctgraph_rl.metrics.bounds import Known, of_changes, of_performance
+from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.runs.read import Run, grouped
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-NOTHING_KNOWN = Known(*UNBOUNDED, tasks=1, evaluations=1, failure_is_lowest=False)
+NOTHING_KNOWN = Known(UNBOUNDED.low, UNBOUNDED.high, tasks=1, evaluations=1, failure_is_lowest=False)
 
 
 @dataclass(frozen=True)
@@ -22,28 +22,30 @@ class BoundsOfRuns:
     Args:
         returns: of each task by its label.
         known: what the metrics' bounds follow from.
+        noisy: whether rewards have noise, so that what is measured may be outside of what bounds its mean.
     """
 
-    returns: Mapping[str, Bounds] = field(default_factory=dict)
+    returns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     known: Known = NOTHING_KNOWN
+    noisy: bool = False
 
     @property
     def of_returns(self) -> Bounds:
         """Of the mean return on any task."""
-        return of_performance(self.known)
+        return Bounds(*of_performance(self.known), self.noisy)
 
     def of_task(self, label: str) -> Bounds:
         """Of the mean return on a task."""
-        return self.returns.get(label, UNBOUNDED)
+        return Bounds(*self.returns[label], self.noisy) if label in self.returns else UNBOUNDED
 
     def of_change(self, label: str) -> Bounds:
         """Of the difference of two mean returns on a task."""
-        low, high = self.of_task(label)
-        return of_changes(self.known._replace(low=low, high=high))
+        low, high, noisy = self.of_task(label)
+        return Bounds(low - high, high - low, noisy)
 
     def of_metric(self, name: str) -> Bounds:
         """Of a metric; one of another version has none."""
-        return METRICS[name].bounds(self.known) if name in METRICS else UNBOUNDED
+        return Bounds(*METRICS[name].bounds(self.known), self.noisy) if name in METRICS else UNBOUNDED
 
 
 NO_BOUNDS = BoundsOfRuns()
@@ -71,7 +73,7 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
             curves = run.history.evaluations.values()
             evaluations = max((sum(frames > 0 for frames, _ in curve) for curve in curves), default=1)
             known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
-            return BoundsOfRuns(returns, known)
+            return BoundsOfRuns(returns, known, any(task.reward_std > 0 for task in curriculum.tasks))
     return NO_BOUNDS
 
 

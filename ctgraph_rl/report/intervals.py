@@ -6,14 +6,20 @@ import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-Bounds = tuple[float, float]
-"""Lowest and highest possible value; infinite where it is not known."""
 
-UNBOUNDED: Bounds = (-math.inf, math.inf)
+class Bounds(NamedTuple):
+    """The lowest and the highest possible value, infinite where it is not known."""
+
+    low: float
+    high: float
+    noisy: bool = False  # whether values may be outside of what bounds their mean; they count as at the bound
+
+
+UNBOUNDED = Bounds(-math.inf, math.inf)
 
 ROUNDING = 1e-6
 """By how much of its bounds a value may be outside of them: rewards are float32."""
@@ -33,12 +39,12 @@ def student(level: float, freedom: int) -> float:
     return float(scipy("stats").t.ppf((1 + level) / 2, freedom))
 
 
-def gaffke(values: Sequence[float], bounds: Bounds, level: float) -> Bounds:
+def gaffke(values: Sequence[float], bounds: Bounds, level: float) -> tuple[float, float]:
     """Return Gaffke's interval of a mean of values within bounds."""
-    low, high = bounds
+    low, high, _ = bounds
     spread = high - low
     if spread == 0:
-        return bounds
+        return low, high
     scaled = np.sort(np.clip((np.array(values) - low) / spread, 0, 1).round(SCALED_DIGITS))
     tail = (1 - level) / 2
     least = _least_mean(tuple(scaled.tolist()), tail)
@@ -74,8 +80,9 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
 
 def within_bounds(known: Sequence[float], bounds: Bounds) -> bool:
     """Return whether values are within bounds, rounding apart."""
-    slack = ROUNDING * max([1.0, *(abs(bound) for bound in bounds if math.isfinite(bound))])
-    return all(bounds[0] - slack <= value <= bounds[1] + slack for value in known)
+    low, high, noisy = bounds
+    slack = ROUNDING * max([1.0, *(abs(bound) for bound in (low, high) if math.isfinite(bound))])
+    return noisy or all(low - slack <= value <= high + slack for value in known)
 
 
 @cache

@@ -36,6 +36,8 @@ MOST_SEEDS = 2**20
 """Number of seeds at which `seeds_needed` gives up."""
 
 Values = Sequence[float | None]
+LowHigh = tuple[float, float] | Bounds
+"""Lowest and highest possible value; infinite where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Comparison:
     holm: float | None = None
 
 
-def mean(values: Values, level: float = LEVEL, bounds: Bounds = UNBOUNDED) -> Estimate:
+def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Estimate:
     """Return the mean with Gaffke's interval where both bounds are known, else with Student's.
 
     One seed has no interval, nor have seeds that are all equal where a bound is not known.
@@ -99,28 +101,31 @@ def mean(values: Values, level: float = LEVEL, bounds: Bounds = UNBOUNDED) -> Es
     Args:
         values: one per seed; None or NaN for a seed without.
         level: coverage of the interval.
-        bounds: the lowest and the highest possible value. If a value is outside, they are none.
+        bounds: the lowest and the highest possible value. A value outside makes them none, unless they are noisy
+            `Bounds`.
     """
     scipy("stats")
-    require(*fraction(level=level), *_bounds_rules(bounds))
+    require(*fraction(level=level))
     known, missing = _known(values)
-    within = within_bounds(known, bounds)
-    bounded = within and math.isfinite(bounds[1] - bounds[0])
+    limits = _checked(bounds)
+    within = within_bounds(known, limits)
+    bounded = within and math.isfinite(limits.high - limits.low)
     method = f"mean, {'Gaffke' if bounded else 'Student t'} {level:.0%}"
     if len(known) == 0:
         return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
-    centre, reason = math.fsum(known) / len(known), None if within else f"a value is outside {_shown(bounds)}"
+    centre = math.fsum(known) / len(known)
+    reason = None if within else f"a value is outside [{limits.low:g}, {limits.high:g}]"
     low: float | None = None
     high: float | None = None
     if len(known) == 1:
         reason = "one seed has no interval"
     elif bounded:
-        low, high = gaffke(known, bounds, level)
+        low, high = gaffke(known, limits, level)
     elif min(known) == max(known):
         reason = "all seeds are equal: no spread to estimate"
     else:
         half = float(student(level, len(known) - 1) * np.std(known, ddof=1) / math.sqrt(len(known)))
-        lowest, highest = bounds if within else UNBOUNDED
+        lowest, highest, _ = limits if within else UNBOUNDED
         low, high = max(lowest, centre - half), min(highest, centre + half)
     return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
 
@@ -137,7 +142,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     missing, method = len(solved) - len(known), f"share, Clopper-Pearson {level:.0%}"
     if not known:
         return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a result")
-    low, high = gaffke(known, (0.0, 1.0), level)
+    low, high = gaffke(known, Bounds(0.0, 1.0), level)
     return Estimate(sum(known) / len(known), low=low, high=high, n=len(known), n_undefined=missing, method=method)
 
 
@@ -170,7 +175,7 @@ def interquartile_mean(
     resamples: int = RESAMPLES,
     seed: int = 0,
     *,
-    bounds: Bounds = UNBOUNDED,
+    bounds: LowHigh = UNBOUNDED,
 ) -> Estimate:
     """Return the mean of the middle half of all values of all tasks, with a bootstrap stratified by task.
 
@@ -185,7 +190,8 @@ def interquartile_mean(
         bounds: the lowest and the highest possible value.
     """
     require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
-    require((len(values) > 0, "interquartile_mean needs the values of at least one task"), *_bounds_rules(bounds))
+    require((len(values) > 0, "interquartile_mean needs the values of at least one task"))
+    lowest, highest, _ = _checked(bounds)
     known, missing = zip(*(_known(task) for task in values), strict=True)
     n, undefined = min(map(len, known)), max(missing)
     method = f"IQM, stratified bootstrap {level:.0%}"
@@ -193,7 +199,7 @@ def interquartile_mean(
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
         return Estimate(None, low=None, high=None, n=n, n_undefined=undefined, method=method, reason=reason)
     rng, limits = np.random.default_rng(seed), []
-    for bound, tail in zip(bounds, ((1 - level) / 2, (1 + level) / 2), strict=True):
+    for bound, tail in ((lowest, (1 - level) / 2), (highest, (1 + level) / 2)):
         added = [bound] if math.isfinite(bound) else []
         tasks = [[*task, *added] for task in known]
         weights = [rng.dirichlet(np.ones(len(task)), resamples) / len(tasks) for task in tasks]
@@ -209,7 +215,7 @@ def of_two_groups(
     first: np.ndarray,
     second: np.ndarray,
     measure: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    bounds: Bounds = (0.0, 1.0),
+    bounds: LowHigh = (0.0, 1.0),
     level: float = LEVEL,
 ) -> Estimate:
     """Return a number of the means of two groups of seeds, such as forward transfer, with the uncertainty of both.
@@ -225,13 +231,14 @@ def of_two_groups(
         bounds: the lowest and the highest possible value of either group.
         level: coverage of the interval.
     """
-    require(*fraction(level=level), *_bounds_rules(bounds))
+    require(*fraction(level=level))
+    lowest, highest, _ = _checked(bounds)
     method, n = f"two groups, weighted {level:.0%}", min(len(first), len(second))
     value = float(measure(first.mean(0), second.mean(0)))
     if n < 2:
         return Estimate(value, None, None, n, 0, method=method, reason="one seed has no interval")
     rng, limits = np.random.default_rng(0), []
-    for ends, tail in ((bounds, (1 - level) / 2), (bounds[::-1], (1 + level) / 2)):
+    for ends, tail in (((lowest, highest), (1 - level) / 2), ((highest, lowest), (1 + level) / 2)):
         means = [
             rng.dirichlet(np.ones(len(group) + 1), RESAMPLES) @ np.vstack([group, np.full(group.shape[1], end)])
             for group, end in zip((first, second), ends, strict=True)
@@ -240,7 +247,7 @@ def of_two_groups(
     return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
 
 
-def compare(first: Values, second: Values, level: float = LEVEL, bounds: Bounds = UNBOUNDED) -> Comparison:
+def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Comparison:
     """Return the paired comparison of two agents.
 
     Args:
@@ -259,8 +266,8 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: Bounds 
     signs = [(each > 0) - (each < 0) for each in known]
     std, p_value = (float(np.std(known, ddof=1)), _sign_flip(known)) if len(known) > 1 else (None, None)
     wins, ties, losses = (signs.count(sign) for sign in (1, 0, -1))
-    spread = bounds[1] - bounds[0]
-    difference = mean(differences, level, (-spread, spread))
+    low, high, noisy = _checked(bounds)
+    difference = mean(differences, level, Bounds(low - high, high - low, noisy))
     return Comparison(difference, std, p_value, wins=wins, ties=ties, losses=losses)
 
 
@@ -310,13 +317,10 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
     return high
 
 
-def _bounds_rules(bounds: Bounds) -> list[tuple[bool, str]]:
-    low, high = bounds
-    return [(low <= high, f"bounds must be a lowest and a highest value, got {bounds}")]
-
-
-def _shown(bounds: Bounds) -> str:
-    return f"[{bounds[0]:g}, {bounds[1]:g}]"
+def _checked(bounds: LowHigh) -> Bounds:
+    found = Bounds(*bounds)
+    require((found.low <= found.high, f"bounds must be a lowest and a highest value, got {tuple(bounds)}"))
+    return found
 
 
 def _sign_flip(differences: Sequence[float]) -> float:

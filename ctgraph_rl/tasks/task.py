@@ -193,8 +193,17 @@ class Task:
 
     @property
     def return_bounds(self) -> tuple[float, float]:
-        """The lowest and the highest undiscounted return of an episode; see `values.return_bounds`."""
+        """The lowest and the highest mean return of any policy; see `values.return_bounds`."""
         return values.return_bounds(self)
+
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether actions alone decide an episode: a policy without chance plays the same one again and again."""
+        x = self.observations
+        ranges = ((x.wait_ids, x.unique_waits), (x.decision_ids, x.unique_decisions), (x.home_ids, False))
+        drawn = any(first != last and not unique for (first, last), unique in ranges)
+        noise = x.read_noise or x.read_rotation or self.reward_std or self.goal_change is not None
+        return self.graph.wait_prob == 0 and not drawn and not noise
 
     @property
     def image_seed(self) -> int | None:

@@ -120,13 +120,14 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
 
 
 def return_bounds(task: Task) -> tuple[float, float]:
-    """Return the lowest and the highest undiscounted return of an episode, infinite where nothing bounds it.
+    """Return the lowest and the highest mean return of any policy, undiscounted; infinite where nothing bounds it.
 
     An end state pays ``goal_reward`` times a share within the reward's ``bounds``, and the fail state ``fail_reward``.
-    Noise of rewards is normal, which has no bounds; nor has the sum of a ``step_reward``, as an agent may wait on.
+    The noise of rewards has mean 0 and changes nothing. The sum of a ``step_reward`` is not bounded, as an agent may
+    wait on.
     """
     bounds = getattr(task.reward_fn, "bounds", None)
-    if bounds is None or task.reward_std > 0:
+    if bounds is None:
         return -math.inf, math.inf
     paid = [*(share * task.goal_reward for share in bounds(task.graph.branching_factor)), task.fail_reward]
     low = min(paid) if task.step_reward >= 0 else -math.inf

@@ -8,17 +8,21 @@ line after so many frames has what each of them gets on its own task after as ma
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import OmegaConf
-from raw import HERE, Raw, groups, mean_of, read, table, write
+from raw import HERE, Raw, groups, mean_of, read, share_of, shown, table, write
 
 from ctgraph_rl import metrics
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.metrics import Curves
+from ctgraph_rl.metrics import METRICS, Curves
+from ctgraph_rl.metrics.bounds import Known
+from ctgraph_rl.report import statistics
 
 EXPERT = "expert"
 CELL = ("curriculum", "agent", "method", "seed")
@@ -30,9 +34,12 @@ MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 EXPERIMENTS = (*MASKS, "methods")
 CONF = HERE.parent.parent / "conf" / "experiment"
 SOLVED = 0.9
-LEAST_ROOM = 0.05
+LEAST_ROOM = Fraction(1, 20)
 """What experts must leave to gain for a forward transfer: one of a task's 20 evaluations. Below it one failed
-evaluation of one run would outweigh all other tasks."""
+evaluation of one run would outweigh all other tasks. Areas are compared with it as exact fractions."""
+
+RETURNS = (0.0, 1.0)
+"""Bounds of the returns of all tasks of these experiments."""
 
 MOST_NAMED = 12
 """Cells without results are named up to so many, apart from seeds; else counted."""
@@ -114,21 +121,65 @@ def scores(lines: Raw) -> dict[str, float | None]:
     return {**values, "known at the end": float((run.performance[-1] >= SOLVED).sum())}
 
 
-def expert_areas(experts: Iterable[Raw]) -> torch.Tensor:
-    """float64 [tasks]: the areas under the curves of the experts, mean over their seeds."""
-    alone = [[metrics.mean_area(curve) for curve in curves(each).performance.T] for each in experts]
-    return torch.tensor(alone, dtype=torch.float64).mean(0)
+def areas(runs: Iterable[Raw]) -> np.ndarray:
+    """float64 [seeds, tasks]: the areas under the curves of tasks over their own blocks."""
+    return np.array([metrics.stage_areas(curves(lines)).tolist() for lines in runs])
 
 
-def transfer(lines: Raw, alone: torch.Tensor) -> dict[str, float]:
-    """What a run gains over the areas of the experts, [tasks]: Continual World's forward transfer, and the plain gain.
+def expert_areas(experts: Iterable[Raw]) -> np.ndarray:
+    """float64 [seeds, tasks]: the areas under the curves of the experts."""
+    return np.array([metrics.mean_area(curves(lines).performance).tolist() for lines in experts])
 
-    The mean of the former over seeds is Continual World's number, of the tasks whose experts leave something to gain.
-    """
-    gain, room = metrics.stage_areas(curves(lines)) - alone, 1 - alone
-    some = room >= LEAST_ROOM
-    return {"forward transfer": float((gain / room)[some].mean()), "gain over experts": float(gain.mean())}
 
+def full(experts: Sequence[Raw]) -> list[int]:
+    """Tasks, from 1, whose experts leave less than `LEAST_ROOM` to gain, in exact numbers."""
+    rooms: dict[str, list[Fraction]] = {}
+    for lines in experts:
+        for line in lines:
+            for task in (key for key in line if key.isdigit() and line[key] and int(line["frames"]) > 0):
+                rooms.setdefault(task, []).append(1 - Fraction(line[task]))
+    return [int(task) for task, room in rooms.items() if sum(room) / len(room) < LEAST_ROOM]
+
+
+def forward_transfer(runs: np.ndarray, experts: np.ndarray) -> np.ndarray:
+    """Continual World's forward transfer of mean areas [..., tasks]; -inf where an expert leaves nothing to gain."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num((runs - experts) / (1 - experts), nan=-np.inf, neginf=-np.inf).mean(-1)
+
+
+def gain(runs: np.ndarray, experts: np.ndarray) -> np.ndarray:
+    """Mean over tasks of what areas [..., tasks] gain over the experts'."""
+    return (runs - experts).mean(-1)
+
+
+def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> dict[str, str]:
+    """Forward transfer and gain over the experts, with the uncertainty of both sides."""
+    kept = [task for task in range(runs.shape[1]) if task + 1 not in left_out]
+    forward = statistics.of_two_groups(runs[:, kept], experts[:, kept], forward_transfer, RETURNS)
+    return {
+        "forward transfer": shown(forward),
+        "gain over experts": shown(statistics.of_two_groups(runs, experts, gain, RETURNS)),
+    }
+
+
+def resampled(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> str:
+    """The middle 95 % of forward transfer where the seeds of both sides are drawn again."""
+    kept = [task for task in range(runs.shape[1]) if task + 1 not in left_out]
+    rng = np.random.default_rng(0)
+    draws = [side[rng.integers(len(side), size=(10_000, len(side)))].mean(1)[:, kept] for side in (runs, experts)]
+    found = forward_transfer(*draws)
+    low, high = np.quantile(found, 0.025, method="lower"), np.quantile(found, 0.975, method="higher")
+    return f"[{low:.2f}, {high:.2f}]"
+
+
+OF_A_RUN = {
+    "average performance": "continual_world_performance",
+    "forgetting": "continual_world_forgetting",
+    "TPOT": "total_performance_over_time",
+    "tasks learned": "tasks_learned",
+    "known at the end": "tasks_learned",
+}
+"""Columns that a run has without experts, with the metrics that say their bounds."""
 
 COLUMNS = (
     "average performance",
@@ -147,14 +198,26 @@ def summary(name: str) -> str:
     if not of:
         return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
     experts = [lines for (who, _), lines in of.items() if who == EXPERT]
-    alone, rows = expert_areas(experts), []
+    alone, left_out, rows, drawn = expert_areas(experts), full(experts), [], []
     for method in dict.fromkeys(expected(name)["method"]):
-        found = [{**scores(lines), **transfer(lines, alone)} for (who, _), lines in of.items() if who == method]
-        values = [mean_of([each.get(column) for each in found]) for column in COLUMNS]
-        rows.append([f"`{method}`", str(len(found)), *values])
-    full = ", ".join(str(task) for task, area in enumerate(alone.tolist(), 1) if 1 - area < LEAST_ROOM)
-    said = f"Experts: {len(experts)} seeds of each. Left out of forward transfer: {f'task {full}' if full else 'none'}."
-    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said} {missing(name)}"
+        runs = [lines for (who, _), lines in of.items() if who == method]
+        found, own = [scores(lines) for lines in runs], areas(runs)
+        values = transfer(own, alone, left_out)
+        values |= {column: mean_of([each[column] for each in found], bounds(column, runs[0])) for column in OF_A_RUN}
+        rows.append([f"`{method}`", str(len(found)), *(values[column] for column in COLUMNS)])
+        drawn.append(f"`{method}` {resampled(own, alone, left_out)}")
+    tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
+    said = f"Experts: {len(experts)} seeds of each. Left out of forward transfer: {tasks}. {missing(name)}"
+    again = f"Forward transfer where seeds of runs and experts are only drawn again: {', '.join(drawn)}."
+    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said} {again}"
+
+
+def bounds(column: str, lines: Raw) -> tuple[float, float]:
+    """The lowest and the highest value of a column."""
+    run = curves(lines)
+    evaluations, tasks = run.performance.shape
+    known = Known(*RETURNS, tasks=tasks, evaluations=evaluations, failure_is_lowest=True)
+    return METRICS[OF_A_RUN[column]].bounds(known)
 
 
 def learned(name: str) -> str:
@@ -164,8 +227,7 @@ def learned(name: str) -> str:
     for method in (*dict.fromkeys(expected(name)["method"]), EXPERT):
         runs = [_solved(curves(lines), method) for lines in groups(of.get((method,), []), "seed").values()]
         if runs:
-            counts = torch.stack(runs).sum(0).int().tolist()
-            rows.append([f"`{method}`", *(f"{count} of {len(runs)}" for count in counts)])
+            rows.append([f"`{method}`", *map(share_of, torch.stack(runs).T.tolist())])
     if not rows:
         return ""
     return table(["", *(f"task {task}" for task in range(1, len(rows[0])))], rows)
@@ -231,14 +293,15 @@ def seeds_of(lines: Raw, agent: str) -> str:
 
 
 def _both(lines: Raw) -> str:
-    runs = [curves(each) for each in groups(lines, "seed").values()]
-    if not runs:
+    by_seed = list(groups(lines, "seed").values())
+    if not by_seed:
         return ""
+    runs = [curves(each) for each in by_seed]
     forgotten = [
         metrics.continual_world_forgetting(run).value for run in runs
     ]  # none where all tasks are learned at once
-    at_end = mean_of(returns_at_end(lines))
-    return at_end if None in forgotten else f"{at_end}; {mean_of(forgotten)}"
+    at_end = mean_of(returns_at_end(lines), RETURNS)
+    return at_end if None in forgotten else f"{at_end}; {mean_of(forgotten, bounds('forgetting', by_seed[0]))}"
 
 
 def returns_at_end(lines: Raw) -> list[float]:

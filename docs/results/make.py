@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
 import comparison
-from raw import HERE, Raw, groups, mean_of, read, table, write
+import pairs
+from raw import HERE, Raw, groups, mean_of, read, share_of, table, write
+
+if TYPE_CHECKING:
+    from ctgraph_rl import Task
 
 if TYPE_CHECKING:
     from ctgraph_rl.runs.load import Trained
@@ -87,9 +92,9 @@ def measured(run_dir: Path) -> dict[str, Any]:
     return {**line, "failed": "" if finished else reason}
 
 
-def cell(lines: Raw, column: str) -> str:
+def cell(lines: Raw, column: str, bounds: tuple[float, float] = (0.0, 1.0)) -> str:
     """Mean over seeds with its interval; seeds that failed are counted, not averaged."""
-    return mean_of([None if line.get("failed") else float(line[column]) for line in lines])
+    return mean_of([None if line.get("failed") else float(line[column]) for line in lines], bounds)
 
 
 def by_goal(raw: Raw, configuration: str) -> str:
@@ -103,25 +108,47 @@ def by_goal(raw: Raw, configuration: str) -> str:
     rows = []
     for remembers in (False, True):
         for name in (name for name in names if kinds[name].memory is remembers):
-            each = [of.get((name, goal), []) for goal in goals]
-            rows.append([f"`{name}`", *map(both_ways, each)])
+            rows.append([f"`{name}`", *(both_ways(of.get((name, goal), []), configuration, goal) for goal in goals)])
         if not remembers and rows:
             exact = (", ".join(ceilings(configuration, goal)) for goal in goals)
             rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
     return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
 
 
-def both_ways(lines: Raw) -> str:
-    """Mean return of the greedy and of the sampled policy."""
-    return f"{cell(lines, 'greedy_return')}, {cell(lines, 'sampled_return')}" if lines else ""
+def both_ways(lines: Raw, configuration: str, goal: str) -> str:
+    """Mean return of the greedy and of the sampled policy, with its interval and the error of the evaluation."""
+    from ctgraph_rl.report.intervals import Bounds
+
+    if not lines:
+        return ""
+    task, found = task_of(configuration, goal), []
+    bounds = Bounds(*task.return_bounds, noisy=task.reward_std > 0)
+    for way in ("greedy", "sampled"):
+        found.append(cell(lines, f"{way}_return", bounds) + evaluation_error(lines, f"{way}_success", task))
+    return ", ".join(found)
+
+
+def evaluation_error(lines: Raw, column: str, task: Task) -> str:
+    """The standard error of a mean return over `EPISODES` episodes, binomial and of the rewards' noise, from 0.005 on.
+
+    All seeds and agents are evaluated by the same draws, so that more seeds do not make it smaller.
+    """
+    rate = sum(float(line[column]) for line in lines) / len(lines)
+    error = math.sqrt((rate * (1 - rate) * task.goal_reward**2 + task.reward_std**2) / EPISODES)
+    return f" ±{error:.2f}" if error >= 0.005 else ""
+
+
+def task_of(configuration: str, goal: str) -> Task:
+    """The task of a configuration and a goal."""
+    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
+
+    name = "CT-" + configuration.upper().replace("_", "-")
+    return CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))
 
 
 def ceilings(configuration: str, goal: str) -> list[str]:
     """The best mean return without memory, of a policy that always does the same and of any."""
-    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
-
-    name = "CT-" + configuration.upper().replace("_", "-")
-    task = CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))
+    task = task_of(configuration, goal)
     return [f"{task.memoryless_ceiling(deterministic):.2f}" for deterministic in (True, False)]
 
 
@@ -147,9 +174,8 @@ def solved(lines: Raw) -> str:
     """How many seeds have a greedy success of at least 0.9, and the mean return."""
     if not lines:
         return ""
-    return (
-        f"{sum(float(line['greedy_success']) >= 0.9 for line in lines)} of {len(lines)}; {cell(lines, 'greedy_return')}"
-    )
+    share = share_of([float(line["greedy_success"]) >= 0.9 for line in lines])
+    return f"{share}; {cell(lines, 'greedy_return')}"
 
 
 def main_job(raw: Raw) -> str:
@@ -194,7 +220,7 @@ def page() -> str:
 def lifelong_page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
-    return template.substitute(comparison.tables())
+    return template.substitute(comparison.tables() | pairs.tables())
 
 
 def draw(path: Path) -> None:

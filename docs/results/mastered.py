@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import comparison
+import pairs
 import torch
 from raw import groups, read
 
 from ctgraph_rl.metrics import MASTERED, Curves
+from ctgraph_rl.report import statistics
 
 METHODS = ("finetune", "ewc_published", "mask_lc", "mask_ri", "mask_blc")
 GOALS = {
@@ -74,6 +76,24 @@ class Table:
         """Its forward transfer on CT8 multi-depth: as in the table, and with the first task."""
         transfer = (self.gain("mask_lc") / (1 - self.alone)).mean(0)
         return transfer[2:].mean().item(), transfer[[0, 2, 3, 4, 5, 6, 7]].mean().item()
+
+    def claims_hold_of_the_means(self) -> bool:
+        """Whether masks know more at the end than others, and combinations have more while learning than new masks."""
+        known = {method: self.known(method).double().mean() for method in METHODS}
+        learning = {method: self.areas(method).mean() for method in METHODS[2:]}
+        better = min(known[mask] for mask in METHODS[2:]) > max(known[other] for other in METHODS[:2])
+        return bool(better) and all(learning[mask] > learning["mask_ri"] for mask in ("mask_lc", "mask_blc"))
+
+    @staticmethod
+    def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
+        """The p-value of the paired test of two methods, a number for each seed."""
+        return statistics.compare(first.tolist(), second.tolist()).p_value
+
+    @staticmethod
+    def clear_pairs() -> int:
+        """How many differences that the paper claims are distinguishable over the pairs of the three curricula."""
+        corrected = statistics.holm([each.p_value for each in pairs.claims().values()])
+        return sum(p is not None and p <= 0.05 for p in corrected)
 
     def beyond_beginnings(self) -> list[set[str]]:
         """What fine-tuning on CT12 has at the end of each block of a goal of depth 3 beyond it and its beginning.

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ctgraph_rl.report.statistics import Estimate
 
 HERE = Path(__file__).resolve().parent
 
@@ -43,16 +47,43 @@ def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
     return found
 
 
-def mean_of(values: Sequence[float | None]) -> str:
-    """Mean over seeds with half of its interval; seeds without a value are counted, not averaged."""
+def mean_of(values: Sequence[float | None], bounds: tuple[float, float]) -> str:
+    """Mean over seeds with its interval; seeds without a value are counted, not averaged.
+
+    Args:
+        values: one per seed; None for a seed without.
+        bounds: the lowest and the highest possible value.
+    """
     from ctgraph_rl.report import statistics
 
-    found = statistics.mean(values)
+    return shown(statistics.mean(values, bounds=bounds))
+
+
+def share_of(solved: Sequence[bool]) -> str:
+    """How many of the seeds, with the exact interval of their share."""
+    from ctgraph_rl.report import statistics
+
+    return f"{sum(solved)} of {len(solved)}{interval_of(statistics.solved_rate(solved))}"
+
+
+def shown(found: Estimate) -> str:
+    """A value and its interval, such as ``1.00 [0.48, 1]``."""
     if found.value is None:
         return "-"
-    interval = "" if found.low is None else f" ± {(found.high - found.low) / 2:.2f}"  # type: ignore[operator]
-    missing = f" (n={found.n}/{len(values)})" if found.n_undefined else ""
-    return f"{found.value:.2f}{interval}{missing}".replace("-0.00", "0.00")
+    missing = f" (n={found.n}/{found.n + found.n_undefined})" if found.n_undefined else ""
+    return f"{_number(found.value)}{interval_of(found)}{missing}"
+
+
+def interval_of(found: Estimate) -> str:
+    """The interval in brackets; nothing without one."""
+    if found.low is None or found.high is None:
+        return ""
+    low, high = (_number(end).removesuffix(".00") for end in (found.low, found.high))
+    return f" [{low}, {high}]"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if 100 <= abs(value) < math.inf else f"{value:.2f}".replace("-0.00", "0.00")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

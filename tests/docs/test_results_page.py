@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 
 import pytest
 from helpers.paths import CHECKOUT
 
+import curricula
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
 FOLDER = CHECKOUT / "docs" / "results"
@@ -31,6 +33,73 @@ def task_of(line):
 
 def test_the_page_is_what_its_raw_results_make(make):
     assert make.page() == make.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_lifelong_page_is_what_its_raw_results_make(make):
+    assert make.lifelong_page() == make.LIFELONG.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", ["PAGE", "LIFELONG"])
+def test_no_mean_of_five_seeds_stands_without_its_interval_and_none_leaves_what_is_possible(make, page):
+    tables = [line for line in getattr(make, page).read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    numbers = re.findall(r"\d\.\d\d(?! \[)", re.sub(r"±\d\.\d\d|\[[^]]*\]", "[]", " ".join(tables)))
+    ends = [tuple(map(float, each)) for each in re.findall(r"\[(-?[\d.]+), (-?[\d.]+)\]", " ".join(tables))]
+
+    assert numbers == []
+    assert len(ends) > 100 and all(low < high for low, high in ends)
+    if page == "PAGE":
+        assert all(low >= 0 and high <= 1 for low, high in ends)
+
+
+def test_five_runs_that_all_know_everything_leave_half_open(make):
+    page = make.LIFELONG.read_text(encoding="utf-8").split("| fo_b1_4tasks |")[1].split("\n\n")[0]
+
+    (row,) = [line for line in page.splitlines() if line.startswith("| `mask_lc` |")]
+    assert row.split("|")[2].strip() == "1.00 [0.48, 1]; 0.00 [-0.39, 0.39]"
+
+
+def test_the_draws_of_the_evaluation_have_their_error(make):
+    page = make.PAGE.read_text(encoding="utf-8")
+
+    assert round(math.sqrt(0.86 * 0.14 / make.EPISODES), 2) == 0.01
+    assert page.count("| `dqn` | 1.00 [0.48, 1], 0.86 [0.41, 0.93] ±0.01 |") >= 2
+
+
+def test_a_threshold_does_not_hang_on_the_last_bit(make):
+    comparison = sys.modules["comparison"]
+    experts = [
+        lines for (who, _), lines in make.groups(make.read("masks_ct12"), "method", "seed").items() if who == "expert"
+    ]
+
+    areas = 1 - comparison.expert_areas(experts).mean(0)
+
+    assert areas[2] != 0.05 and areas[2] == pytest.approx(0.05, abs=1e-15)
+    assert comparison.full(experts) == [1, 4, 5, 7, 10, 12]
+    assert comparison.full(experts[::-1]) == comparison.full([lines[::-1] for lines in experts])
+    next(line for lines in experts for line in lines if line["3"] == "0.0" and line["frames"] != "0")["3"] = "1.0"
+    assert 3 in comparison.full(experts)
+
+
+@pytest.mark.parametrize("name", ["masks_ct8_md", "masks_ct8", "masks_ct12"])
+def test_methods_that_must_learn_the_first_task_alike_share_its_results(make, name):
+    first = {
+        (method, seed): [line["1"] for line in lines if line["block"] in ("0", "1")]
+        for (method, seed), lines in make.groups(make.read(name), "method", "seed").items()
+    }
+
+    for seed in "01234":
+        assert first["finetune", seed] == first["ewc_published", seed] == first["expert", seed]
+        assert first["mask_ri", seed] == first["mask_lc", seed] == first["mask_blc", seed]
+
+
+@pytest.mark.parametrize("name", ["ct8_md", "ct8", "ct12", "fo_b1_4tasks", "fo_b1_4images", "fo_b1_depth2to5"])
+def test_an_evaluation_of_the_lifelong_page_is_one_episode_of_a_return_in_0_to_1(make, name):
+    learned = curricula.load(name)
+    raw = make.read(f"masks_{name}") or [line for line in make.read("methods") if line["curriculum"] == name]
+
+    assert learned.evaluation.greedy and all(task.is_deterministic for task in learned.tasks)
+    assert {task.return_bounds for task in learned.tasks} == {(0, 1)}
+    assert {line[key] for line in raw for key in line if key.isdigit()} - {""} == {"0.0", "1.0"}
 
 
 @pytest.mark.parametrize(

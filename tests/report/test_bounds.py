@@ -16,8 +16,10 @@ from ctgraph_rl.core.rewards import Arrival, Gradient, ReferenceLinear
 from ctgraph_rl.metrics.bounds import Known
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.report.bounds import bounds_of
+from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import comparisons, table
 from ctgraph_rl.report.sections import sections
+from ctgraph_rl.report.statistics import mean
 from ctgraph_rl.tasks.configurations import ct_su_b1
 
 pytest.importorskip("scipy")
@@ -41,7 +43,7 @@ class Own:
         ({"reward_fn": ReferenceLinear()}, (0, 1)),
         ({"step_reward": -0.1}, (-math.inf, 1)),
         ({"step_reward": 0.1}, (0, math.inf)),
-        ({"reward_std": 0.1}, (-math.inf, math.inf)),
+        ({"reward_std": 0.1}, (0, 1)),
         ({"reward_fn": Own()}, (-math.inf, math.inf)),
     ],
 )
@@ -117,9 +119,9 @@ def test_of_another_curriculum_than_the_run_learned_nothing_is_known(tmp_path):
     (tmp_path / "0" / "curriculum.json").unlink()
     curricula.load("fo_b1_4tasks").to_json(tmp_path / "0" / "curriculum.json")
 
-    assert bounds_of(runs[:1]).of_returns == (-math.inf, math.inf)
-    assert bounds_of(runs).of_returns == (0, 1)  # the second run's directory says it
-    assert bounds_of(runs).of_metric("of_another_version") == (-math.inf, math.inf)
+    assert bounds_of(runs[:1]).of_returns == UNBOUNDED
+    assert bounds_of(runs).of_returns == Bounds(0, 1)  # the second run's directory says it
+    assert bounds_of(runs).of_metric("of_another_version") == UNBOUNDED
 
 
 def test_a_time_is_a_median_that_seeds_that_never_got_there_count_in(tmp_path):
@@ -146,3 +148,10 @@ def test_p_values_of_comparisons_are_corrected_for_all_pairs(tmp_path):
         ("A", "C"): (0.25, 0.75),
         ("B", "C"): (1.0, 1.0),
     }
+
+
+def test_noise_of_rewards_puts_what_is_measured_outside_and_no_interval():
+    noisy, exact = (mean([1.01, 0.99, 1.0], bounds=bounds) for bounds in (Bounds(0, 1, noisy=True), (0, 1)))
+
+    assert str(noisy) == "1.00 [0.29, 1.00] n = 3"
+    assert exact.reason == "a value is outside [0, 1]"

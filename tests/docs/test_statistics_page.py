@@ -1,0 +1,97 @@
+"""docs/statistics.md: its tables are those of the script, which covers as the page says."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from helpers.paths import CHECKOUT
+
+from ctgraph_rl.report import statistics
+
+pytest.importorskip("scipy")
+PAGE = CHECKOUT / "docs" / "statistics.md"
+
+
+@pytest.fixture(scope="module")
+def coverage():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
+        yield __import__("coverage_of_rules")
+        for name in ("coverage_of_rules", "comparison", "raw"):
+            sys.modules.pop(name, None)
+
+
+def cells(*names: str) -> list[str]:
+    """The numbers of the line that starts with the names."""
+    (line,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {' | '.join(names)} |")]
+    return [cell.strip() for cell in line.split("|")[len(names) + 1 : -1]]
+
+
+def covered(cell: str) -> float:
+    return float(cell.split(" %")[0])
+
+
+def test_the_page_is_its_template_with_tables(coverage):
+    template = (CHECKOUT / "docs" / "results" / "statistics_template.md").read_text(encoding="utf-8")
+    written = template.replace("$draws", f"{coverage.DRAWS:,}")
+
+    blocks = PAGE.read_text(encoding="utf-8").split("\n\n")
+    tables = {"| returns | interval": "$of_means", "| number |  |": "$of_others"}
+    named = [next((name for head, name in tables.items() if block.startswith(head)), block) for block in blocks]
+    assert "\n\n".join(named) == written
+
+
+@pytest.mark.parametrize("rule", ["**Gaffke**", "Student t", "Anderson", "Hoeffding", "empirical Bernstein"])
+def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
+    assert cells("two-valued", rule) == [coverage.cell(rule, "two-valued", n) for n in coverage.SEEDS]
+
+
+@pytest.mark.parametrize(
+    ("rule", "shape", "n"),
+    [("**Gaffke**", "bounded", 3), ("**Gaffke**", "skewed", 5), ("Student t", "skewed", 5), ("Anderson", "skewed", 20)],
+)
+def test_simulated_cells_are_computed_again(coverage, rule, shape, n):
+    assert cells(shape, rule)[coverage.SEEDS.index(n)] == coverage.cell(rule, shape, n)
+
+
+def test_times_are_computed_again(coverage):
+    name = "median of times, of which a third is never reached"
+    assert cells(name, "covers, has an end")[:2] == [coverage.of_times(n) for n in (3, 5)]
+
+
+@pytest.mark.slow
+def test_the_whole_page_is_made_again(coverage):
+    assert coverage.page() == PAGE.read_text(encoding="utf-8")
+
+
+def test_the_rules_of_the_package_cover_and_students_does_not():
+    own = [cells(shape, "**Gaffke**") for shape in ("bounded", "two-valued", "skewed")]
+    own += [
+        cells("median of times, of which a third is never reached", "covers, has an end"),
+        cells("interquartile mean of three tasks", "covers, width")[2:],
+        cells("**forward transfer, both sides weighted**", "covers, no end below"),
+    ]
+
+    assert min(covered(cell) for row in own for cell in row) >= 95
+    assert covered(cells("two-valued", "Student t")[1]) == 40.9
+    assert covered(cells("skewed", "Student t")[1]) < 80
+
+
+def test_gaffkes_is_the_narrowest_that_covers_everywhere():
+    for shape in ("bounded", "two-valued", "skewed"):
+        for n in range(4):
+            widths = {
+                rule: float(cells(shape, rule)[n].split(", ")[1])
+                for rule in ("**Gaffke**", "Anderson", "Hoeffding", "empirical Bernstein")
+            }
+            assert min(widths, key=widths.__getitem__) == "**Gaffke**"
+
+
+def test_what_the_text_says_of_five_seeds_is_so():
+    text = PAGE.read_text()
+
+    assert f"{1 - 0.9**5 - 0.1**5:.0%}".replace("%", " %") == "41 %" and "covers in 41 %" in text
+    assert f"{0.9**5:.0%}" == "59%" and "in 59 % of cases" in text
+    assert str(statistics.mean([0.0] * 5, bounds=(-1, 1))).startswith("0.00 [-0.52, 0.52]") and "[-0.52, 0.52]" in text
+    assert statistics.compare([1.0] * 5, [0.0] * 5).p_value == 2 / 2**5
