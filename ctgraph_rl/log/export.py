@@ -19,7 +19,7 @@ from pathlib import Path
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log.escape import terminal_lines
-from ctgraph_rl.log.files import LOG
+from ctgraph_rl.log.files import LOG, no_run
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
@@ -103,7 +103,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
     arguments = parser.parse_args()
     try:
+        require(((arguments.run / LOG).is_file(), no_run(arguments.run)))
         log = RunLog.read(arguments.run / LOG)
+        measured = any(measurement["kind"] != "run" for measurement in log.measurements)
+        require((measured, f"{arguments.run} has no training and no evaluation yet: there is nothing to export"))
         if arguments.format == "parquet":
             arguments.out.mkdir(parents=True, exist_ok=True)
             write_tables(log, arguments.out, parquet=True)

@@ -99,3 +99,13 @@ def _signed(file: BinaryIO) -> BinaryIO:
     with suppress(OSError):
         file.write(f"process {os.getpid()} on {socket.gethostname()} since {now}".encode())
     return file
+
+
+def no_run(path: Path) -> str:
+    """Return why there is no run in or below a path."""
+    if path.is_dir():
+        return f"{path} holds no run: no {LOG} in or below it"
+    if not path.exists():
+        return f"{path} holds no run: there is no such directory"
+    within = f", such as {path.parent}" if (path.parent / LOG).exists() else ""
+    return f"{path} holds no run: it is a file; name a run directory{within}"

@@ -116,6 +116,15 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
     return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), corrected, strict=True)}
 
 
+def _pairs(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
+    """Return `comparisons`; refuse runs among which there are none."""
+    pairs = comparisons(runs, metric)
+    agents = ", ".join(f"{agent} on {curriculum}" for curriculum, agent in grouped(runs))
+    rule = f"--compare needs two agents with the same seeds on one curriculum, got {agents}"
+    require((bool(pairs), f"{rule}; add the runs of another agent, or leave --compare out"))
+    return pairs
+
+
 def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Row]:
     """The rows of some measures; agents none of whose runs finished stay.
 
@@ -339,14 +348,14 @@ def main() -> None:
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
         runs, problems = find_runs(arguments.runs)
         require((bool(runs), "; ".join(problem.reason for problem in problems)))
+        pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
         rows = table(runs)
         names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
         print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names)))
         if arguments.csv is not None:
             write_csv(arguments.csv, rows)
-        if arguments.compare is not None:
-            for pair, found in comparisons(runs, arguments.compare).items():
-                print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
+        for pair, found in pairs.items():
+            print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
     except BrokenPipeError:
         raise
     except (OSError, ValueError, ModuleNotFoundError) as error:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, is_real, require
-from ctgraph_rl.log.files import FAILURE, LOG, METRICS
+from ctgraph_rl.log.files import FAILURE, LOG, METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.runs.experts import EXPERT
@@ -120,7 +120,7 @@ def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
         for folder in marks:
             refused.setdefault(folder.resolve(), folder)
         if not logs and not marks:
-            problems.append(Problem(Path(path), f"{path} holds no run: no run.jsonl in or below it"))
+            problems.append(Problem(Path(path), no_run(Path(path))))
         for log in logs:
             try:
                 found.append(read_run(log.parent))

@@ -154,15 +154,16 @@ class SweepProgress:
     def _watch(self) -> None:
         start = last_line = time.perf_counter()
         ended_before = sum(self.look()[:2])
-        pause = 1.0
-        while not self._stop.wait(pause):
+        pause, over = 1.0, False
+        while not over:
+            over = self._stop.wait(pause)  # one more look then: cells may have ended since the last
             now = time.perf_counter()
             done, failed, running = self.look()
             pause = max(1.0, 20 * (time.perf_counter() - now))
             text = self.describe(done, failed, running, done + failed - ended_before, now - start)
             if self.console.is_terminal:
                 self._bar.update(self._task, completed=done, description=text)
-            elif now - last_line >= SECONDS_BETWEEN_LINES:
+            elif not over and now - last_line >= SECONDS_BETWEEN_LINES:
                 last_line = now
                 self.console.print(text, highlight=False, soft_wrap=True)
 

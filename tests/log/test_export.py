@@ -125,15 +125,18 @@ def test_the_command_exports_a_run_directory(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("trained", "message"),
     [
-        (None, "No such file"),
+        (None, "holds no run: no run.jsonl in or below it"),
+        ((), "has no training and no evaluation yet: there is nothing to export"),
         (([1], [1, 2]), "lifelong metrics need blocks that train one task, block 2 trains several"),
     ],
 )
 def test_a_run_that_cannot_be_exported_is_one_message(tmp_path, monkeypatch, capsys, trained, message):
-    if trained is not None:
+    if trained == ():
+        (tmp_path / "run.jsonl").touch()
+    elif trained is not None:
         learned(RunLog(tmp_path / "run.jsonl"), trained).close()
 
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit, match="2"):
         command_line(monkeypatch, tmp_path, "--out", tmp_path / "out")
 
     assert message in capsys.readouterr().err

@@ -201,13 +201,30 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
     assert rows[1]["low"] == "" and rows[1]["note"] == "all seeds are equal: no spread to estimate"
 
 
-def test_a_users_error_is_one_message(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["results", str(tmp_path)])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["empty"], "empty holds no run: no run.jsonl in or below it"),
+        (["nowhere"], "nowhere holds no run: there is no such directory"),
+        (["table.csv"], "table.csv holds no run: it is a file; name a run directory"),
+        (["runs/0/metrics.json"], "it is a file; name a run directory, such as runs/0"),
+        (["runs", "--compare", "average_performance"], "--compare needs two agents with the same seeds on one"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_users_error_is_one_message(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "table.csv").touch()
+    make_run(tmp_path, 0).rename(tmp_path / "runs" / "0")
+    monkeypatch.setattr(sys, "argv", ["results", *arguments])
 
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit, match="2"):
         results.main()
 
-    assert "holds no run" in capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert message in shown.err and shown.out == ""
 
 
 @pytest.mark.parametrize("name", [EXPERT, f"{EXPERT} (modified)"])

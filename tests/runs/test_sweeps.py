@@ -354,6 +354,18 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     assert progress.describe(9, 1, 0, ended=0, seconds=1).endswith("? left")
 
 
+def test_progress_on_a_terminal_ends_with_the_cells_that_were_done_last(tmp_path):
+    shown = io.StringIO()
+    console = Console(file=shown, force_terminal=True, width=120)
+
+    with SweepProgress(dict.fromkeys([tmp_path / "a", tmp_path / "b"], Outcome()), console):
+        for name in "ab":
+            (tmp_path / name).mkdir()
+            (tmp_path / name / "metrics.json").touch()
+
+    assert "2/2 cells done" in shown.getvalue()
+
+
 def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
