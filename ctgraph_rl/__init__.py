@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from ctgraph_rl.packages import warn_of_shadows
+
 if TYPE_CHECKING:
     from ctgraph_rl import metrics as metrics
     from ctgraph_rl.agent import Agent as Agent
@@ -77,3 +79,6 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
+
+
+warn_of_shadows()

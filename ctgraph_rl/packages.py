@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,13 +29,26 @@ def check_packages() -> None:
     """Refuse a ``curricula`` or ``baselines`` that is not the one installed with this package.
 
     Raises:
-        ValueError: if a folder, usually in the working directory, shadows one of them; names it.
+        ValueError: if a folder or a file, usually in the working directory, shadows one of them; names it.
     """
+    require(*((False, message) for message in _shadows()))
+
+
+def warn_of_shadows() -> None:
+    """Warn the importer of this package of what `check_packages` refuses."""
+    for message in _shadows():
+        warnings.warn(message, stacklevel=3)
+
+
+def _shadows() -> Iterator[str]:
+    """Yield what is wrong with packages that are not ours."""
     for name in ("curricula", "baselines"):
         spec, ours = find_spec(name), HERE.parent / name
-        found = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent
-        message = f"package {name!r} was found in {found} instead of {ours}; rename or move the folder found"
-        require((found == ours, message))
+        origin = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
+        found = origin.parent if origin is not None and origin.name == "__init__.py" else origin
+        if found != ours:
+            kind = "file" if found == origin else "folder"
+            yield f"package {name!r} was found in {found} instead of {ours}; rename or move the {kind} found"
 
 
 def command(module: str) -> Callable[[], None]:
@@ -59,7 +73,12 @@ def curriculum_named(name: str) -> Curriculum:
 
 
 def is_published(curriculum: Curriculum) -> bool | None:
-    """Return whether a curriculum is the published one of its name; None if no published one has this name."""
+    """Return whether a curriculum is the published one of its name; None if no published one has this name.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
     published = import_module("curricula")
     if curriculum.name not in published.names():
         return None
@@ -67,6 +86,11 @@ def is_published(curriculum: Curriculum) -> bool | None:
 
 
 def class_named(module: str, name: str) -> type | None:
-    """Return a class that a module of `baselines` defines; None if there is no such module or class."""
+    """Return a class that a module of `baselines` defines; None if there is no such module or class.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
     kind = getattr(import_module(module), name, None) if find_spec(module) is not None else None
     return kind if isinstance(kind, type) and kind.__module__ == module else None

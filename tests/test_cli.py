@@ -172,16 +172,56 @@ def test_an_unknown_command_is_refused_with_the_choices(call):
     )
 
 
-def test_a_folder_that_shadows_ours_is_refused(checkout, tmp_path):
-    (tmp_path / "curricula").mkdir()
-    (tmp_path / "curricula" / "__init__.py").write_text("")
-    code = "import sys; sys.argv = ['x', 'curricula']; from ctgraph_rl.cli import main; main()"
-    env = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{checkout}"}
+def in_a_folder_that_shadows(checkout, tmp_path, path, code):
+    """The process of a script beside a file that shadows one of our packages."""
+    (tmp_path / path).parent.mkdir(exist_ok=True)
+    (tmp_path / path).write_text("")
+    (tmp_path / "script.py").write_text(code)
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+    return subprocess.run([sys.executable, "script.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
 
-    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+
+SHADOWS = {"curricula/__init__.py": "curricula; rename or move the folder found", "curricula.py": "file found"}
+
+
+@pytest.mark.parametrize("path", SHADOWS)
+def test_what_shadows_ours_is_refused_by_the_commands(checkout, tmp_path, path):
+    code = "import sys; sys.argv = ['x', 'curricula']; from ctgraph_rl.cli import main; main()"
+
+    result = in_a_folder_that_shadows(checkout, tmp_path, path, code)
 
     assert result.returncode == 1
-    assert "error: package 'curricula' was found in" in result.stderr
+    error = result.stderr[result.stderr.index("error: ") :]
+    assert f"error: package 'curricula' was found in {tmp_path / path.removesuffix('/__init__.py')} instead of" in error
+    assert SHADOWS[path] in error and "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import ctgraph_rl, curricula; curricula.load('ct8')",
+        "import curricula; from ctgraph_rl import Task; curricula.load('ct8')",
+    ],
+)
+def test_what_shadows_ours_is_named_where_python_imports_it(checkout, tmp_path, code):
+    result = in_a_folder_that_shadows(checkout, tmp_path, "curricula/__init__.py", code)
+
+    first, *_ = result.stderr.splitlines()
+    assert f"script.py:1: UserWarning: package 'curricula' was found in {tmp_path / 'curricula'} instead of" in first
+    assert first.endswith("; rename or move the folder found")
+    assert "has no attribute 'load'" in result.stderr
+
+
+def test_a_folder_named_baselines_leaves_the_environment_usable_and_trained_agents_not(checkout, tmp_path):
+    code = (
+        "from ctgraph_rl.tasks.configurations import ct_su_b1; from ctgraph_rl import packages; print(ct_su_b1().goal)"
+    )
+    code += "; packages.class_named('baselines.dqn', 'DQN')"
+
+    result = in_a_folder_that_shadows(checkout, tmp_path, "baselines/__init__.py", code)
+
+    assert result.stdout == "(1, 1)\n"
+    assert "ValueError: package 'baselines' was found in" in result.stderr
 
 
 def test_the_page_lists_what_the_command_prints(checkout):
