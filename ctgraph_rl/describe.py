@@ -9,6 +9,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_lines, terminal_text
+from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -254,13 +256,15 @@ def main(
         argv: its arguments; None: those of the process.
     """
     parser = _parser(prog)
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_args(argv, argparse.Namespace(format="text", config_dir=None))
     try:
         if arguments.command is None:
-            _show([listing(map(load, names()))], arguments.format)
+            own = [curriculum_of(name, arguments.config_dir) for name in curriculum_names(arguments.config_dir)]
+            _show([listing([*map(load, names()), *own])], arguments.format)
         else:
             is_file = arguments.name.endswith(".json") or Path(arguments.name).is_file()
-            _describe(Curriculum.from_json(arguments.name) if is_file else load(arguments.name), arguments)
+            named = load if arguments.config_dir is None else partial(curriculum_of, config_dir=arguments.config_dir)
+            _describe(Curriculum.from_json(arguments.name) if is_file else named(arguments.name), arguments)
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
@@ -268,8 +272,9 @@ def main(
 
 
 def _parser(prog: str | None) -> argparse.ArgumentParser:
-    form = argparse.ArgumentParser(add_help=False)
-    form.add_argument("--format", choices=("text", "markdown", "latex"), default="text", help="default: text")
+    form = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    form.add_argument("--format", choices=("text", "markdown", "latex"), help="default: text")
+    form.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     parser = argparse.ArgumentParser(prog=prog, description="List all curricula, or describe one.", parents=[form])
     one = parser.add_subparsers(dest="command").add_parser("describe", help="describe one", parents=[form])
     one.add_argument("name", help="a name of the list, or a curriculum as a JSON file")

@@ -1,5 +1,6 @@
 """``python -m curricula``, ``ctgraph-rl`` with a command, and the page that lists all curricula."""
 
+import io
 import json
 import os
 import re
@@ -222,6 +223,74 @@ def test_a_folder_named_baselines_leaves_the_environment_usable_and_trained_agen
 
     assert result.stdout == "(1, 1)\n"
     assert "ValueError: package 'baselines' was found in" in result.stderr
+
+
+OWN_CURRICULUM = """
+from ctgraph_rl import Block, Curriculum
+from ctgraph_rl.tasks.configurations import ct_su_b1
+
+def make(num_frames):
+    return Curriculum("mine", 1, "me", [Block(ct_su_b1(goal), num_frames) for goal in ((1, 1), (2, 2))])
+
+def nothing():
+    return {}
+"""
+
+
+@pytest.fixture
+def my_conf(tmp_path, monkeypatch):
+    """A directory as of ``ctgraph-rl --config-dir my_conf curriculum=my-own``, below the working directory."""
+    (tmp_path / "my_conf" / "curriculum").mkdir(parents=True)
+    (tmp_path / "my_conf" / "curriculum" / "my-own.yaml").write_text("_target_: my_own_tasks.make\nnum_frames: 1024\n")
+    (tmp_path / "my_own_tasks.py").write_text(OWN_CURRICULUM)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "stdin", io.StringIO("q"))
+    return tmp_path / "my_conf"
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ("curricula --config-dir my_conf", "mine"),
+        ("curricula --config-dir my_conf describe my-own --format markdown", "goal2.2"),
+        ("curricula describe my-own --config-dir my_conf", "goal2.2"),
+        ("curricula describe ct8 --config-dir my_conf", "ct8"),
+        ("draw my-own --task 2 --config-dir my_conf --dot task.dot", ""),
+        ("play my-own --config-dir my_conf", "You see what an agent sees"),
+    ],
+)
+def test_a_curriculum_of_a_configuration_directory_is_known_to_the_commands(call, my_conf, words, shown):
+    code, out, err = call(cli.main, *words.split())
+
+    assert (code, err) == (0, "") and shown in out
+    if "--dot" in words:
+        assert "mine, task 2: goal2.2" in (my_conf.parent / "task.dot").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            "curricula describe mien --config-dir my_conf",
+            "unknown curriculum 'mien'.*; in my_conf: broken, my-own, plain",
+        ),
+        ("draw my-own --config-dir there --dot task.dot", "--config-dir must be a directory, got there"),
+        ("draw my-own --config-dir my_conf --depth 3 --dot task.dot", "my-own takes no depth"),
+        ("curricula describe broken --config-dir my_conf", "curriculum has no frames. Choices: num_frames"),
+        (
+            "curricula describe plain --config-dir my_conf",
+            "my_own_tasks.nothing must make a Curriculum, it made a dict",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_configuration_directory_is_one_message(call, my_conf, words, message):
+    (my_conf / "curriculum" / "broken.yaml").write_text("_target_: my_own_tasks.make\nframes: 1024\n")
+    (my_conf / "curriculum" / "plain.yaml").write_text("_target_: my_own_tasks.nothing\n")
+
+    code, out, err = call(cli.main, *words.split())
+
+    assert (code, out) == (2, "") and re.search(message, err)
 
 
 def test_the_page_lists_what_the_command_prints(checkout):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from inspect import Parameter
 from pathlib import Path
@@ -20,8 +22,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import is_int, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
-from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
 from ctgraph_rl.runs.settings import digest, parameters_of
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 SPECS = ("observation_spec", "action_spec", "folder")
 """Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
@@ -125,6 +128,49 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
         (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
     )
     return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
+
+
+def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
+    """Return the curriculum that ``ctgraph-rl --config-dir DIR curriculum=NAME`` learns.
+
+    Args:
+        name: of a published curriculum, or of a file in the directory's ``curriculum`` folder.
+        config_dir: the directory; None: a published curriculum.
+
+    Raises:
+        ValueError: for an unknown name or directory, and a file that makes no curriculum.
+    """
+    own = curriculum_names(config_dir)
+    if config_dir is None or name not in own:
+        try:
+            return curriculum_named(name)
+        except ValueError as error:
+            there = f"; in {config_dir}: {', '.join(own) or 'none'}" if config_dir is not None else ""
+            raise ValueError(f"{error}{there}") from None
+    check_packages()
+    sys.path.append(os.getcwd())  # where a user's own function may be, as in a run
+    settings = [f"curriculum={name}", f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
+    try:
+        with hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+            cfg = hydra.compose("config", settings)
+        made = target(cfg, "curriculum")()
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(explain(error)) from None
+    kind = type(made).__name__
+    require((isinstance(made, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {kind}"))
+    return made
+
+
+def curriculum_names(config_dir: Path | None) -> list[str]:
+    """Return the names of the curricula in a configuration directory.
+
+    Raises:
+        ValueError: if there is no such directory.
+    """
+    if config_dir is None:
+        return []
+    require((config_dir.is_dir(), f"--config-dir must be a directory, got {config_dir}"))
+    return sorted(path.stem for path in (config_dir / "curriculum").glob("*.yaml"))
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:

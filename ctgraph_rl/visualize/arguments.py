@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.collect import InitialState, Policy
-from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
+from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -66,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names = ", ".join(CONFIGURATIONS)
     about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: numbers alone"
     parser.add_argument("name", nargs="?", help=about)
+    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     parser.add_argument("--task", type=int, default=1, metavar="N", help="number of a curriculum's task, from 1")
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
@@ -93,7 +94,7 @@ def select(arguments: argparse.Namespace) -> Selection:
         require((arguments.name is None and not changes, "--run has a curriculum of its own: choose one with --task"))
         return _of_run(arguments.run, arguments.task)
     policy = None if arguments.policy is None else POLICIES[arguments.policy]
-    return _named(arguments.name, arguments.task, changes)._replace(policy=policy)
+    return _named(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
 
 
 def decisions(text: str) -> tuple[int, ...]:
@@ -101,16 +102,17 @@ def decisions(text: str) -> tuple[int, ...]:
     return tuple(map(int, text.split(".")))
 
 
-def _named(name: str | None, number: int, changes: dict[str, Any]) -> Selection:
+def _named(name: str | None, number: int, changes: dict[str, Any], config_dir: Path | None) -> Selection:
     """Return a task without a policy."""
+    own = name in curriculum_names(config_dir)
     if name is None:
         return _called("CT-graph", make_task(**changes))
-    if name.endswith(".json"):
+    if not own and name.endswith(".json"):
         return _called(name, make_task(config=name, **changes))
-    if "-" in name:  # as in the paper's labels and in no curriculum's name
+    if not own and "-" in name:  # as in the paper's labels and in no curriculum's name
         return _called(name.upper(), make_task(name.upper(), **changes))
     require((not changes, f"the tasks of a curriculum are as they are: {name} takes no {', '.join(changes)}"))
-    return _of_curriculum(curriculum_named(name), number)
+    return _of_curriculum(curriculum_of(name, config_dir), number)
 
 
 def _called(name: str, task: Task) -> Selection:

@@ -24,6 +24,16 @@ def test_the_python_in_readme_runs_and_prints_what_it_says(capsys):
     assert mean_return == "mean return 1.0"
 
 
+def test_every_example_with_stable_baselines3_sets_one_thread():
+    """With all threads of a busy machine the same steps take ten times as long."""
+    pages = [README, *(CHECKOUT / "docs").glob("*.md")]
+    blocks = [code for page in pages for code in re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)]
+    with_sb3 = [code for code in blocks if "from stable_baselines3 import" in code]
+
+    assert len(with_sb3) >= 2
+    assert all(code.index("torch.set_num_threads(1)") < code.index("PPO(") for code in with_sb3)
+
+
 @pytest.mark.parametrize("name", ["run-command", "test-command"])
 def test_each_of_the_two_commands_is_one_line_behind_its_marker(name):
     text = README.read_text(encoding="utf-8")
