@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from inspect import Parameter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -24,7 +24,9 @@ from ctgraph_rl.checks import is_int, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
 from ctgraph_rl.runs.settings import digest, parameters_of
-from ctgraph_rl.tasks.curriculum import Curriculum
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.curriculum import Curriculum
 
 SPECS = ("observation_spec", "action_spec", "folder")
 """Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
@@ -140,6 +142,8 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
     Raises:
         ValueError: for an unknown name or directory, and a file that makes no curriculum.
     """
+    from ctgraph_rl.tasks.curriculum import Curriculum  # here: --help and a wrong setting need no torch
+
     own = curriculum_names(config_dir)
     if config_dir is None or name not in own:
         try:
