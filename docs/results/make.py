@@ -30,6 +30,8 @@ AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
 """Tables of agents that each learned one task."""
 
 REWARDS_MET = "rewards_met"
+OLDER = "ppo_published"
+"""The agent of which cells of the depth ladder were of an earlier revision."""
 
 EPISODES = 1000
 SEED = 2023
@@ -208,13 +210,30 @@ def learned_and_met() -> dict[str, str]:
     return found
 
 
+def rerun() -> dict[str, str]:
+    """What the page says of the cells that were run again, and of those of an earlier revision."""
+    again = read("reruns")
+    changed = [line for line in again if line["agent"] == OLDER and line["table"] == "depth_ladder"]
+    others = [line for line in again if line not in changed]
+    rerun_again = {(line["depth"], line["seed"]) for line in changed}
+    cells = [line for line in read("depth_ladder") if line["agent"] == OLDER]
+    older = groups([line for line in cells if (line["depth"], line["seed"]) not in rerun_again], "depth")
+    left = (f"depth {depth} ({len(lines)} of 5 seeds)" for (depth,), lines in older.items())
+    return {
+        "rerun": str(len(others)),
+        "rerun_equal": str(sum(line["equal"] == line["numbers"] for line in others)),
+        "changed": f"{len(changed)} of {len(cells)}",
+        "older": ", ".join(left) or "none",
+    }
+
+
 def page() -> str:
     """The page: the template with its tables."""
     small = read("baselines_b1")
     tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
     tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
-    return template.substitute(tables, main_job=main_job(read("main_job")), **learned_and_met())
+    return template.substitute(tables, main_job=main_job(read("main_job")), **learned_and_met(), **rerun())
 
 
 def lifelong_page() -> str:

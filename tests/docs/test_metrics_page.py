@@ -18,6 +18,7 @@ from ctgraph_rl import Block, RunLog, metrics
 from ctgraph_rl.log import tables
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import write_metrics
+from ctgraph_rl.metrics.lifetime import ROUNDING
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.recorder import Recorder
 
@@ -54,6 +55,23 @@ def column_rows(columns: dict[str, tuple[str, str]]) -> list[tuple[str, ...]]:
 
 def test_the_page_has_every_definition_as_the_code_has_it():
     assert table(*definition_rows()) in TEXT
+
+
+@pytest.mark.parametrize(
+    ("program", "deviation"),
+    [
+        ("CORA", "its code counts the first cycle alone by default"),
+        ("l2metrics 3.1.0", "a value within 1e-12 of the level, relative to it, has reached it"),
+        ("Ben-Iwhiwhu et al.", "an evaluation before training, which named curricula add, is not part of"),
+    ],
+)
+def test_the_page_has_the_deviation_from_a_program_under_its_name(program, deviation):
+    bullets = re.split(r"\n- ", TEXT.split("deviate on purpose")[1].split("## Over seeds")[0])
+
+    (bullet,) = [" ".join(each.split()) for each in bullets if each.startswith(f"**{program}**")]
+
+    assert deviation in bullet
+    assert ROUNDING == 1e-12
 
 
 @pytest.mark.parametrize("columns", [tables.EVALUATIONS, tables.TRAINING], ids=["evaluations", "training"])

@@ -25,7 +25,7 @@ def make():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
         yield __import__("make")
-        for name in ("make", "comparison", "raw"):
+        for name in ("make", "comparison", "raw", "reruns"):
             sys.modules.pop(name, None)
 
 
@@ -104,3 +104,30 @@ def test_dqn_explores_as_the_page_says():
     assert (settings.eps_end, settings.annealing_num_steps) == (1 / 20, 51_200)
     assert "(a random action in twenty)" in RESULTS
     assert "`dqn` acts at random at first, for 51,200 frames less and less." in RESULTS
+
+
+def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revision_differ(make):
+    again = make.read("reruns")
+    changed = [line for line in again if (line["table"], line["agent"]) == ("depth_ladder", make.OLDER)]
+
+    assert {line["table"] for line in again} >= {"main_job", *make.AGENTS, "masks_ct8", "masks_ct12", "methods"}
+    assert all(line["equal"] == line["numbers"] for line in again if line not in changed)
+    assert {(line["numbers"], line["equal"]) for line in changed} == {("4", "2")}  # greedy return and success
+
+
+def test_a_cell_that_was_run_again_takes_the_place_of_its_line(make, monkeypatch, tmp_path):
+    reruns, written = __import__("reruns"), []
+    cell = {"configuration": "fo_b1", "depth": "2", "task": "1.1", "agent": "ppo", "seed": "0"}
+    numbers = {"greedy_return": "1.0", "greedy_success": "1.0", "sampled_return": "0.5", "sampled_success": "0.5"}
+    tables = {"baselines_b1": [cell | numbers], "reruns": [reruns.line_of("baselines_b1", cell, 4, 0)]}
+    tables["main_job"] = []
+    monkeypatch.setattr(reruns, "read", tables.get)
+    monkeypatch.setattr(reruns, "write", lambda name, lines: written.extend(lines))
+    monkeypatch.setattr(make, "measured", lambda run: cell | numbers | {"sampled_return": 0.25})
+    (tmp_path / "metrics.json").write_text("{}")
+
+    reruns.compare("baselines_b1", tmp_path)
+
+    assert written == [reruns.line_of("baselines_b1", cell, 4, 3)]
+    with pytest.raises(ValueError, match="holds no run of main_job: give the folder of its runs"):
+        reruns.compare("main_job", tmp_path)
