@@ -224,10 +224,8 @@ def test_graphs_of_any_size_are_drawn(tmp_path, shapes):
 
 def boxes_of_labels(curriculum: Curriculum, monkeypatch: pytest.MonkeyPatch) -> list[list]:
     """Where the labels of each panel are, in pixels."""
-    from matplotlib.figure import Figure
-
     drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *rest, **options: drawn.append(figure))
+    monkeypatch.setattr("ctgraph_rl.visualize.curriculum_figure.save_figure", lambda figure, _: drawn.append(figure))
     draw_graphs(curriculum, "unused.png")
     (figure,) = drawn
     figure.canvas.draw()
