@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Iterable
 
 
@@ -18,6 +20,26 @@ def require(*rules: tuple[bool, str]) -> None:
     broken = [message for holds, message in rules if not holds]
     if broken:
         raise ValueError("; ".join(broken))
+
+
+def memory_bytes() -> int:
+    """Return the memory of this machine; without a limit where the system does not say."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
+
+
+def require_memory(what: str, needed: int, fewer: str) -> None:
+    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
+
+    Args:
+        what: needs memory.
+        needed: bytes at least.
+        fewer: of what to use fewer.
+
+    Raises:
+        ValueError: if the machine has less memory.
+    """
+    memory = memory_bytes()
+    require((needed < memory, f"{what} need {needed:,} bytes, this machine has {memory:,}; use fewer {fewer}"))
 
 
 def is_int(value: object, low: float = -math.inf, high: float = math.inf) -> bool:

@@ -1,7 +1,7 @@
 """Curricula from the JSON files of the labs: a list of environments, and which of their goals in which order.
 
 The labs' wrappers number all goals of all environments and choose by number. ``config_paths`` names the environment
-files, relative to the file itself; ``task_order`` puts their goals one environment after the other (``default``) or in
+files, in its folder and relative to it; ``task_order`` puts their goals one environment after the other (``default``) or in
 turns (``interleaved``); ``filter_tasks`` chooses from that list, in its own order, repeats allowed; ``num_tasks`` cuts
 what is chosen. The one-hot label of a task has length ``label_dim`` and is its number in the whole list, or, by
 ``task_label_mode``, its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says (``explicit``).
@@ -21,6 +21,7 @@ from reprlib import repr as short
 from typing import Any
 
 from ctgraph_rl.checks import is_int, is_shallow, require
+from ctgraph_rl.disk import read_regular
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
@@ -60,7 +61,7 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
     with _named(file):
         require(*_key_rules(meta))
         require(*_value_rules(meta))
-        environments = [read_environment(file.parent / config) for config in meta["config_paths"]]
+        environments = [read_environment(_within(file.parent, config)) for config in meta["config_paths"]]
         pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
         tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
@@ -149,9 +150,7 @@ def _read(path: Path) -> dict[str, Any]:
     """
     with _named(path):
         try:
-            size = path.stat().st_size
-            require((size <= MOST_BYTES, f"must be at most {MOST_BYTES} bytes, got {size}"))
-            content = json.loads(path.read_bytes())
+            content = json.loads(read_regular(path, MOST_BYTES))
         except OSError as error:
             raise ValueError(f"must be a file that can be read: {error.strerror or error}") from error
         except RecursionError as error:
@@ -159,6 +158,18 @@ def _read(path: Path) -> dict[str, Any]:
         require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
         require((is_shallow(content, MOST_NESTING), f"must be nested at most {MOST_NESTING} levels deep"))
     return content
+
+
+def _within(folder: Path, name: str) -> Path:
+    """Return the path of a file that another file names, which must be in that file's folder, links followed.
+
+    Raises:
+        ValueError: for a path that leads elsewhere.
+    """
+    path = folder / name
+    inside = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
+    require((inside, f"config_paths must be in the folder of the file, got {short(name)}; copy the file there"))
+    return path
 
 
 @contextmanager

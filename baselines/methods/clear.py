@@ -17,9 +17,8 @@ from baselines.learner import Learner
 from baselines.methods.method import Method
 from baselines.methods.weights import Weights
 from baselines.networks import Data
-from ctgraph_rl.checks import at_least_one, not_negative, require
+from ctgraph_rl.checks import at_least_one, not_negative, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.memory import require_memory
 
 
 class Reservoir:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.core import reading
 from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
@@ -17,7 +17,7 @@ from ctgraph_rl.core.rotation import taps_of
 from ctgraph_rl.core.row_params import LegacyIndex, ObservationParams, RewardParams, Uses
 from ctgraph_rl.core.tree import TreeParams, tree_params
 from ctgraph_rl.tasks.images import white_level
-from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, require_memory, rotates_after_noise
+from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
 
 MakeTensor = Callable[..., Tensor]

@@ -19,6 +19,9 @@ LOG, AGENT, METRICS, CURRICULUM = "run.jsonl", "agent.pt", "metrics.json", "curr
 FAILURE = "failed.txt"
 """Says why a run ended by an error."""
 
+MOST_BYTES_OF_METRICS, MOST_BYTES_OF_A_REASON = 2**24, 2**16
+"""Largest `METRICS`, and largest `FAILURE` and `LOCK`, that are read."""
+
 CHECKPOINTS = "checkpoints"
 """The folder with the checkpoints of an unfinished run."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ctgraph_rl.checks import is_int, is_real, is_shallow, require
@@ -71,8 +71,12 @@ def parsed(line: bytes) -> dict[str, Any]:
     return measurement
 
 
-def check(measurement: Mapping[str, Any]) -> None:
+def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
     """Refuse a measurement that is none of ours.
+
+    Args:
+        measurement: what `parsed` returned.
+        most: number of blocks and of tasks that its file has room for.
 
     Raises:
         ValueError: for a missing field, one of another type, and a number that tables have no room for.
@@ -85,3 +89,13 @@ def check(measurement: Mapping[str, Any]) -> None:
         (not missing, f"{', '.join(missing)} must be there"),
         (is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
     )
+    highest = max(_numbers(measurement), default=0)
+    rule = f"block or task {highest:,} is beyond what a file of its size can measure, {most:,}: restore the log"
+    require((highest <= most, rule))
+
+
+def _numbers(measurement: Mapping[str, Any]) -> Iterator[int]:
+    """Yield the numbers of blocks and tasks."""
+    yield from (measurement[name] for name in ("block", "task") if name in measurement)
+    for block in measurement.get("trained", ()):
+        yield from block

@@ -34,13 +34,22 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import cannot_write, open_own, write_whole
+from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable
 
 MOST_CELLS = 10**7
 """Largest table that is made of a log."""
+
+MOST_BYTES = 2**30
+"""Largest log that is read: 1 GiB."""
+
+FEW, BYTES_OF_A_NUMBER = 1000, 4
+"""Blocks and tasks that a log of any size may have, and bytes of its file for each more."""
+
+FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
+"""Cells that a table of a log of any size may have, and more for each byte of its file."""
 
 SCHEMA = 1
 """Raised when a line means something else than before; fields may be added without."""
@@ -61,6 +70,7 @@ class RunLog:
     def __init__(self, path: Path | str | None = None) -> None:
         self.measurements: list[dict[str, Any]] = []
         self.torn_lines = 0
+        self._num_bytes = MOST_BYTES  # of the file that was read
         self.listeners: list[Callable[[dict[str, Any]], object]] = []
         self._start = time.perf_counter()
         self._path = None if path is None else Path(path)
@@ -82,7 +92,7 @@ class RunLog:
             file.truncate(size)
         log = cls.read(path)
         require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
-        log._path, log._file = path, open_own(path, "ab")
+        log._path, log._file, log._num_bytes = path, open_own(path, "ab"), MOST_BYTES
         log._start -= position["seconds"]
         return log
 
@@ -125,10 +135,13 @@ class RunLog:
         A last line that was torn when the run was killed is left out and counted in ``torn_lines``.
 
         Raises:
-            ValueError: for any other line that is no measurement, and for a newer schema.
+            ValueError: for any other line that is no measurement, for a newer schema, for what is no regular file of at
+                most `MOST_BYTES`, and for numbers of blocks and tasks that a file of its size cannot measure.
         """
         log = cls()
-        lines = Path(path).read_bytes().splitlines()
+        content = read_regular(path, MOST_BYTES)
+        lines, log._num_bytes = content.splitlines(), len(content)
+        most = FEW + len(content) // BYTES_OF_A_NUMBER
         for number, line in enumerate(lines, 1):
             try:
                 log.measurements.append(parsed(line))
@@ -137,7 +150,7 @@ class RunLog:
                 log.torn_lines = 1
         for number, measurement in enumerate(log.measurements, 1):
             try:
-                check(measurement)
+                check(measurement, most)
             except ValueError as error:
                 raise ValueError(f"{path}: line {number}: {error}") from None
         for run in log.of_kind("run"):
@@ -280,7 +293,8 @@ class RunLog:
         tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
         rows = list(rows)
         size = len(rows) * len(tasks)
-        require((size <= MOST_CELLS, f"a table of {len(rows):,} x {len(tasks):,} is no run's: restore the log"))
+        most = min(MOST_CELLS, FEW_CELLS + CELLS_OF_A_BYTE * self._num_bytes)
+        require((size <= most, f"a table of {len(rows):,} x {len(tasks):,} is no run's: restore the log"))
         return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
 
 

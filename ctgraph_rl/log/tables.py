@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log.escape import csv_text, utf8_text
 from ctgraph_rl.log.run_log import RunLog
@@ -58,6 +59,9 @@ TRAINING = {
 }
 """Columns of ``training``: type and meaning; what the agent reports follows, each a double."""
 
+MOST_COLUMNS = 256
+"""Of a table: every line of a log might name others."""
+
 TABLES = {"evaluation": ("evaluations", EVALUATIONS), "training": ("training", TRAINING)}
 
 
@@ -91,6 +95,7 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
 def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[str, str]:
     """Type of each column; what else the log has follows as numbers, in the order of first appearance."""
     names = dict.fromkeys(name for measurement in log.of_kind(kind) for name in measurement)
+    require((len(names) <= MOST_COLUMNS, f"a table of {len(names):,} columns, the limit is {MOST_COLUMNS}"))
     extra = {name: "double" for name in names if name != "kind" and name not in columns}
     return {name: type_ for name, (type_, _) in columns.items()} | extra
 

@@ -22,6 +22,7 @@ import torch
 
 from ctgraph_rl.checks import is_int
 from ctgraph_rl.disk import PART, made_folder, require_no_link, write_whole
+from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
@@ -154,8 +155,11 @@ def decoded(path: Path) -> State:
     Raises:
         BrokenCheckpoint: if it is torn, changed, of another format, or holds more than tensors and plain values.
     """
-    head, _, content = path.read_bytes().partition(b"\n")
     advice = "delete it to resume from the one before"
+    try:
+        head, _, content = content_of(path).partition(b"\n")
+    except ValueError as error:
+        raise BrokenCheckpoint(f"{error}; {advice}") from None
     try:
         header = json.loads(head)
         version, expected = header["format"], (header["bytes"], header["sha256"])
@@ -172,18 +176,6 @@ def decoded(path: Path) -> State:
     if not (isinstance(state, dict) and is_int(state.get("frames"), 0)):
         raise BrokenCheckpoint(f"{path} does not say after how many frames it was made; {advice}")
     return state
-
-
-def read_plain(content: bytes) -> Any:
-    """Read what `torch.save` made of tensors and plain values, on the CPU; nothing else is built, and no code runs.
-
-    Raises:
-        ValueError: for anything else.
-    """
-    try:
-        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except Exception as error:  # what a pickle that others made may raise is without end
-        raise ValueError("holds more than tensors and plain values, or is torn") from error
 
 
 def _require_plain(checkpoint: bytes) -> None:

@@ -18,8 +18,9 @@ from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.saved import content_of, read_plain, require_records
 from ctgraph_rl.packages import class_named
-from ctgraph_rl.runs.checkpoints import Checkpoints, read_plain
+from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -145,8 +146,9 @@ def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
 
 def _checked(path: Path) -> Any:
     """Return what a file of `torch.save` holds, if its own sums agree and it is plain."""
-    content = path.read_bytes()
     try:
+        content = content_of(path)
+        require_records(content)
         with zipfile.ZipFile(io.BytesIO(content)) as records:
             changed = records.testzip()
         require((changed is None, f"{changed} in it is not what was written"))

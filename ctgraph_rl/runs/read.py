@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, is_real, require
-from ctgraph_rl.log.files import FAILURE, LOG, METRICS, no_run
+from ctgraph_rl.disk import read_regular, read_text
+from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.log.run_log import SCHEMA, RunLog
+from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
 
@@ -171,8 +172,7 @@ def read_run(path: Path) -> Run:
 
 def _about(file: Path) -> dict[str, Any]:
     """Return the first line of a log, which says what was run."""
-    with file.open("rb") as lines:
-        first = lines.readline()
+    first, _, _ = read_regular(file, MOST_BYTES).partition(b"\n")
     try:
         about = parsed(first)
         check(about)
@@ -212,7 +212,7 @@ def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
         torn = ", with a torn last line" if log.torn_lines else ""
         return {}, f"{_failure(path) or 'unfinished'}{torn}"
     try:
-        metrics = json.loads(file.read_text(encoding="utf-8"))
+        metrics = json.loads(read_regular(file, MOST_BYTES_OF_METRICS))
     except (OSError, ValueError, RecursionError) as error:
         return {}, f"{file} cannot be read: {error}"
     ours = isinstance(metrics, dict) and metrics and all(_is_metric(metric) for metric in metrics.values())
@@ -222,9 +222,11 @@ def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
 def _failure(path: Path) -> str | None:
     """Why a run failed, as it says itself."""
     try:
-        return "failed: " + " ".join((path / FAILURE).read_text(encoding="utf-8", errors="replace").split())
-    except OSError:
+        return "failed: " + " ".join(read_text(path / FAILURE, MOST_BYTES_OF_A_REASON).split())
+    except FileNotFoundError:
         return None
+    except (OSError, ValueError) as error:
+        return f"failed: {error}"
 
 
 def _is_metric(metric: Any) -> bool:

@@ -17,8 +17,9 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from ctgraph_rl.disk import read_text
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS
+from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 
 DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
 
@@ -76,15 +77,22 @@ def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None)
     if error is not None:
         return Status(FAILED, error)
     if now.failure not in (None, before.failure):
-        return Status(FAILED, (folder / FAILURE).read_text(encoding="utf-8", errors="replace"))
+        return Status(FAILED, _failure(folder))
     return Status(MISSING, "stopped; the next start resumes it" if (folder / LOG).exists() else "not begun")
+
+
+def _failure(folder: Path) -> str:
+    try:
+        return read_text(folder / FAILURE, MOST_BYTES_OF_A_REASON)
+    except (OSError, ValueError) as error:
+        return str(error)
 
 
 def lock_holder(folder: Path) -> str | None:
     """Return which process has locked a run directory; None for none, or one of this machine that has ended."""
     try:
-        holder = (folder / LOCK).read_text(encoding="utf-8")
-    except OSError:
+        holder = read_text(folder / LOCK, MOST_BYTES_OF_A_REASON)
+    except (OSError, ValueError):
         return None
     _, number, _, host, *_ = [*holder.split(), *[""] * 4]
     if host == socket.gethostname():
@@ -92,7 +100,7 @@ def lock_holder(folder: Path) -> str | None:
             os.kill(int(number), 0)
         except ProcessLookupError:
             return None
-        except PermissionError:  # another user's
+        except (PermissionError, ValueError, OverflowError):  # another user's, or no number
             pass
     return holder or "another process"
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.disk import append_line, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
@@ -27,7 +27,6 @@ from ctgraph_rl.runs.checkpoints import Checkpoints, State
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.progress import ProgressBar
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.memory import require_memory
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent for an environment's unbatched observation and action specs."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -24,7 +25,7 @@ from ctgraph_rl import __version__
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
@@ -149,11 +150,9 @@ def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, M
     is_path = isinstance(path_or_dict, (str, PathLike))
     require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
     try:
-        with open(path_or_dict, "rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        data = read_regular(path_or_dict, MAX_BYTES)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
-    require((len(data) <= MAX_BYTES, f"{path_or_dict} has more than {MAX_BYTES:,} bytes, the limit for a curriculum"))
     with _within(str(path_or_dict)):
         return str(path_or_dict), _parse(data)
 
@@ -171,10 +170,11 @@ def _parse(data: bytes) -> Mapping[str, Any]:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = [key for key, _ in pairs]
-    repeated = sorted({key for key in keys if keys.count(key) > 1}) if len(set(keys)) < len(keys) else []
-    require((not repeated, f"key {repeated[:1]} occurs twice in one object"))
-    return dict(pairs)
+    known = dict(pairs)
+    if len(known) < len(pairs):
+        [(repeated, _)] = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"key {[repeated]!r:.80} occurs twice in one object")
+    return known
 
 
 def _check_form(value: Any, nesting: int = 1) -> None:
@@ -196,8 +196,9 @@ def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()
     """Refuse anything but an object with exactly these keys."""
     require((isinstance(content, Mapping), f"must be an object with {', '.join(names)}, got {content!r:.80}"))
     missing = [name for name in names if name not in content]
-    unknown = [str(name) for name in content if name not in (*names, *optional)]
-    close = [f" (did you mean {near!r}?)" for name in unknown[:1] for near in get_close_matches(name, names, 1)]
+    known = {*names, *optional}
+    unknown = [str(name) for name in content if name not in known]
+    close = [f" (did you mean {near!r}?)" for name in unknown[:1] for near in get_close_matches(name[:80], names, 1)]
     require(
         (not missing, f"missing keys: {', '.join(missing)}"),
         (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{''.join(close)}"),

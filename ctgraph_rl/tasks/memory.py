@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable
 
 from torch import Tensor
 
-from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.images import ImageSet
 from ctgraph_rl.tasks.task import Task
 
@@ -37,20 +35,3 @@ def bank_bytes(tasks: Iterable[Task]) -> int:
     sets = {bank_key(task): math.prod(task.images.shape) for task in tasks}
     shown = sum(images.num_images * images.num_variants * (rotation + 1) for images, rotation in sets)
     return shown * max(sets.values())
-
-
-def require_memory(what: str, needed: int, fewer: str) -> None:
-    """Refuse what cannot be held, before anything is allocated; POSIX systems only.
-
-    Args:
-        what: needs memory.
-        needed: bytes at least.
-        fewer: of what to use fewer.
-
-    Raises:
-        ValueError: if the machine has less memory.
-    """
-    if not hasattr(os, "sysconf"):
-        return
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    require((needed < memory, f"{what} need {needed:,} bytes, this machine has {memory:,}; use fewer {fewer}"))

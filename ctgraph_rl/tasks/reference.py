@@ -11,13 +11,12 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from os import PathLike
 from os.path import lexists
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
@@ -58,6 +57,9 @@ _KEYS: dict[str, tuple[str, str | None, str | None, str | None]] = {  # section,
 }
 """The dialects: what a key means here, and how each dialect calls it; None where it has no such key."""
 
+MAX_BYTES = 2**20
+"""Largest file that is read: 1 MiB; one has 2 kB."""
+
 _SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
 
 _DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
@@ -88,9 +90,11 @@ def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, M
     is_path = isinstance(path_or_dict, (str, PathLike))
     require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
     try:
-        content = json.loads(Path(path_or_dict).read_bytes())
-    except OSError as error:
+        data = read_regular(path_or_dict, MAX_BYTES)
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
+    try:
+        content = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
     require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))

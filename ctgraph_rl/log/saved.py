@@ -1,0 +1,115 @@
+"""What `torch.save` wrote, of tensors and plain values, read without running code or taking more than its size."""
+
+from __future__ import annotations
+
+import io
+import pickletools
+import re
+import struct
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ctgraph_rl.checks import memory_bytes, require
+from ctgraph_rl.disk import read_regular
+
+SHARE_OF_MEMORY = 4
+"""Files may have this part of the machine's memory: one is read, checked, made tensors and copied into an agent."""
+
+_GLOBALS = re.compile(
+    r"torch\._utils _rebuild_(tensor_v2|parameter|parameter_with_state)"
+    r"|torch \w+Storage|torch\.storage UntypedStorage|torch [a-z]\w*\d\w*|torch (bool|device|Size)"
+    r"|collections OrderedDict|_codecs encode|(__builtin__|builtins) (set|complex)"
+)
+"""What a pickle of tensors and plain values names; `torch.load` alone also lets it make arrays of any size."""
+
+_FOLLOWS = {"_codecs encode": "BINUNICODE", "collections OrderedDict": "EMPTY_TUPLE"}
+"""What these are called with, so that no result is made larger again and again."""
+
+
+def content_of(path: Path) -> bytes:
+    """Return the content of a regular file that fits this machine.
+
+    Raises:
+        ValueError: for a larger file, and what is no regular file.
+        OSError: if it cannot be read.
+    """
+    return read_regular(path, memory_bytes() // SHARE_OF_MEMORY)
+
+
+def read_plain(content: bytes) -> Any:
+    """Read what `torch.save` made of tensors and plain values, on the CPU; nothing else is built, and no code runs.
+
+    Raises:
+        ValueError: for anything else, and for what would take more memory than a few times its size.
+    """
+    require_records(content)
+    try:
+        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # what a pickle that others made may raise is without end
+        raise ValueError("holds more than tensors and plain values, or is torn") from error
+
+
+def require_records(content: bytes) -> None:
+    """Refuse records that would take more than they have in the file, before any is read.
+
+    Raises:
+        ValueError: for what is no archive as `torch.save` writes it: one that ends with the list of its records, which
+            are not compressed and do not overlap; and for a pickle that names other than tensors and plain values.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as records:
+            listed = records.infolist()
+            _check_sizes(content, listed)
+            pickles = [records.read(record) for record in listed if record.filename.endswith("/data.pkl")]
+        require((len(pickles) == 1, "holds more than tensors and plain values, or is torn"))
+        names = list(_names(pickles[0]))
+    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, struct.error) as error:
+        raise ValueError("holds more than tensors and plain values, or is torn") from error
+    other = [name for name, follows in names if not _GLOBALS.fullmatch(name) or follows != _FOLLOWS.get(name, follows)]
+    require((not other, f"holds more than tensors and plain values: {', '.join(other[:3])!r:.80}"))
+
+
+def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
+    """Refuse compressed and overlapping records, and a second list of records that another reader could take."""
+    end = len(content) - 22
+    large = content[end - 20 : end - 16] == b"PK\x06\x07"
+    one_list = (
+        content[end : end + 4] == b"PK\x05\x06"
+        and content[-2:] == b"\0\0"
+        and (not large or struct.unpack_from("<Q", content, end - 12)[0] == end - 76)
+        and min((record.header_offset for record in records), default=0) == 0
+    )
+    stored = all(record.compress_type == zipfile.ZIP_STORED for record in records)
+    total = sum(max(record.file_size, record.compress_size) for record in records)
+    require(
+        (one_list, "is no archive of torch.save, whose records begin at its start and are listed at its end"),
+        (stored, "has compressed records, which torch.save does not write"),
+        (total <= len(content), f"says that its records have {total:,} bytes, and has {len(content):,}"),
+    )
+
+
+def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
+    """Yield what a pickle names, each with the kind of what follows."""
+    known: dict[Any, str] = {}
+    name, last = "", ""
+    for operation, argument, _ in pickletools.genops(pickled):
+        if "PUT" in operation.name:
+            known[argument] = last
+            continue
+        if name:
+            yield name, operation.name
+        name = _named(operation.name, argument, known)
+        last = name
+
+
+def _named(operation: str, argument: Any, known: dict[Any, str]) -> str:
+    """Return the name that an operation puts on the stack; empty for a plain value."""
+    if operation == "GLOBAL":
+        return argument
+    if operation in ("STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4", "OBJ", "MEMOIZE"):
+        return operation  # which torch.save does not write
+    return known.get(argument, "") if "GET" in operation else ""
