@@ -144,12 +144,12 @@ def append_line(path: Path, value: object) -> None:
         file.write(json.dumps(value).encode() + b"\n")
 
 
-def read_text(path: Path | str, most: int) -> str:
+def read_text(path: str | os.PathLike[str], most: int) -> str:
     """Return `read_regular` as text, with a mark for what is not UTF-8."""
     return read_regular(path, most).decode("utf-8", "replace")
 
 
-def read_regular(path: Path | str, most: int) -> bytes:
+def read_regular(path: str | os.PathLike[str], most: int) -> bytes:
     """Return the content of a regular file, which is not opened where it is a pipe or a device.
 
     Args:

@@ -1,10 +1,11 @@
 """Curricula from the JSON files of the labs: a list of environments, and which of their goals in which order.
 
 The labs' wrappers number all goals of all environments and choose by number. ``config_paths`` names the environment
-files, in its folder and relative to it; ``task_order`` puts their goals one environment after the other (``default``) or in
-turns (``interleaved``); ``filter_tasks`` chooses from that list, in its own order, repeats allowed; ``num_tasks`` cuts
-what is chosen. The one-hot label of a task has length ``label_dim`` and is its number in the whole list, or, by
-``task_label_mode``, its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says (``explicit``).
+files, relative to the folder of the file and within it; ``task_order`` puts their goals one environment after the other
+(``default``) or in turns (``interleaved``); ``filter_tasks`` chooses from that list, in its own order, repeats allowed;
+``num_tasks`` cuts what is chosen. The one-hot label of a task has length ``label_dim`` and is its number in the whole
+list, or, by ``task_label_mode``, its place in the curriculum (``curriculum_index``) or what ``task_label_ids`` says
+(``explicit``).
 """
 
 from __future__ import annotations

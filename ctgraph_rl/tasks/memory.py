@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 from torch import Tensor
 
+from ctgraph_rl.checks import require_memory
 from ctgraph_rl.tasks.images import ImageSet
 from ctgraph_rl.tasks.task import Task
 
@@ -27,6 +28,8 @@ def bank_key(task: Task) -> BankKey:
 def make_bank(key: BankKey) -> Tensor:
     """Return all images of a key, uint8 [rows, *shape]; see `ImageSet.bank`."""
     images, rotation = key
+    size = math.prod(images.shape) * images.num_images * images.num_variants * (rotation + 1)
+    require_memory(f"{images.num_images:,} images while they are made", 2 * size, "images")
     return images.bank(rotation)
 
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require, require_memory
 from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
 from ctgraph_rl.core.rotation import rotate
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
@@ -21,6 +21,11 @@ BLUEPRINT_ANGLES = (0, 30, 60)
 
 UNRELATED = (WHITE + 2) / (3 * (WHITE + 1))
 """256/765: the expected distance of two images whose cells are independent and uniform over 0..254."""
+
+_ROTATED_AT_ONCE = 4096
+
+_BYTES_OF_A_PIXEL, _BYTES_OF_A_BLUEPRINT, _BYTES_OF_A_CELL = 8, 800, 64
+"""Memory that making images takes for each candidate's pixels and blueprint, and for each cell of grouped images."""
 
 _GROUPED_BLOCK = 1 << 27  # the upper half of the image stream's blocks; `PaperImages` uses block 0
 
@@ -144,6 +149,8 @@ def _paper_images(image_set: PaperImages) -> Tensor:
     """The first different images of the seed's sequence of candidates."""
     candidates, images = image_set.num_images, torch.empty(0)
     while len(images) < image_set.num_images:
+        needed = candidates * (_BYTES_OF_A_PIXEL * image_set.size**2 + _BYTES_OF_A_BLUEPRINT)
+        require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
         rendered = _render(_blueprints(image_set.seed, candidates), image_set.size)
         images = rendered[first_of_each(rendered)]
         candidates *= 2
@@ -163,7 +170,8 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
     images = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), size)
     for which, angle in enumerate(BLUEPRINT_ANGLES):
         chosen = blueprints[:, -1] == which
-        images[chosen] = rotate(images[chosen], angle)
+        parts = images[chosen].split(_ROTATED_AT_ONCE)
+        images[chosen] = torch.cat([rotate(part, angle) for part in parts])
     return images
 
 
@@ -173,6 +181,8 @@ def _grouped_images(image_set: GroupedImages) -> Tensor:
     groups, cells = image_set.groups, image_set.cells
     candidates, chosen = max(groups), [torch.empty(0)]
     while any(len(positions) < size for positions, size in zip(chosen, groups, strict=False)):
+        needed = candidates * len(groups) * cells**2 * _BYTES_OF_A_CELL
+        require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
         images = _candidates(image_set, candidates).flatten(0, 1)
         first = first_of_each(images)
         chosen = [first[first % len(groups) == group] for group in range(len(groups))]

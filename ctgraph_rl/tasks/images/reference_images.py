@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import is_int, is_real, require, require_memory
 from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
 
@@ -22,6 +22,11 @@ _ANGLES = 359
 """Image sets are rotated by 0..358 degrees."""
 
 _PIXELS_PER_CELL = 3
+
+_ROTATED_AT_ONCE = 256
+
+_BYTES_OF_A_PIXEL = 12
+"""Memory that making images takes."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +70,13 @@ class ReferenceImages(SquareImages):
 
     def bank(self, read_rotation: int) -> Tensor:
         """See `ImageSet`; rotated on read as the authors' implementation does it, pixel by pixel."""
-        upright = self.images.numpy().astype(np.float64)
-        views = [_rotate(upright, angle).astype(np.uint8) for angle in range(read_rotation + 1)]
-        return torch.from_numpy(np.stack(views, axis=1)).flatten(0, 1).unsqueeze(1)
+        views = np.empty((self.num_images, read_rotation + 1, 1, self.size, self.size), dtype=np.uint8)
+        images = self.images.numpy()
+        for first in range(0, self.num_images, _ROTATED_AT_ONCE):
+            part = images[first : first + _ROTATED_AT_ONCE].astype(np.float64)
+            for angle in range(read_rotation + 1):
+                views[first : first + len(part), angle, 0] = _rotate(part, angle)  # cut off to whole levels
+        return torch.from_numpy(views).flatten(0, 1)
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,8 @@ def _num_images_rule(value: object) -> tuple[bool, str]:
 @lru_cache(maxsize=16)
 def _reference_images(image_set: ReferenceImages) -> Tensor:
     """The images of a set, uint8 [num_images, r, r]."""
+    needed = image_set.num_images * image_set.size**2 * _BYTES_OF_A_PIXEL
+    require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
     blueprints, angles = _blueprints(image_set.seed, image_set.num_images)
     cells = blueprints * ((WHITE - image_set.noise) / 2)
     upright = cells.repeat(_PIXELS_PER_CELL, axis=1).repeat(_PIXELS_PER_CELL, axis=2)
