@@ -163,7 +163,7 @@ def read_regular(path: str | os.PathLike[str], most: int) -> bytes:
     with open(path, "rb", opener=_opener(os.O_NONBLOCK)) as file:
         found = os.fstat(file.fileno())
         require((stat.S_ISREG(found.st_mode), f"{path} must be a regular file"))
-        content = file.read(most + 1) if found.st_size <= most else b""
+        content = file.read(found.st_size + 1) if found.st_size <= most else b""
     size = max(found.st_size, len(content))
     require((size <= most, f"{path} has {size:,} bytes, the limit is {most:,}"))
     return content
