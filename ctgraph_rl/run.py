@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.packages import check_packages, conf_dir
+from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, sweepable
 
 
@@ -63,6 +64,8 @@ def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     try:
         check_one_cell()
+        if cfg.portable is True and not in_sweep():
+            become_portable()
         with redirect_stdout(io.StringIO()) if in_sweep() else nullcontext():
             run(cfg, run_dir)
     except BaseException as error:
@@ -75,6 +78,7 @@ def _job(cfg: DictConfig) -> None:
 
 def main() -> None:
     """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
+    environment = dict(os.environ)
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
     sys.argv[1:] = sweepable(sys.argv[1:])
@@ -86,6 +90,8 @@ def main() -> None:
             raise
         print(f"error: {terminal_lines(explain(error))}", file=sys.stderr)
         sys.exit(1)
+    except Restart:
+        restart(environment)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)
         sys.exit(130)

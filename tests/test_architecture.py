@@ -21,7 +21,7 @@ from ctgraph_rl.core import rewards
 FLOORS = (
     ("ctgraph_rl", "checks", "metrics"),
     ("disk",),
-    ("core",),
+    ("core", "portable"),
     ("tasks",),
     ("packages", "batch", "agent", "curricula"),
     ("env", "gym", "log"),

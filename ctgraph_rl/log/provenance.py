@@ -13,6 +13,7 @@ import torchrl
 from ctgraph_rl import __version__
 from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.packages import is_published
+from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 NUMBERS = 1
@@ -50,10 +51,15 @@ def provenance(curriculum: Curriculum) -> dict[str, Any]:
         "versions": versions(),
         "numbers": NUMBERS,
         **machine(),
+        "cpu": cpu_model(),
     }
 
 
 def machine() -> dict[str, Any]:
-    """Return what besides versions decides the bits of a run on a CPU: its kind and the number of threads."""
-    kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    """Return what besides versions decides the bits of a run on a CPU: its kind and the number of threads.
+
+    The kind is such as ``x86_64 AVX512``, or ``x86_64 portable`` for any CPU of `ctgraph_rl.portable`.
+    """
+    instructions = "portable" if is_portable() else torch.backends.cpu.get_cpu_capability()
+    kind = f"{platform.machine()} {instructions}"
     return {"machine": kind, "num_threads": torch.get_num_threads()}

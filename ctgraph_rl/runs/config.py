@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ctgraph_rl.checks import is_int, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
+from ctgraph_rl.portable import check_portable
 from ctgraph_rl.runs.settings import digest, parameters_of
 
 if TYPE_CHECKING:
@@ -95,12 +96,19 @@ def check_values(cfg: DictConfig) -> None:
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
-    for switch in ("overwrite", "experts", "report"):
+    for switch in ("overwrite", "experts", "report", "portable"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     require(
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
+    if cfg.portable:
+        check_portable()
+        compiled = "portable=true needs agent.compile=false: compiled code is made for the CPU of this machine"
+        require(
+            (cfg.device == "cpu", f"portable=true needs device=cpu, got {cfg.device}: bits depend on the kind of GPU"),
+            (not cfg.agent.get("compile"), compiled),
+        )
 
 
 def changes_of(cfg: DictConfig, part: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import versions
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Expert, expert_curriculum, find_or_train
@@ -32,7 +33,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
 
-OF_AN_EXPERT = ("agent", "seed", "device", "num_threads")
+OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
 """Settings that a single-task expert shares with the run that needs it."""
 
 
@@ -64,6 +65,8 @@ class Job:
             ValueError: for values out of range, and parts that do not go together.
         """
         device = checked_device(cfg.device)
+        if cfg.portable:
+            hold()
         torch.set_num_threads(cfg.num_threads)
         torch.set_flush_denormal(True)
         make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")

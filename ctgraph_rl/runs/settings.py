@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from inspect import Parameter, signature
 from typing import Any
 
-ADDED: dict[str, dict[str, Any]] = {}
+ADDED: dict[str, dict[str, Any]] = {"run": {"portable": False}}
 """Settings that were added after runs had been stored, each with the value for "as before".
 
 They are listed by the ``_target_`` that takes them, as ``{"baselines.rl2.RL2": {"cell": "lstm"}}``; those of no target

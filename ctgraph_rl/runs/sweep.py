@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.portable import become_portable
 from ctgraph_rl.runs.config import save_yaml
 from ctgraph_rl.runs.status import DONE, NOTHING, SHOWN, Outcome, SweepProgress, report, status_of
 
@@ -66,6 +67,8 @@ class Sweeper(Base):
             SystemExit: with code 1 if some are not done.
         """
         assert self.config is not None
+        if self.config.portable is True:
+            become_portable()  # processes that a launcher starts have its variables
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
         [batch] = self.split_arguments(overrides, None)
         cells = self.cells(batch)

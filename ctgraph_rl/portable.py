@@ -1,0 +1,123 @@
+"""Portable runs: the same bits on every x86-64 CPU with AVX2, by variables that PyTorch reads when it is imported.
+
+PyTorch, MKL and oneDNN choose their code by the CPU. Code for other instruction sets adds in another order and rounds
+differently, and a run amplifies that. Held to the code that all these CPUs have, a run depends on none of them.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from ctgraph_rl.checks import require
+
+VARIABLES = {
+    "ATEN_CPU_CAPABILITY": "avx2",  # PyTorch's own loops; its random numbers too
+    "MKL_CBWR": "COMPATIBLE",  # products of matrices: MKL's only code with the same bits on Intel's and AMD's CPUs
+    "ONEDNN_MAX_CPU_ISA": "AVX2",  # convolutions
+}
+"""Environment variables that a portable process has when it imports torch."""
+
+NEEDED = ("avx2", "fma")
+"""Instructions that a portable run needs; libm takes those of FMA, too."""
+
+
+class Restart(BaseException):
+    """The command must start again; no error, so that nothing between it and the entry point handles it."""
+
+
+_HELD: list[Any] = []
+"""What `hold` registered with PyTorch, which ends with these objects."""
+
+
+def is_portable() -> bool:
+    """Return whether PyTorch was held to portable code by `hold`."""
+    return bool(_HELD)
+
+
+def hold() -> None:
+    """Hold PyTorch to portable code, for as long as this process lasts, beyond what `VARIABLES` do.
+
+    oneDNN's LSTM has other bits on Intel's and AMD's CPUs, so PyTorch's own is taken. MKL's square root starts from the
+    approximation of the CPU and is not rounded correctly; NumPy's is.
+
+    Raises:
+        ValueError: see `check_portable`.
+    """
+    check_portable()
+    if _HELD:
+        return
+    import torch  # here: a command asks before torch is imported
+
+    torch.backends.mkldnn.set_flags(False)
+    functions = torch.library.Library("aten", "IMPL")
+
+    def sqrt(x: Any) -> Any:
+        dtype = x.dtype if x.is_floating_point() else torch.get_default_dtype()
+        exact = np.sqrt(np.asarray(x.detach().double() if dtype != torch.float32 else x.detach().float()))
+        return torch.from_numpy(np.asarray(exact)).to(dtype)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that PyTorch's own function is replaced
+        functions.impl("sqrt", sqrt, "CPU")
+        functions.impl("sqrt_", lambda x: x.copy_(sqrt(x)), "CPU")
+    _HELD.append(functions)
+
+
+def check_portable() -> None:
+    """Refuse a portable run in a process that is not portable.
+
+    Raises:
+        ValueError: for a CPU that lacks instructions, and for variables that are not set; names them.
+    """
+    lacking, variables = _lacking(), " ".join(f"{name}={value}" for name, value in VARIABLES.items())
+    require((not lacking, f"portable=true needs an x86-64 CPU with AVX2 and FMA, this one lacks {', '.join(lacking)}"))
+    require((_has_variables(), f"portable=true needs these variables before torch is imported: {variables}; set them"))
+
+
+def become_portable() -> None:
+    """Ask for a restart of the command with `VARIABLES`, unless this process is portable.
+
+    Raises:
+        Restart: which the command's entry point takes to `restart`.
+        ValueError: see `check_portable`; once torch is imported it is too late for a restart.
+    """
+    if "torch" not in sys.modules and not _has_variables() and not _lacking():
+        raise Restart
+    check_portable()
+
+
+def restart(environment: Mapping[str, str]) -> NoReturn:
+    """Start the command of this process again, in the same process, with `VARIABLES` in its environment."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**environment, **VARIABLES})
+
+
+def cpu_model() -> str | None:
+    """Return the name of the CPU's model; None where the system does not say it."""
+    return _of_cpu("model name") or platform.processor() or None
+
+
+def _has_variables() -> bool:
+    return all(os.environ.get(name) == value for name, value in VARIABLES.items())
+
+
+def _lacking() -> list[str]:
+    """Return which of `NEEDED` this machine lacks."""
+    there = _of_cpu("flags").split() if platform.machine() in ("x86_64", "AMD64") else []
+    return [name for name in NEEDED if name not in there]
+
+
+def _of_cpu(field: str) -> str:
+    """Return a field of the first processor in Linux's list; empty where there is none."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.split(":")[0].strip() == field), "")
