@@ -23,11 +23,13 @@ class BoundsOfRuns:
         returns: of each task by its label.
         known: what the metrics' bounds follow from.
         noisy: whether rewards have noise, so that what is measured may be outside of what bounds its mean.
+        one_episode: whether all episodes of an evaluation are one: greedy ones of tasks without chance.
     """
 
     returns: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     known: Known = NOTHING_KNOWN
     noisy: bool = False
+    one_episode: bool = False
 
     @property
     def of_returns(self) -> Bounds:
@@ -73,7 +75,9 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
             curves = run.history.evaluations.values()
             evaluations = max((sum(frames > 0 for frames, _ in curve) for curve in curves), default=1)
             known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
-            return BoundsOfRuns(returns, known, any(task.reward_std > 0 for task in curriculum.tasks))
+            noisy = any(task.reward_std > 0 for task in curriculum.tasks)
+            alike = curriculum.evaluation.greedy and all(task.is_deterministic for task in curriculum.tasks)
+            return BoundsOfRuns(returns, known, noisy=noisy, one_episode=alike)
     return NO_BOUNDS
 
 

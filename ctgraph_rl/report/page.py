@@ -142,7 +142,7 @@ def _title(parts: Sequence[Part]) -> str:
 def _part(section: Section, gallery: Gallery) -> Part:
     return Part(
         section,
-        facts=list(_facts(section)),
+        facts=list(facts(section)),
         figures=gallery.write((section.name,), (draw(section) for draw in OF_SECTION)),
         table=next(results.pages(results.selected(section.rows))),
         everything=next(results.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
@@ -153,7 +153,7 @@ def _part(section: Section, gallery: Gallery) -> Part:
     )
 
 
-def _facts(section: Section) -> Iterator[tuple[str, Any]]:
+def facts(section: Section) -> Iterator[tuple[str, Any]]:
     """Return the facts of the curriculum that was learned."""
     about = section.one.about
     yield "curriculum", about["curriculum"]
@@ -162,6 +162,8 @@ def _facts(section: Section) -> Iterator[tuple[str, Any]]:
     yield "tasks", len(section.labels)
     yield "blocks", len(section.trained)
     yield "frames", f"{section.ends[-1]:,}"
+    if section.results[0].bounds.one_episode:
+        yield "a sample", "a seed: the episodes of an evaluation are one, greedy and of tasks without chance"
     for group in ("curriculum", "evaluation", "protocol"):
         given = about["config"].get(group)
         for key, value in flat(given if isinstance(given, Mapping) else {}, f"{group}."):

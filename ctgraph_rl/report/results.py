@@ -248,7 +248,7 @@ def _latex_line(line: Line) -> str:
 
 def latex_value(value: str) -> str:
     """A number and its interval with signs, or a dash for none."""
-    return "--" if value == "-" else value.replace("-", "$-$")
+    return "--" if value == "-" else value.replace("-", "$-$").replace("inf", r"$\infty$")
 
 
 def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:

@@ -169,3 +169,12 @@ def test_at_least_two_agents_solve_ct_fo_b2(make):
         )
     }
     assert len(solved) >= 2
+
+
+def test_where_nothing_is_left_to_chance_is_as_the_page_says(make):
+    goals = dict.fromkeys(SMALL, "1.1") | {"fo_b2": "1.1.1"}
+    without = {name for name, goal in goals.items() if make.task_of(name, goal).is_deterministic}
+
+    assert without == {"fo_b1", "su_b1"}
+    assert "On CT-FO-B1 and CT-SU-B1 nothing is left to chance" in make.PAGE.read_text(encoding="utf-8")
+    assert all(task.is_deterministic for task in curricula.load("su_b1_4tasks").tasks)

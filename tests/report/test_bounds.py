@@ -12,15 +12,17 @@ from torch import Tensor
 
 import curricula
 from ctgraph_rl import metrics
+from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Arrival, Gradient, ReferenceLinear
 from ctgraph_rl.metrics.bounds import Known
 from ctgraph_rl.metrics.record import METRICS
+from ctgraph_rl.report import page
 from ctgraph_rl.report.bounds import bounds_of
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import comparisons, table
 from ctgraph_rl.report.sections import sections
 from ctgraph_rl.report.statistics import mean
-from ctgraph_rl.tasks.configurations import ct_su_b1
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
 
 pytest.importorskip("scipy")
 NEEDLE = ct_su_b1()
@@ -112,6 +114,28 @@ def test_intervals_of_runs_stay_within_what_their_curriculum_allows(tmp_path):
     assert str(matrix[-1][0]) == str(line(rows, f"solved {section.labels[0]}").estimate) == "0.80 [0.28, 0.99] n = 5"
     assert str(matrix[1][0]) == "1.00 [0.48, 1.00] n = 5"  # all seeds agree
     assert changes[-1][0].high == pytest.approx(1 - 0.05**0.2)  # P(weight of +1 - weight of -1 > t) = (1 - t)**5 / 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "deterministic"),
+    [
+        ({}, True),
+        ({"graph": CTGraph(2, 2, 0.5)}, False),
+        ({"reward_std": 0.1}, False),
+        ({"goal_change": (1, 2)}, False),
+        ({"observations": replace(NEEDLE.observations, read_noise=3)}, False),
+        ({"observations": ct_co_b1().observations, "images": ct_co_b1().images}, False),
+    ],
+)
+def test_a_task_is_deterministic_where_actions_alone_decide(changes, deterministic):
+    assert replace(NEEDLE, **changes).is_deterministic == deterministic
+
+
+def test_a_report_says_that_episodes_of_a_greedy_policy_without_chance_are_one(tmp_path):
+    (section,) = sections(of_known_curriculum(tmp_path, (0.0, 1.0)))
+
+    facts = dict(page.facts(section))
+    assert facts["a sample"].startswith("a seed: the episodes of an evaluation are one, greedy")
 
 
 def test_of_another_curriculum_than_the_run_learned_nothing_is_known(tmp_path):
