@@ -110,7 +110,14 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     again = make.read("reruns")
     changed = [line for line in again if (line["table"], line["agent"]) == ("depth_ladder", make.OLDER)]
 
-    assert {line["table"] for line in again} >= {"main_job", *make.AGENTS, "masks_ct8", "masks_ct12", "methods"}
+    assert {line["table"] for line in again} >= {
+        "main_job",
+        *make.AGENTS,
+        "masks_ct8",
+        "masks_ct12",
+        "masks_ct8_md",
+        "methods",
+    }
     assert all(line["equal"] == line["numbers"] for line in again if line not in changed)
     assert {(line["numbers"], line["equal"]) for line in changed} == {("4", "2")}  # greedy return and success
 

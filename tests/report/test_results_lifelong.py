@@ -53,8 +53,11 @@ def test_numbers_of_a_run_are_those_by_hand(comparison):
     run = lines((0, 0, 1, 1), (1, 10, 0.5, 0), (1, 20, 1, 0.25), (2, 30, 0.5, 0.5), (2, 40, 0, 1))
     experts = lines((0, 0, 0, 0), (1, 10, 1, 0), (1, 20, 1, 0.5))
 
-    found = {**comparison.scores(run), **comparison.transfer(run, comparison.expert_areas([experts]))}
+    own, alone = comparison.areas([run])[0], comparison.expert_areas([experts])[0]
+    transfer = comparison.forward_transfer(own[1:], alone[1:]), comparison.gain(own, alone)
+    found = {**comparison.scores(run), **dict(zip(("forward transfer", "gain over experts"), transfer, strict=True))}
 
+    assert comparison.full([experts]) == [1]
     assert found == pytest.approx(
         {
             "average performance": 0.5,
@@ -72,14 +75,15 @@ def test_the_mean_forward_transfer_is_continual_worlds(comparison):
     """A ratio of means over seeds, whose experts need not be as many."""
     runs = [lines((1, 10, a, 0), (1, 20, 1, 0), (2, 30, 0, b), (2, 40, 0, 1)) for a, b in ((0.5, 0), (0, 0.25), (1, 1))]
     experts = [lines((1, 10, 0.5, 0.25), (1, 20, 0.75, 1)), lines((1, 10, 0, 0.5), (1, 20, 1, 0))]
-    alone = comparison.expert_areas(experts)
+    own, alone = comparison.areas(runs), comparison.expert_areas(experts)
 
-    found = [comparison.transfer(run, alone)["forward transfer"] for run in runs]
+    found = comparison.forward_transfer(own.mean(0), alone.mean(0))
 
     areas = torch.stack([metrics.stage_areas(comparison.curves(run)) for run in runs])
-    assert alone.tolist() == [(0.625 + 0.5) / 2, (0.625 + 0.25) / 2]
-    expected = metrics.continual_world_forward_transfer(areas, alone).value
-    assert sum(found) / 3 == pytest.approx(expected, abs=1e-12)
+    assert alone.mean(0).tolist() == [(0.625 + 0.5) / 2, (0.625 + 0.25) / 2]
+    expected = metrics.continual_world_forward_transfer(areas, torch.from_numpy(alone)).value
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert comparison.transfer(own, alone, [])["forward transfer"].startswith(f"{expected:.2f} ")
 
 
 def test_what_was_not_run_is_named_by_method_and_seed(comparison, monkeypatch):
