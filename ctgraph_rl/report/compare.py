@@ -1,0 +1,205 @@
+"""Whether two runs are equal, equal up to rounding, or different, since when, and what they differ in.
+
+``ctgraph-rl compare A B`` compares all measurements but their times, and the weights of the agents. The exit code is 0
+for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for what is no run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from ctgraph_rl.checks import is_real, positive, require
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import AGENT, LOG
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.checkpoints import read_plain
+from ctgraph_rl.runs.settings import ADDED, as_before, flat
+
+BOUND = 1e-4
+"""Largest difference that counts as rounding, as a share of the largest value that the field has in either run."""
+
+EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
+"""Exit codes."""
+
+PARTS = {
+    "curriculum": ("curriculum", "version", "fingerprint", "source", "tasks", "trained"),
+    "machine": ("machine", "num_threads", "cpu"),
+}
+"""Keys of a log's first line by what they say; all others, but for the settings, say what the code was."""
+
+Line = Mapping[str, Any]
+
+
+class Compared(NamedTuple):
+    """The result of a comparison: an exit code and the lines to print."""
+
+    code: int
+    lines: list[str]
+
+
+def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
+    """Compare two run directories, finished or not.
+
+    Args:
+        one: the first directory.
+        other: the second.
+        bound: see `BOUND`.
+
+    Raises:
+        ValueError: for a directory without a run, and a log that cannot be read.
+    """
+    logs = [_log(path) for path in (one, other)]
+    first = [log[0] for log in logs]
+    found = [list(map(_measured, log[1:])) for log in logs]
+    code, verdict = _verdict(found, bound)
+    weights = _weights(one, other)
+    if code == EQUAL and weights.startswith("different"):
+        code, verdict = DIFFERENT, "different: all measurements are equal, the agents' weights are not"
+    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first)])
+
+
+def _log(path: Path) -> list[dict[str, Any]]:
+    """Return the measurements of a run, of which the first says what was run."""
+    require(((path / LOG).is_file(), f"{path} holds no run: there is no {LOG}"))
+    log = RunLog.read(path / LOG).measurements
+    require((bool(log) and log[0]["kind"] == "run", f"{path / LOG} does not say what was run in its first line"))
+    return log
+
+
+def _measured(line: Line) -> dict[str, Any]:
+    """Return a measurement without its time, and without where the runs of experts are."""
+    kept = {key: value for key, value in line.items() if key != "seconds"}
+    if isinstance(kept.get("experts"), list):
+        kept["experts"] = [{k: v for k, v in dict(each).items() if k != "run"} for each in kept["experts"]]
+    return kept
+
+
+def _verdict(found: Sequence[Sequence[Line]], bound: float) -> tuple[int, str]:
+    """Return the exit code and a sentence about the measurements."""
+    pairs = list(zip(*found, strict=False))
+    unequal = next((number for number, pair in enumerate(pairs) if pair[0] != pair[1]), None)
+    lengths = [len(lines) for lines in found]
+    if unequal is None and lengths[0] == lengths[1]:
+        return EQUAL, f"equal: all {lengths[0]} measurements, bit for bit"
+    if unequal is None:
+        return DIFFERENT, f"different: equal as far as both go, {min(lengths)} of {lengths[0]} and {lengths[1]} lines"
+    scale = _scale(found)
+    beyond = next(
+        (i for i, pair in enumerate(pairs) if not all(_close(*p, bound, scale) for p in _fields(*pair))), None
+    )
+    since = f"{_where(pairs[unequal][0])}: {_changes(*pairs[unequal])}"
+    if beyond is None and lengths[0] == lengths[1]:
+        within = f"all measurements agree within {bound:g} of their field's largest value"
+        return ROUNDING, f"equal up to rounding: {within}; they diverge at {since}"
+    more = "" if beyond in (unequal, None) else f"; beyond rounding ({bound:g}) at {_where(pairs[beyond][0])}"
+    return DIFFERENT, f"different since {since}{more}"
+
+
+def _fields(one: Line, other: Line) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the fields of two lines with both values; None where a line lacks one."""
+    for key in {**one, **other}:
+        yield key, one.get(key), other.get(key)
+
+
+def _scale(found: Sequence[Sequence[Line]]) -> dict[str, float]:
+    """Return the largest size that the numbers of each field have in both runs."""
+    scale: dict[str, float] = {}
+    for line in (line for lines in found for line in lines):
+        for key, value in line.items():
+            if is_real(value):
+                scale[key] = max(scale.get(key, 0.0), abs(value))
+    return scale
+
+
+def _close(key: str, one: Any, other: Any, bound: float, scale: Mapping[str, float]) -> bool:
+    """Return whether two values are equal, or differ by no more than rounding; counts must be equal."""
+    are_floats = isinstance(one, float) and isinstance(other, float)
+    return one == other or (are_floats and abs(one - other) <= bound * scale[key])
+
+
+def _where(line: Line) -> str:
+    """Return which measurement a line is."""
+    label = f" of {line['label']}" if "label" in line else ""
+    block = f" in block {line['block']}" if "block" in line else ""
+    frames = f" after {line['frames']:,} frames" if is_real(line.get("frames")) else ""
+    return terminal_text(f"{line['kind']}{label}{block}{frames}")
+
+
+def _changes(one: Mapping[str, Any], other: Mapping[str, Any], most: int = 3) -> str:
+    """Return in words which values differ."""
+    pairs = [f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b]
+    more = f" and {len(pairs) - most} more" if len(pairs) > most else ""
+    return terminal_text(", ".join(pairs[:most]) + more)
+
+
+def _weights(one: Path, other: Path) -> str:
+    """Return how the weights of the agents compare."""
+    files = [path / AGENT for path in (one, other)]
+    missing = [str(file.parent) for file in files if not file.exists()]
+    if missing:
+        return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
+    states = [dict(flat(read_plain(file.read_bytes()))) for file in files]
+    if list(states[0]) != list(states[1]):
+        return "different: the agents have other parts"
+    pairs = {key: (states[0][key], states[1][key]) for key in states[0]}
+    unequal = [key for key, pair in pairs.items() if not _same(*pair)]
+    if not unequal:
+        return "equal, bit for bit"
+    shown = terminal_text(", ".join(unequal[:3]) + (f" and {len(unequal) - 3} more" if len(unequal) > 3 else ""))
+    return f"different in {len(unequal)} of {len(pairs)} parts: {shown}"
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two plain values are equal, tensors bit by bit."""
+    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
+        alike = (one.dtype, one.shape) == (other.dtype, other.shape)
+        return alike and torch.equal(_bits(one), _bits(other))
+    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        return len(one) == len(other) and all(map(_same, one, other))
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return list(one) == list(other) and all(_same(one[key], other[key]) for key in one)
+    return bool(one == other)
+
+
+def _bits(tensor: torch.Tensor) -> torch.Tensor:
+    """Return the bytes of a tensor."""
+    return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
+
+
+def _origins(one: Line, other: Line) -> list[str]:
+    """Return a line for what the runs were: settings, curriculum, code and machine."""
+    settings = [{**ADDED.get("run", {}), **dict(flat(as_before(line.get("config") or {})))} for line in (one, other)]
+    known = {key for keys in PARTS.values() for key in keys} | {"kind", "seconds", "config"}
+    parts = {name: [{key: line.get(key) for key in keys} for line in (one, other)] for name, keys in PARTS.items()}
+    parts["code"] = [dict(flat({k: v for k, v in line.items() if k not in known})) for line in (one, other)]
+    parts = {"settings": settings, **parts}
+    return [f"{name}: {'equal' if a == b else 'different, ' + _changes(a, b, 10)}" for name, (a, b) in parts.items()]
+
+
+def main() -> None:
+    """Compare two run directories."""
+    parser = argparse.ArgumentParser(prog="ctgraph-rl compare", description=__doc__)
+    parser.add_argument("one", type=Path, metavar="A", help="a run directory")
+    parser.add_argument("other", type=Path, metavar="B", help="another one")
+    within = (
+        "largest difference that counts as rounding, as a share of the field's largest value (default: %(default)g)"
+    )
+    parser.add_argument("--bound", type=float, default=BOUND, help=within)
+    arguments = parser.parse_args()
+    try:
+        require(*positive(bound=arguments.bound))
+        found = compare(arguments.one, arguments.other, arguments.bound)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    print("\n".join(found.lines))
+    sys.exit(found.code)
+
+
+if __name__ == "__main__":
+    main()

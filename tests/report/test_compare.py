@@ -1,0 +1,141 @@
+"""``ctgraph-rl compare``: what it says of two runs, and its exit code."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.made_runs import write_run
+
+from ctgraph_rl import cli
+from ctgraph_rl.log.files import AGENT, LOG
+
+
+@pytest.fixture
+def pair(tmp_path) -> tuple[Path, Path]:
+    """Two equal runs with agents."""
+    runs = tmp_path / "A", tmp_path / "B"
+    for run in runs:
+        write_run(run)
+        torch.save({"weight": torch.tensor([1.0, -0.0]), "steps": 3}, run / AGENT)
+    return runs
+
+
+@pytest.fixture
+def said(monkeypatch, capsys):
+    """Calls the command: its exit code, its lines and its error."""
+
+    def call(*words: object) -> tuple[int, list[str], str]:
+        monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "compare", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out, err = capsys.readouterr()
+        return end.value.code, out.splitlines(), err
+
+    return call
+
+
+def change(run: Path, number: int, **values: object) -> None:
+    """Change fields of a line of a run's log, counted from 0."""
+    lines = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+    lines[number].update(values)
+    (run / LOG).write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_equal_runs_are_equal_whatever_time_they_took(pair, said):
+    change(pair[1], 5, seconds=99.0)
+
+    code, lines, _ = said(*pair)
+
+    assert code == 0
+    assert lines == [
+        "equal: all 10 measurements, bit for bit",
+        "weights: equal, bit for bit",
+        *(f"{part}: equal" for part in ("settings", "curriculum", "machine", "code")),
+    ]
+
+
+def test_rounding_is_told_from_a_difference_by_the_bound_and_the_first_divergence_is_named(pair, said):
+    change(pair[1], 4, return_mean=1.00005)
+    change(pair[1], 6, return_mean=0.00005)
+    where = "training in block 1 after 1,000 frames: return_mean 1.0 and 1.00005"
+
+    code, [verdict, *_], _ = said(*pair)
+    assert code == 3
+    assert verdict == (
+        f"equal up to rounding: all measurements agree within 0.0001 of their field's largest value; "
+        f"they diverge at {where}"
+    )
+
+    code, [verdict, *_], _ = said(*pair, "--bound", "4e-5")
+    assert (code, verdict) == (1, f"different since {where}")
+
+
+def test_a_difference_after_rounding_is_named_too(pair, said):
+    change(pair[1], 4, return_mean=1.00005)
+    change(pair[1], 6, return_mean=0.5)
+
+    code, [verdict, *_], _ = said(*pair)
+
+    assert code == 1
+    assert verdict == (
+        "different since training in block 1 after 1,000 frames: return_mean 1.0 and 1.00005; "
+        "beyond rounding (0.0001) at evaluation of goal2 in block 1 after 1,000 frames"
+    )
+
+
+def test_counts_are_never_rounded(pair, said):
+    change(pair[0], 3, episodes=1_000_000)
+    change(pair[1], 3, episodes=1_000_001)
+
+    assert said(*pair)[0] == 1
+
+
+@pytest.mark.parametrize("weight", [[1.0, 0.0], [1.0], [1.0, 2.0]])
+def test_weights_are_compared_bit_by_bit(pair, said, weight):
+    torch.save({"weight": torch.tensor(weight), "steps": 3}, pair[1] / AGENT)
+
+    code, lines, _ = said(*pair)
+
+    assert code == 1
+    assert lines[:2] == [
+        "different: all measurements are equal, the agents' weights are not",
+        "weights: different in 1 of 2 parts: weight",
+    ]
+
+
+def test_a_run_that_ends_earlier_is_different(pair, said):
+    log = pair[1] / LOG
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-2]))
+
+    code, [verdict, *_], _ = said(*pair)
+
+    assert (code, verdict) == (1, "different: equal as far as both go, 8 of 10 and 8 lines")
+
+
+def test_other_settings_code_and_machines_are_named(pair, said):
+    about = json.loads((pair[1] / LOG).read_text().splitlines()[0])
+    settings = {**about["config"], "seed": 1, "portable": True}
+    change(pair[1], 0, config=settings, machine="arm", num_threads=2, fingerprint="g", numbers=7, source="x")
+    (pair[1] / AGENT).unlink()
+
+    code, lines, _ = said(*pair)
+
+    assert code == 0
+    assert lines[1:] == [
+        f"weights: not compared, {pair[1]} has no agent.pt",
+        "settings: different, portable False and True, seed 0 and 1",
+        "curriculum: different, fingerprint 'f' and 'g', source 'a test' and 'x'",
+        "machine: different, machine 'x86_64' and 'arm', num_threads 1 and 2",
+        "code: different, numbers None and 7",
+    ]
+
+
+def test_what_is_no_run_is_an_error(pair, said, tmp_path):
+    code, _, error = said(pair[0], tmp_path / "none")
+
+    assert code == 2 and f"{tmp_path / 'none'} holds no run: there is no run.jsonl" in error
+    assert said(*pair, "--bound", "0")[0] == 2
