@@ -108,7 +108,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 
     def learn(cfg, run_dir, interrupt):
         cells.append(run_dir)
-        first = {"kind": "run", "config": config.plain(cfg)}
+        first = {"kind": "run", "config": config.plain(cfg), **job.code_of(cfg, {})}
         (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")
         if cfg.seed == UNLUCKY:
             raise FloatingPointError("the loss is NaN")

@@ -64,6 +64,7 @@ KNOW_HYDRA = (
 DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
     "ctgraph_rl.packages": "the only door to curricula and baselines",
+    "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
     "ctgraph_rl.report.style": "packages of an extra",
     "ctgraph_rl.runs.trackers": "packages of an extra",

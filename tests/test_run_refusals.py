@@ -29,7 +29,7 @@ REFUSED = [
     (["seed=1.5"], ["seed must be an integer in [0, 2**63), got 1.5"]),
     (["device=bogus"], ["device must be one of cpu", "got 'bogus'"]),
     (["num_threads=0"], ["num_threads must be in 1.."]),
-    (["overwrite=1"], ["overwrite must be true or false, got 1"]),
+    (["overwrite=1"], ["overwrite must be true, false or stale, got 1"]),
     (
         ["curriculum.num_frames=1000"],
         ["num_frames=1000 of block 1, 2, 3, 4 must be a multiple of num_envs=64", "960 or 1024"],

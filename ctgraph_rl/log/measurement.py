@@ -35,12 +35,20 @@ def _are_blocks(value: object) -> bool:
     return all(isinstance(block, list) and block and all(is_int(task, 1, MOST) for task in block) for block in blocks)
 
 
+def _are_sources(value: object) -> bool:
+    """Whether it has a text, or none, for each module."""
+    values = value.values() if isinstance(value, Mapping) else [] if value is None else [0]
+    return all(each is None or isinstance(each, str) for each in values)
+
+
 RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "kind": (_is_text, "a text"),
     "schema": (is_int, "an integer"),
     "config": (lambda value: value is None or isinstance(value, Mapping), "an object"),
     "trained": (_are_blocks, f"lists of numbers of tasks in 1..{MOST:,}"),
     "tasks": (_are_texts, "a list of texts"),
+    "numbers": (is_int, "an integer"),
+    "sources": (_are_sources, "an object of texts"),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
     "task": (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}"),
     "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import tensordict
@@ -12,6 +13,7 @@ import torchrl
 
 from ctgraph_rl import __version__
 from ctgraph_rl.log.run_log import SCHEMA
+from ctgraph_rl.log.sources import full_name, is_ours, sources_of, targets
 from ctgraph_rl.packages import is_published
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -40,19 +42,86 @@ def named(curriculum: Curriculum) -> Curriculum:
     return replace(curriculum, name=f"{curriculum.name} (modified)") if modified else curriculum
 
 
-def provenance(curriculum: Curriculum) -> dict[str, Any]:
-    """Return curriculum, versions and machine as plain values for JSON. Tasks are counted from 1."""
+def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict[str, Any]:
+    """Return curriculum, code, versions and machine as plain values for JSON. Tasks are counted from 1.
+
+    Args:
+        curriculum: what is learned.
+        names: see `code`.
+    """
     return {
         "schema": SCHEMA,
         "curriculum": named(curriculum).name,
-        **{name: getattr(curriculum, name) for name in ("version", "fingerprint", "source")},
+        **{name: getattr(curriculum, name) for name in ("version", "source")},
+        **code(curriculum, names),
         "tasks": list(curriculum.labels),
         "trained": [[number + 1 for number in block] for block in curriculum.trained],
         "versions": versions(),
-        "numbers": NUMBERS,
         **machine(),
         "cpu": cpu_model(),
     }
+
+
+def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict[str, Any]:
+    """Return what decides the numbers of a run beside its configuration, as plain values for JSON.
+
+    Args:
+        curriculum: what is learned; its fingerprint stands for it, and its parts of a user's classes count as names do.
+        names: classes and functions that learn, such as ``my_agent.MyAgent``, of which the user's sources count; None
+            if they are not known.
+    """
+    known = None if names is None else sources_of([*names, *dict.fromkeys(_parts(curriculum))])
+    return {"fingerprint": curriculum.fingerprint, "numbers": NUMBERS, "sources": known}
+
+
+def learners(config: Mapping[str, Any] | None, agent: object) -> list[str]:
+    """Return the classes and functions that learn in a run: those of its configuration, or else the agent's parts.
+
+    The curriculum of a configuration is left out: what it is says its fingerprint, however it was made.
+    """
+    named = list(targets({key: value for key, value in (config or {}).items() if key != "curriculum"}))
+    if named or agent is None:
+        return named
+    parts = agent.modules() if isinstance(agent, torch.nn.Module) else [agent]
+    kinds = dict.fromkeys(full_name(kind) for part in parts for kind in type(part).__mro__)
+    return [name for name in kinds if not is_ours(name)]
+
+
+def _parts(value: Any) -> Iterator[str]:
+    """Yield the names of the user's classes that parts of a curriculum have."""
+    if is_dataclass(value) and not isinstance(value, type):
+        if not is_ours(type(value).__module__):
+            yield full_name(type(value))
+        for each in fields(value):
+            yield from _parts(getattr(value, each.name))
+    elif isinstance(value, Iterable) and not isinstance(value, str):
+        for item in value:
+            yield from _parts(item)
+
+
+def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return in words what differs in the `code` of two runs; what one of them does not know does not differ.
+
+    Args:
+        before: the first line of a log.
+        now: the code of this process.
+    """
+    stored, fingerprint, numbers = before.get("sources"), before.get("fingerprint"), before.get("numbers", 1)
+    changed = []
+    if fingerprint not in (None, now["fingerprint"]):
+        changed.append(f"the curriculum (fingerprint {fingerprint} before, {now['fingerprint']} now)")
+    if numbers != now["numbers"]:
+        changed.append(f"ctgraph_rl (numbers version {numbers} before, {now['numbers']} now)")
+    if stored is not None and now["sources"] is not None:
+        pairs = {name: (stored.get(name, ""), now["sources"].get(name, "")) for name in {*stored, *now["sources"]}}
+        changed += [f"{name}" for name, pair in sorted(pairs.items()) if None not in pair and pair[0] != pair[1]]
+    return changed
+
+
+def is_unknown(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Return whether a run does not say of which source it is where that counts now."""
+    stored = before.get("sources")
+    return bool(now["sources"]) and (stored is None or None in stored.values())
 
 
 def machine() -> dict[str, Any]:

@@ -103,7 +103,7 @@ def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[
 def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
     about = (log.of_kind("run") or [{}])[0]
     run = {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint")}
-    run["seed"] = about.get("config", {}).get("seed")
+    run["seed"] = (about.get("config") or {}).get("seed")
     for measurement in log.of_kind(kind):
         row = {**run, **measurement}
         yield [row.get(name) for name in names]

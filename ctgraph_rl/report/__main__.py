@@ -8,12 +8,13 @@ from pathlib import Path
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.report.code_states import print_problems
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_summary
 
 
 def main() -> None:
-    """Write the report, and say what is in it; the exit code is 1 if something was left out."""
+    """Write the report, and say what is in it; the exit code is 1 if something was left out or is of different code."""
     parser = argparse.ArgumentParser(prog="ctgraph-rl report", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
@@ -24,10 +25,9 @@ def main() -> None:
         report = write_report(arguments.runs, arguments.out)
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(terminal_lines(error))
-    for problem in report.problems:
-        print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
+    incomplete = print_problems(report.problems, report.runs)
     print(f"report of {len(report.runs)} runs: {terminal_text(report.page)}")
-    if report.problems:
+    if incomplete:
         sys.exit(1)
 
 

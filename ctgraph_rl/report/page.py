@@ -12,6 +12,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 from ctgraph_rl.report import results
+from ctgraph_rl.report.code_states import code_notes, mixed_code
 from ctgraph_rl.report.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.learning_curves import learning_curves, training_curves
@@ -100,6 +101,7 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
         "title": _title(parts),
         "parts": parts,
         "problems": problems,
+        "code": [*mixed_code(runs), *code_notes(runs)],
         "legend": results.LEGEND,
         "legend_of_means": results.MEANS,
         "definitions": _definitions(parts),

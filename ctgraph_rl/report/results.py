@@ -3,7 +3,8 @@
 ``ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--format latex] [--csv FILE]``
 
 Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
-undefined metric is counted, as in n = 9/10. What cannot be read is named and left out, and the exit code is then 1.
+undefined metric is counted, as in n = 9/10. What cannot be read is named and left out, and runs of one configuration
+whose code has changed in between are shown apart; the exit code is then 1.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ctgraph_rl.disk import write_named
 from ctgraph_rl.log.escape import csv_text, latex_text, markdown_text, terminal_lines, terminal_text
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.code_states import print_problems
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 
@@ -360,9 +362,7 @@ def main() -> None:
         raise
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(terminal_lines(error))
-    for problem in problems:
-        print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
-    if problems:
+    if print_problems(problems, runs):
         sys.exit(1)
 
 

@@ -37,6 +37,9 @@ PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 
 RESUME = ("warn", "strict")
 
+STALE = "stale"
+"""Of ``overwrite``: what was run with other code alone is run again."""
+
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
 """Configurations that come with other packages, and the extras that install these."""
 
@@ -96,9 +99,10 @@ def check_values(cfg: DictConfig) -> None:
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
-    for switch in ("overwrite", "experts", "report", "portable"):
+    for switch in ("experts", "report", "portable"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
     require(
+        check_overwrite(cfg.overwrite),
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
         *positive(checkpoint_seconds=cfg.checkpoint_seconds),
     )
@@ -109,6 +113,11 @@ def check_values(cfg: DictConfig) -> None:
             (cfg.device == "cpu", f"portable=true needs device=cpu, got {cfg.device}: bits depend on the kind of GPU"),
             (not cfg.agent.get("compile"), compiled),
         )
+
+
+def check_overwrite(given: Any) -> tuple[bool, str]:
+    """Return the rule of ``overwrite`` with its message."""
+    return isinstance(given, bool) or given == STALE, f"overwrite must be true, false or {STALE}, got {given!r}"
 
 
 def changes_of(cfg: DictConfig, part: str) -> dict[str, Any]:

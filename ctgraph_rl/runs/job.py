@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from collections.abc import Iterator, Mapping
@@ -14,21 +15,23 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
-from ctgraph_rl.agent import Agent
+from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
-from ctgraph_rl.log.provenance import versions
-from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.measurement import check, parsed
+from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
+from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Expert, expert_curriculum, find_or_train
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
+from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import RESULTS, MakeAgent, new_agent, remove_results, train, with_method
+from ctgraph_rl.runs.train import RESULTS, START_AGAIN, MakeAgent, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
@@ -70,7 +73,7 @@ class Job:
         torch.set_num_threads(cfg.num_threads)
         torch.set_flush_denormal(True)
         make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
-        curriculum = make_method().prepare(with_changes(config.target(cfg, "curriculum")(), cfg))
+        curriculum = curriculum_of(cfg, make_method())
         if cfg.experts:
             _check_experts(curriculum, make_alone, cfg.seed)
         agent = new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, device)
@@ -80,7 +83,7 @@ class Job:
         """Learn into a directory; the single-task experts first, where the configuration asks for them."""
         cfg, saved = self.cfg, self._checkpoints(run_dir)
         with self._tracking(run_dir) as listeners:
-            if cfg.overwrite:
+            if self._replaces(run_dir):
                 saved.clear()
                 remove_results(run_dir)
             config.write_configuration(cfg, run_dir / ".hydra")
@@ -97,6 +100,8 @@ class Job:
             self._train(alone, agent, run_dir, settings)
 
         folder, key = Path(self.cfg.experts_dir), {**as_before(settings), "versions": versions()}
+        now = _code(self.curriculum, settings)
+        key |= {name: now[name] for name, as_ever in (("sources", {}), ("numbers", 1)) if now[name] != as_ever}
         return find_or_train(self.curriculum, learn_alone, folder, key, print, waiting=self.interrupt.check)
 
     def _train(
@@ -111,11 +116,18 @@ class Job:
         strict = self.cfg.resume == "strict"
         return Checkpoints(run_dir / CHECKPOINTS, self.cfg.checkpoint_seconds, strict, self.interrupt)
 
+    def _replaces(self, run_dir: Path) -> bool:
+        """Return whether a run of the directory is replaced and not resumed."""
+        if self.cfg.overwrite != config.STALE:
+            return bool(self.cfg.overwrite)
+        about = first_line(run_dir)
+        return about is not None and bool(code_changes(about, _code(self.curriculum, config.plain(self.cfg))))
+
     @contextmanager
     def _tracking(self, run_dir: Path) -> Iterator[list[Tracker]]:
         """Open the tracker that ``logger`` names, if it names one, and close it at the end."""
         if "logger" not in self.cfg:
-            if self.cfg.overwrite:
+            if self._replaces(run_dir):
                 shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
             yield []
             return
@@ -158,36 +170,81 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     """Return whether the directory already holds the results of this configuration, complete.
 
     Raises:
-        FileExistsError: if it holds a run, finished or not, of another configuration; shows the difference.
+        FileExistsError: if it holds a run, finished or not, of another configuration or of code that has changed;
+            shows the difference.
     """
-    stored = None if cfg.overwrite else stored_settings(run_dir)
-    if stored is None:
+    about = None if cfg.overwrite is True else first_line(run_dir)
+    if about is None:
         return False
-    changed = differences(stored, config.plain(cfg))
+    changed = differences(about.get("config") or {}, config.plain(cfg))
     if changed:
         advice = "choose another hydra.run.dir, or overwrite=true to replace it"
         raise FileExistsError(f"{run_dir} holds a run with {', '.join(changed)}; {advice}")
-    finished = (run_dir / METRICS).exists()
+    stale, unknown = changed_code(cfg, run_dir, {})
+    if stale and cfg.overwrite != config.STALE:
+        raise FileExistsError(f"{run_dir} holds a run of other code: {', '.join(stale)} changed; {START_AGAIN}")
+    finished = (run_dir / METRICS).exists() and not stale
     if finished:
-        print("this configuration was run before; overwrite=true runs it again, as a change of code may need")
+        print("this configuration was run before; overwrite=true runs it again")
+        if unknown:
+            print("note: this run does not say of which source it is, so whether that has changed is unknown")
     return finished
 
 
-def stored_settings(run_dir: Path) -> Mapping[str, Any] | None:
-    """Return the settings of the run that a directory holds; None without a run.
+def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]]) -> tuple[list[str], bool]:
+    """Return in words what code has changed since a configuration was run in a directory, and whether some is unknown.
+
+    A run that was stopped before its first checkpoint has nothing that a change could concern.
+
+    Args:
+        cfg: the composed configuration.
+        run_dir: the directory.
+        known: the code of configurations that differ from this one in what does not matter; it is added to.
+    """
+    about = first_line(run_dir) if holds_results(run_dir) else None
+    if about is None:
+        return [], False
+    now = code_of(cfg, known)
+    return code_changes(about, now), is_unknown(about, now)
+
+
+def code_of(cfg: DictConfig, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return what a run of a configuration would store of its code; see `ctgraph_rl.log.provenance.code`."""
+    settings = config.plain(cfg)
+    deciding = {key: settings.get(key) for key in ("curriculum", "method", *config.PARTS)}
+    key = json.dumps([deciding, learners(settings, None)], sort_keys=True)
+    if key not in known:
+        known[key] = _code(curriculum_of(cfg, config.target(cfg, "method")()), settings)
+    return known[key]
+
+
+def _code(curriculum: Curriculum, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return code(curriculum, learners(settings, None))
+
+
+def first_line(run_dir: Path) -> Mapping[str, Any] | None:
+    """Return the first line of the log of the run that a directory holds; None without a run.
 
     Raises:
         FileExistsError: if it holds files that a run would replace, and that are of no run.
     """
     there = [name for name in RESULTS if (run_dir / name).exists()]
-    log = RunLog.read(run_dir / LOG) if LOG in there else RunLog()
-    runs = log.of_kind("run")
-    if runs:
-        return runs[0].get("config") or {}
-    if not there or (there == [LOG] and not log.measurements):  # stopped while its first line was written
+    about = _first_line(run_dir / LOG) if LOG in there else None
+    if about is not None or not there:
+        return about
+    if there == [LOG] and not RunLog.read(run_dir / LOG).measurements:  # stopped while its first line was written
         return None
     advice = "choose another hydra.run.dir, or overwrite=true to replace them"
     raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
+
+
+def _first_line(path: Path) -> Mapping[str, Any] | None:
+    try:
+        about = parsed(read_regular(path, MOST_BYTES).partition(b"\n")[0])
+        check(about)
+    except ValueError:
+        return None
+    return about if about["kind"] == "run" else None
 
 
 @contextmanager
@@ -215,6 +272,15 @@ def checked_device(name: str) -> torch.device:
     choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
     require((name in choices, f"device must be one of {', '.join(choices)} on this machine, got {name!r}"))
     return torch.device(name)
+
+
+def curriculum_of(cfg: DictConfig, method: Method) -> Curriculum:
+    """Return what a configuration lets an agent with a method learn.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+    return method.prepare(with_changes(config.target(cfg, "curriculum")(), cfg))
 
 
 def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:

@@ -6,6 +6,7 @@ A directory that cannot be read is a `Problem` with its reason, and never a numb
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,6 +19,7 @@ from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog
+from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
 
@@ -32,6 +34,9 @@ ABOUT = ("curriculum", "fingerprint", "config")
 
 NO_METHOD = "Finetune"
 """The method that changes nothing: a run with it and one without a method have the same configuration."""
+
+MOST_MODULES = 3
+"""Modules that differ between runs that else are alike and are named; one digest stands for all others."""
 
 Curve = list[tuple[int, float]]
 """Mean returns after numbers of frames; NaN for one without a value."""
@@ -92,9 +97,21 @@ class Run:
         return name.removesuffix(MODIFIED), fingerprint
 
     @property
-    def configuration(self) -> tuple[tuple[str, str], str]:
-        """Equal for runs that differ in their seed alone."""
+    def code(self) -> dict[str, Any]:
+        """The numbers version of the package, and the digest of each module of the user; None where it is not known."""
+        sources, learners = self.about.get("sources"), targets({**self.about["config"], "curriculum": None})
+        unknown = {name.rpartition(".")[0]: None for name in learners if not is_ours(name)}
+        return {"numbers version": self.about.get("numbers", 1), **(unknown if sources is None else sources)}
+
+    @property
+    def alike(self) -> tuple[tuple[str, str], str]:
+        """Equal for runs that differ in seed and code alone."""
         return self.group, json.dumps(self.settings, sort_keys=True)
+
+    @property
+    def configuration(self) -> tuple[tuple[str, str], str, str]:
+        """Equal for runs that differ in their seed alone."""
+        return *self.alike, json.dumps(self.code, sort_keys=True)
 
 
 class Problem(NamedTuple):
@@ -318,7 +335,28 @@ def _rank(value: Any) -> tuple[int, float, str]:
 def _agent_names(runs: Sequence[Run]) -> list[str]:
     """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
     differing = {key: _differing(some) for key, some in _alike(runs).items()}
-    return [_named(run, differing[run.group, _name(run)]) for run in runs]
+    codes = _codes(runs)
+    return [_named(run, differing[run.group, _name(run)]) + code for run, code in zip(runs, codes, strict=True)]
+
+
+def _codes(runs: Sequence[Run]) -> list[str]:
+    """The code of each run, as far as that of runs that are alike else differs."""
+    of: dict[Any, list[Run]] = {}
+    for run in runs:
+        of.setdefault(run.alike, []).append(run)
+    return [f" ({code})" if (code := code_of(run, of[run.alike])) else "" for run in runs]
+
+
+def code_of(run: Run, others: Sequence[Run]) -> str:
+    """Return in words the code of a run, as far as it differs between others."""
+    codes = [other.code for other in others]
+    names = sorted({name for code in codes for name in code if len({each.get(name, "") for each in codes}) > 1})
+    values = [(name, run.code.get(name, "")) for name in names]
+    said = [f"{name} {'unknown' if value is None else value or 'not there'}" for name, value in values]
+    if len(said) > MOST_MODULES:
+        rest = json.dumps(values[MOST_MODULES:])
+        said[MOST_MODULES:] = [f"{len(said) - MOST_MODULES} more {hashlib.sha256(rest.encode()).hexdigest()[:8]}"]
+    return ", ".join(said)
 
 
 def _alike(runs: Iterable[Run]) -> dict[tuple[Any, ...], list[Run]]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from pathlib import Path
-from types import TracebackType
+from types import FunctionType, TracebackType
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sources import full_name
 from ctgraph_rl.runs.train import write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -53,6 +54,8 @@ class Recorder:
         run_dir: where the files of a run go, all but ``agent.pt``; None: measurements stay in ``log``.
         seed: of the run; evaluations derive theirs from it, in [0, 2**63).
         about: what else the first line of the log should tell, such as the learner's name and settings, as JSON.
+        code: classes and functions that learn; the log then says of which source they are, so that results of changed
+            code are not averaged with those of before. None: it does not say.
 
     Raises:
         ValueError: for values out of range, before anything is written.
@@ -65,12 +68,14 @@ class Recorder:
         run_dir: Path | str | None = None,
         seed: int = 0,
         about: Mapping[str, Any] | None = None,
+        code: Sequence[type | FunctionType] | None = None,
     ) -> None:
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
             ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
             (_is_json(about), f"about must be plain JSON values by name, got {about!r}"),
+            (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
@@ -80,7 +85,8 @@ class Recorder:
                 raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
             path.parent.mkdir(parents=True, exist_ok=True)
         self.log = RunLog(path)
-        self.log.append("run", **provenance(curriculum), config={"seed": seed, **(about or {})})
+        names = None if code is None else [full_name(each) for each in code]
+        self.log.append("run", **provenance(curriculum, names), config={"seed": seed, **(about or {})})
         self._evaluator = Evaluator(curriculum, seed, self.log)
         self._frames, self._trained = -1, 0
 
@@ -191,6 +197,11 @@ def _is_json(about: object) -> bool:
     except (TypeError, ValueError):
         return False
     return about is None or isinstance(about, Mapping)
+
+
+def _is_code(code: object) -> bool:
+    listed = code is None or isinstance(code, (list, tuple))
+    return listed and all(isinstance(each, (type, FunctionType)) for each in code or ())  # type: ignore[attr-defined]
 
 
 def _number(value: Any) -> Any:

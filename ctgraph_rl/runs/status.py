@@ -19,9 +19,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from ctgraph_rl.disk import read_text
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
+from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 
-DONE, FAILED, IN_USE, MISSING = "done", "failed", "in use", "missing"
+DONE, STALE, FAILED, IN_USE, MISSING = "done", "stale", "failed", "in use", "missing"
+
+START_AGAIN = "overwrite=stale runs what is stale again, overwrite=true all"
 
 SHOWN = 20
 """Cells that the report at a sweep's end names."""
@@ -50,6 +52,11 @@ class Outcome(NamedTuple):
 
 
 NOTHING = Outcome()
+
+
+def holds_results(folder: Path) -> bool:
+    """Return whether a run directory holds results or a checkpoint, which a change of code would make stale."""
+    return (folder / METRICS).exists() or any((folder / CHECKPOINTS).glob("*.pt"))
 
 
 def _identity(path: Path) -> Hashable:
@@ -114,14 +121,17 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
         most: cells that are named; None: all.
     """
     counts = Counter(found.state for found in statuses.values())
-    numbers = ", ".join(f"{counts[state]} {state}" for state in (DONE, FAILED, IN_USE, MISSING))
+    states = (DONE, *([STALE] if counts[STALE] else []), FAILED, IN_USE, MISSING)
+    numbers = ", ".join(f"{counts[state]} {state}" for state in states)
     twice = f" ({repeated} more are the same as others)" if repeated else ""
     lines = [f"sweep of {len(statuses)} cells{twice}: {numbers}"]
     left = [(name, found) for name, found in statuses.items() if found.state != DONE]
     lines += [f"  {state:<7}  {name}  {terminal_text(reason)}" for name, (state, reason) in left[:most]]
     if most is not None and len(left) > most:
         lines.append(f"  and {len(left) - most} more")
-    if left:
+    if counts[STALE]:
+        lines.append(f"stale: the code has changed since; {START_AGAIN}")
+    elif left:
         lines.append("the same command runs what is not done; with hydra.sweeper.status=true it only lists it")
     return "\n".join(lines)
 

@@ -20,9 +20,22 @@ from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import become_portable
-from ctgraph_rl.runs.config import save_yaml
-from ctgraph_rl.runs.status import DONE, NOTHING, SHOWN, Outcome, SweepProgress, report, status_of
+from ctgraph_rl.runs.config import check_overwrite, save_yaml
+from ctgraph_rl.runs.status import (
+    DONE,
+    MISSING,
+    NOTHING,
+    SHOWN,
+    STALE,
+    Outcome,
+    Status,
+    SweepProgress,
+    holds_results,
+    report,
+    status_of,
+)
 
 if TYPE_CHECKING:
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper as Base
@@ -52,6 +65,9 @@ class Sweeper(Base):
         super().__init__(max_batch_size, params)
         self.status = status
         self._values: dict[str, tuple[str, Any] | None] = {}
+        self._stale: dict[Path, str] = {}
+        self._known: dict[str, dict[str, Any]] = {}
+        self._num_unknown = 0
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Set up as Hydra does; a launcher for all cores gets as many processes as have ``num_threads`` each."""
@@ -63,32 +79,50 @@ class Sweeper(Base):
     def sweep(self, arguments: list[str]) -> None:
         """Run the cells that are not done, then report the status of all.
 
+        Cells that were run with other code are stale: unless ``overwrite`` says so they are not run again, and nothing
+        is run then.
+
         Raises:
+            ValueError: for a value of ``overwrite`` that is none.
             SystemExit: with code 1 if some are not done.
         """
         assert self.config is not None
+        overwrite = self.config.overwrite
+        require(check_overwrite(overwrite))
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
         [batch] = self.split_arguments(overrides, None)
         cells = self.cells(batch)
-        before = {folder: Outcome.of(folder) if self.config.overwrite else NOTHING for folder in cells}
+        again = cells if overwrite is True else self._stale
+        before = {folder: Outcome.of(folder) if folder in again else NOTHING for folder in cells}
         left = [folder for folder in cells if status_of(folder, before[folder]).state != DONE]
         errors: dict[Path, str] = {}
         try:
-            if left and not self.status:
+            if left and not self.status and (overwrite or not self._stale):
                 with sigterm_exits(), SweepProgress(before):
                     self._launch({folder: cells[folder] for folder in left}, errors)
         finally:
-            found = {folder: status_of(folder, before[folder], errors.get(folder)) for folder in cells}
-            names = shortened(list(cells.values()))
-            statuses = dict(zip(names, found.values(), strict=True))
-            print(report(statuses, len(batch) - len(cells), None if self.status else SHOWN))
+            found = {folder: self._status(folder, before[folder], errors.get(folder)) for folder in cells}
+            self._show(cells, found, len(batch) - len(cells))
         if any(state != DONE for state, _ in found.values()):
             sys.exit(1)
 
+    def _show(self, cells: Mapping[Path, Overrides], found: Mapping[Path, Status], repeated: int) -> None:
+        if self._num_unknown:
+            print(f"note: {self._num_unknown} cells do not say of which source they are, so it may have changed since")
+        statuses = dict(zip(shortened(list(cells.values())), found.values(), strict=True))
+        print(report(statuses, repeated, None if self.status else SHOWN))
+
+    def _status(self, folder: Path, before: Outcome, error: str | None) -> Status:
+        found = status_of(folder, before, error)
+        stale = found.state == MISSING and folder in self._stale
+        return Status(STALE, f"{self._stale[folder]} changed") if stale else found
+
     def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
         """Return the cells by their run directories; of equal ones only the first.
+
+        What has changed since one was run is kept, unless all are run again.
 
         Cells that choose the same files differ in values alone, so only the first of them is composed.
 
@@ -109,8 +143,26 @@ class Sweeper(Base):
             for key, value in filter(None, values.values()):
                 OmegaConf.update(composed[choices], key, value)
             sweep = composed[choices].hydra.sweep
-            found.setdefault(Path(sweep.dir).absolute() / sweep.subdir, overrides)
+            folder = Path(sweep.dir).absolute() / sweep.subdir
+            if folder not in found and self.config.overwrite is not True:
+                self._compare(composed[choices], folder)
+            found.setdefault(folder, overrides)
         return found
+
+    def _compare(self, cfg: DictConfig, folder: Path) -> None:
+        """Keep in words what code has changed since a cell was run, if it was, or that this is unknown."""
+        if not holds_results(folder):
+            return
+        check_packages()
+        from ctgraph_rl.runs.job import changed_code  # here: a sweep that begins needs no torch
+
+        try:
+            changed, unknown = changed_code(cfg, folder, self._known)
+        except Exception as error:  # of the code of a user, which may have changed so that it cannot be run
+            changed, unknown = [f"what builds it, which now fails ({type(error).__name__}: {error}),"], False
+        if changed:
+            self._stale[folder] = ", ".join(changed)
+        self._num_unknown += unknown
 
     def _value(self, setting: str) -> tuple[str, Any] | None:
         """Return key and value of a setting that changes a value; None for one that chooses a file, adds or removes."""

@@ -19,7 +19,7 @@ from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
-from ctgraph_rl.log.provenance import machine, provenance
+from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
 from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import write_tables
@@ -40,6 +40,8 @@ MEMBERS = (
 RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
 """Files that a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
 ``curriculum.json`` where the curriculum has only parts of this package's classes."""
+
+START_AGAIN = "overwrite=stale runs it again from the beginning, as overwrite=true does with any run"
 
 RESTARTS = "restarts.jsonl"
 """Says, for a run that was stopped, where it was resumed and on which machine."""
@@ -108,7 +110,7 @@ def train(
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
     checkpoints.tidy()
     saved = checkpoints.newest()
-    about = provenance(curriculum)
+    about = provenance(curriculum, learners(config, agent))
     log = _new_log(run_dir) if saved is None else _resumed_log(run_dir, saved, about, checkpoints.strict)
     log.listeners.extend(listeners)
     if saved is None:
@@ -166,8 +168,8 @@ def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: 
     runs = RunLog.read(path).of_kind("run") if path.exists() else []
     require((bool(runs), f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"))
     before, same = runs[0], ("versions", "machine", "num_threads")
-    changed = f"{run_dir} was begun with another curriculum of this name, whose code has changed: overwrite=true"
-    require((before.get("fingerprint") == about["fingerprint"], changed))
+    changed = ", ".join(code_changes(before, about))
+    require((not changed, f"{run_dir} was begun with other code: {changed} changed; {START_AGAIN}"))
     other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
     message = f"{run_dir} was begun with other {other}; from here on its bits may differ from those of one machine"
     require((not (strict and other), f"{message}; resume=warn resumes it all the same"))

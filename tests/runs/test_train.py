@@ -43,7 +43,7 @@ def newest(run_dir: Path) -> Path:
 def about(monkeypatch, **changes) -> None:
     """Let the machine and versions of this process seem others."""
     provenance = train.__globals__["provenance"]
-    monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda curriculum: {**provenance(curriculum), **changes})
+    monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda *given: {**provenance(*given), **changes})
 
 
 def test_a_stopped_run_ends_as_if_never_stopped_and_leaves_no_checkpoint(stopped, whole):
@@ -139,7 +139,9 @@ def test_else_they_are_a_warning(stopped, monkeypatch, whole):
 def test_a_curriculum_whose_code_has_changed_is_refused(stopped):
     other = replace(LEARNED, blocks=(Block(LEARNED.tasks[1], 96), LEARNED.blocks[1]))
 
-    with pytest.raises(ValueError, match="was begun with another curriculum of this name, whose code has changed"):
+    with pytest.raises(
+        ValueError, match=r"was begun with other code: the curriculum \(fingerprint \w+ before, \w+ now\) changed"
+    ):
         train(other, new_agent(other, make_agent, 3), stopped, 3)
 
 

@@ -1,0 +1,274 @@
+"""The source that a run's numbers depend on beside this package: a digest of each module of the user.
+
+A module is the user's if it is a .py file that is neither of this package, nor of the standard library, nor installed.
+It counts with all modules of the user that it imports, also within functions. A digest is one of the syntax: comments,
+docstrings and layout do not change it, and it is equal on Python 3.11 to 3.13. Of a script that is run, which is
+``__main__``, only the definitions count that a class needs. An installed package counts by its version, and only if a
+class of it is named; those that the user's modules import do not count, nor do files of data and compiled extensions.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from importlib import metadata
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
+from pathlib import Path
+from types import FunctionType
+from typing import Any, NamedTuple
+
+OURS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins")
+"""Packages whose changes the numbers version tells."""
+
+RECORDED = ("torch", "torchrl", "tensordict", "hydra")
+"""Installed packages whose versions do not count here: every run stores those that decide its bits."""
+
+INSTALLED = frozenset({"site-packages", "dist-packages"})
+"""Folders of installed packages."""
+
+STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
+"""Folders of the standard library."""
+
+SCRIPT = "__main__"
+
+NOT_CODE = ("kind", "type_comment", "type_ignores")
+"""Fields of syntax nodes that change nothing; ``kind`` is the u of a text."""
+
+
+class Module(NamedTuple):
+    """A module of the user."""
+
+    digest: str
+    imports: frozenset[str]  # modules that it imports, and names that may be modules
+
+
+_READ: dict[str, tuple[ModuleSpec, Module]] = {}
+"""Modules as they were when this process first read them after importing them: a later edit does not change the code
+that runs."""
+
+
+def sources_of(names: Iterable[str]) -> dict[str, str | None]:
+    """Return the digest of each module of the user that some classes or functions need, by the module's name.
+
+    An installed package that one of them is of has its version instead; None stands for what cannot be read, such as a
+    class of a notebook.
+
+    Args:
+        names: dotted names, such as ``my_agent.MyAgent``; those of this package and of Python itself need nothing.
+    """
+    found: dict[str, str | None] = {}
+    waiting: list[str] = []
+    for name in names:
+        package = name.partition(".")[0]
+        if package == SCRIPT:
+            module = _of_script(name.split(".")[1])
+            found[SCRIPT] = module and module.digest
+            waiting += module.imports if module else ()
+        elif package not in (*OURS, *RECORDED):
+            waiting.append(name)
+            found |= _installed(package)
+    while waiting:
+        for name, spec in _specs(waiting.pop()):
+            if name not in found and _is_users(spec):
+                module = _module(name, spec)
+                found[name] = module.digest
+                waiting += module.imports
+    return dict(sorted(found.items()))
+
+
+def _specs(name: str) -> Iterator[tuple[str, ModuleSpec]]:
+    """Yield the packages and the module at the beginning of a dotted name, as far as there are any; imports none."""
+    package, *rest = name.split(".")
+    if package in OURS:
+        return
+    spec = _top(package)
+    while spec is not None:
+        yield package, spec
+        if not rest or spec.submodule_search_locations is None or _is_installed(spec):
+            return
+        package = f"{package}.{rest.pop(0)}"
+        spec = PathFinder.find_spec(package, list(spec.submodule_search_locations))
+
+
+def _top(package: str) -> ModuleSpec | None:
+    try:
+        return find_spec(package)
+    except (ValueError, ImportError):  # a module that was made by hand
+        return None
+
+
+def _is_users(spec: ModuleSpec) -> bool:
+    origin = spec.origin or ""
+    return origin.endswith(".py") and not _is_installed(spec) and not origin.startswith(STANDARD)
+
+
+def _is_installed(spec: ModuleSpec) -> bool:
+    places = [spec.origin or "", *(spec.submodule_search_locations or ())]
+    return any(INSTALLED & {*Path(place).parts} for place in places)
+
+
+def _installed(package: str) -> dict[str, str | None]:
+    """Return an installed package with its version; empty for any other."""
+    spec = _top(package)
+    if spec is None or not _is_installed(spec):
+        return {}
+    try:
+        return {package: f"version {metadata.version(package)}"}
+    except metadata.PackageNotFoundError:
+        names = metadata.packages_distributions().get(package, ())
+        return {package: f"version {metadata.version(names[0])}" if names else None}
+
+
+def _module(name: str, spec: ModuleSpec) -> Module:
+    """Return a module; one that this process has imported as it was when it was first read since."""
+    imported = getattr(sys.modules.get(name), "__spec__", None)
+    if imported is not None and name in _READ and _READ[name][0] is imported:
+        return _READ[name][1]
+    module = read_module(name, Path(str(spec.origin)).read_bytes(), spec.submodule_search_locations is not None)
+    if imported is not None:
+        _READ[name] = imported, module
+    return module
+
+
+def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
+    """Return digest and imports of a module.
+
+    Args:
+        name: its dotted name, which relative imports start from.
+        source: its file; one that is no Python of this version counts byte by byte.
+        is_package: whether it is the ``__init__`` of a package.
+    """
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return Module(_hash([source.hex()]), frozenset())
+    package = name if is_package else name.rpartition(".")[0]
+    return Module(_hash(syntax(tree)), frozenset(_imports(tree, package)))
+
+
+def _of_script(name: str) -> Module | None:
+    """Return what a class or function of the script that runs needs of it; None without a file."""
+    path = getattr(sys.modules.get(SCRIPT), "__file__", None)
+    if path is None or not Path(path).is_file():
+        return None
+    tree = ast.parse(Path(path).read_bytes())
+    package = getattr(sys.modules[SCRIPT], "__package__", None) or ""
+    tree.body = _needed(tree.body, name)
+    return Module(_hash(syntax(tree)), frozenset(_imports(tree, package)))
+
+
+def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
+    """Return the statements that define a name, and those that define what they mention, in order."""
+    mentions = {each: {node.id for node in ast.walk(each) if isinstance(node, ast.Name)} for each in statements}
+    defines = {each: set(_defined(each)) for each in mentions}
+    wanted, kept = {name}, set[ast.stmt]()
+    while new := {each for each in mentions if each not in kept and defines[each] & wanted}:
+        kept |= new
+        wanted |= set[str]().union(*(mentions[each] for each in new))
+    return [each for each in mentions if each in kept]
+
+
+def _defined(statement: ast.stmt) -> Iterator[str]:
+    """Yield the names that a statement of a module defines, or may define."""
+    if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+        yield statement.name
+        return
+    for node in ast.walk(statement):
+        if isinstance(node, ast.alias):
+            yield (node.asname or node.name).partition(".")[0]
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            yield node.name
+
+
+def _imports(tree: ast.AST, package: str) -> Iterator[str]:
+    """Yield the dotted names that statements import, and those of modules that ``import_module`` imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            start = [*filter(None, parents), *filter(None, [node.module])]
+            yield from (".".join([*start, alias.name]) for alias in node.names if parents or not node.level)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+            names = [each.value for each in node.args[:1] if isinstance(each, ast.Constant)]
+            yield from (name for name in names if isinstance(name, str))
+
+
+def syntax(tree: ast.AST) -> Iterator[str]:
+    """Yield the syntax of a tree as texts: kinds of nodes and their fields, without positions and docstrings.
+
+    What depends on the version of Python is left out: empty fields, and how the text of an f-string is cut into parts.
+    """
+    waiting: list[Any] = [tree]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, ast.AST):
+            fields = {name: value for name, value in ast.iter_fields(part) if name not in NOT_CODE}
+            if isinstance(part, ast.JoinedStr):
+                fields["values"] = list(_joined(part.values))
+            named = [each for name in sorted(fields) for each in _field(name, fields[name])]
+            waiting += [_Text(")"), *reversed(named), _Text(f"{type(part).__name__}(")]
+        elif isinstance(part, list):
+            waiting += [_Text("]"), *reversed(part), _Text("[")]
+        else:
+            yield part if isinstance(part, _Text) else repr(part)
+
+
+def _joined(parts: Iterable[ast.expr]) -> Iterator[Any]:
+    """Yield the parts of an f-string, with adjacent texts as one, and no empty ones."""
+    text = ""
+    for part in parts:
+        if isinstance(part, ast.Constant):
+            text += str(part.value)
+            continue
+        yield from filter(None, [text])
+        yield part
+        text = ""
+    yield from filter(None, [text])
+
+
+class _Text(str):
+    """A text that is no value of the syntax."""
+
+
+def _field(name: str, value: Any) -> list[Any]:
+    """Return a field with its name; nothing for an empty one."""
+    if isinstance(value, list):
+        value = [each for each in value if not _has_no_effect(each)]
+    return [] if value is None or value == [] else [_Text(f"{name}="), value]
+
+
+def _has_no_effect(node: Any) -> bool:
+    """Return whether a statement does nothing, as docstrings do."""
+    return isinstance(node, ast.Pass) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
+
+
+def _hash(texts: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+
+def targets(settings: Any) -> Iterator[str]:
+    """Yield the names of classes and functions that a configuration builds or hands on, at any depth."""
+    if isinstance(settings, Mapping):
+        name = str(settings.get("_target_", ""))
+        if name:
+            yield str(settings.get("path")) if name.startswith("hydra.utils.get_") else name
+    if isinstance(settings, (Mapping, list, tuple)):
+        for each in settings.values() if isinstance(settings, Mapping) else settings:
+            yield from targets(each)
+
+
+def is_ours(name: str) -> bool:
+    """Return whether a class or function is of this package."""
+    return name.partition(".")[0] in OURS
+
+
+def full_name(kind: type | FunctionType) -> str:
+    """Return the dotted name of a class or function."""
+    return f"{kind.__module__}.{kind.__qualname__}"
