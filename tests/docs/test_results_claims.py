@@ -119,7 +119,8 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
         "methods",
     }
     assert all(line["equal"] == line["numbers"] for line in again if line not in changed)
-    assert {(line["numbers"], line["equal"]) for line in changed} == {("4", "2")}  # greedy return and success
+    assert all(line["equal"] == "2" for line in changed if line["depth"] in "23")  # greedy return and success
+    assert all(line["equal"] in "24" for line in changed if line["depth"] in "45")  # all, where no goal is reached
 
 
 def test_a_cell_that_was_run_again_takes_the_place_of_its_line(make, monkeypatch, tmp_path):
