@@ -76,9 +76,14 @@ def csv_text(rows: Iterable[Iterable[Any]], end: str = "\n") -> str:
         rows: cells; None is an empty one.
         end: of a line.
     """
+    return "".join(_line(row) + end for row in rows)
+
+
+def _line(row: Iterable[Any]) -> str:
+    """A line without its end; cells with an end of a line of any kind are quoted."""
     file = io.StringIO(newline="")
-    csv.writer(file, lineterminator=end).writerows([_cell(value) for value in row] for row in rows)
-    return file.getvalue()
+    csv.writer(file, lineterminator="\r\n").writerow([_cell(value) for value in row])
+    return file.getvalue().removesuffix("\r\n")
 
 
 def _cell(value: Any) -> Any:
