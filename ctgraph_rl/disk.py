@@ -22,7 +22,7 @@ PART = ".part"
 """Ending of a file that is being written."""
 
 
-def write_whole(path: str | os.PathLike[str], content: bytes | str) -> None:
+def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:
     """Write a file so that whoever reads it, also after a crash, finds the old content or the new.
 
     A link at its place is replaced, its target stays as it is.
@@ -30,6 +30,7 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str) -> None:
     Args:
         path: the file.
         content: bytes, or text that is written in UTF-8.
+        synced: whether it must be there after a power cut; False for what no run is resumed from.
 
     Raises:
         OSError: if it cannot be written; names the path and the bytes needed and free. The old file stays.
@@ -41,7 +42,10 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str) -> None:
         part.unlink(missing_ok=True)
         with part.open("xb") as file:  # a new file, never one that is there, nor a link
             file.write(data)
-        publish(part, path)
+        if synced:
+            publish(part, path)
+        else:
+            part.replace(path)
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)

@@ -108,5 +108,7 @@ def test_a_full_disk_is_one_message_with_sizes_after_the_first_update(monkeypatc
 
     error = capsys.readouterr().err
     assert code == 1
-    assert re.search(r"No space left on device: cannot write 0\.0 MB to .*run\.jsonl, [\d.]+ MB are free\n", error)
+    assert re.search(
+        r"No space left on device: cannot write 0\.0 MB to .*(curriculum\.json|run\.jsonl), [\d.]+ MB are free\n", error
+    )
     assert "No space left on device: cannot write" in Path("out/failed.txt").read_text()

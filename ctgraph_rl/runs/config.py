@@ -207,7 +207,7 @@ def save_yaml(settings: Any, path: Path) -> None:
     """Write settings as Hydra does."""
     buffer = io.StringIO()
     OmegaConf.save(settings, buffer)
-    write_whole(path, buffer.getvalue())
+    write_whole(path, buffer.getvalue(), synced=False)
 
 
 def explain(error: BaseException) -> str:

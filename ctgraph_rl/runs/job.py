@@ -258,7 +258,7 @@ def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
     except Exception as error:
         if failed_before or (run_dir / LOG).exists() or config.in_sweep():
             with suppress(OSError):
-                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n")
+                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
         raise
 
 
