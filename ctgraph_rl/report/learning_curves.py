@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import FEWEST_FOR_BANDS, Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
-from ctgraph_rl.runs.read import Curve
 
 MOST_TASKS = 32
 """Tasks that have a panel."""
@@ -21,7 +21,10 @@ MANY_BLOCKS = 12
 MOST_SEEDS = 20
 """Seeds up to which each has a thin line."""
 
-BANDS = f"the range of seeds, from {FEWEST_FOR_BANDS} seeds on the 95 % interval of their mean"
+BANDS = f"from {FEWEST_FOR_BANDS} seeds on the 95 % interval of their mean"
+Places = Sequence[tuple[float, float]]
+"""Values after numbers of frames."""
+
 COLUMNS = 4
 PLACES = 160
 """Means over equal numbers of frames that the return while training is shown as, in all blocks together."""
@@ -46,7 +49,8 @@ def training_curves(section: Section) -> CaptionedFigure | None:
         return None
     caption = (
         f"Return of the episodes that were finished while training, means over equal numbers of frames. "
-        f"{_agents(section)} Lines: means over seeds; bands: {BANDS}. Dashed: ends of blocks."
+        f"{_agents(section)} Lines: means over seeds; bands: {BANDS}; thin lines: single seeds, of fewer. Dashed: ends "
+        "of blocks."
     )
     return CaptionedFigure("training", "Return while training", caption, draw_training(section))
 
@@ -68,7 +72,8 @@ def draw_tasks(section: Section) -> Any:
     for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
         _mark_blocks(axes, section, task)
         for position, result in enumerate(section.results[:MOST_AGENTS]):
-            seeds = [run.history.evaluations.get(label, []) for run in result.finished if run.history]
+            seeds = [run.history.evaluations.get(label, []) for run in result.finished[: MOST_SEEDS + 1] if run.history]
+            seeds = seeds if len(seeds) <= MOST_SEEDS else []
             _draw(axes, position, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
         axes.set_title(short(label))
     _finish(figure, grid, section, "mean return")
@@ -83,14 +88,22 @@ def draw_training(section: Section) -> Any:
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
     for position, result in enumerate(section.results[:MOST_AGENTS]):
-        runs, bounds = result.finished, result.bounds.of_returns
-        pieces = [
-            training_curve(runs, block, start=start, end=end, places=places, bounds=bounds)
-            for block, (start, end) in blocks
-        ]
-        _draw(axes, position, pieces, ())
+        pieces = _training(result, blocks, places)
+        few = len(result.finished) < FEWEST_FOR_BANDS
+        alone = [_training(replace(result, by_seed={run.seed: run}), blocks, places) for run in result.finished if few]
+        seeds = [[(point.frames, point.value) for point in piece] for each in alone for piece in each if piece]
+        _draw(axes, position, pieces, seeds)
     _finish(figure, [[axes]], section, "return while training")
     return figure
+
+
+def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:
+    """Return the curve of each block."""
+    runs, bounds = result.finished, result.bounds.of_returns
+    return [
+        training_curve(runs, block, start=start, end=end, places=places, bounds=bounds)
+        for block, (start, end) in blocks
+    ]
 
 
 def has_training(section: Section) -> bool:
@@ -109,16 +122,17 @@ def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
             axes.axvspan(start, end, color="0.9", zorder=-1, linewidth=0)
 
 
-def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[Curve]) -> None:
+def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[Places]) -> None:
     """Draw a mean with its band, piece by piece, and thin lines for seeds."""
     look = agent_style(position)
-    if 1 < len(seeds) <= MOST_SEEDS:
+    if len(seeds) > 1:
         for curve in seeds:
             axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
     for points in pieces:
         if points:
             frames = [point.frames for point in points]
             axes.plot(frames, [point.value for point in points], markevery=_every(points), zorder=3, **look)
+        if points and points[0].low is not None:
             lows, highs = zip(*((point.low, point.high) for point in points), strict=True)
             axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
 

@@ -32,8 +32,8 @@ class Point(NamedTuple):
 
     frames: float
     value: float  # mean over seeds
-    low: float  # ends of the band: the interval, or the range of fewer than `FEWEST_FOR_BANDS` seeds
-    high: float
+    low: float | None  # ends of the interval; None for fewer than `FEWEST_FOR_BANDS` seeds
+    high: float | None
     n: int
 
 
@@ -183,11 +183,10 @@ def over_seeds(curves: Sequence[Curve], bounds: Bounds = UNBOUNDED) -> list[Poin
 
 
 def _point(frames: int, values: Sequence[float], bounds: Bounds) -> Point:
-    centre, low, high = math.fsum(values) / len(values), min(values), max(values)
-    if len(values) >= FEWEST_FOR_BANDS:
-        estimate = mean(values, bounds=bounds)
-        low, high = (low, high) if estimate.low is None or estimate.high is None else (estimate.low, estimate.high)
-    return Point(frames, centre, low, high, len(values))
+    if len(values) < FEWEST_FOR_BANDS:
+        return Point(frames, math.fsum(values) / len(values), None, None, len(values))
+    estimate = mean(values, bounds=bounds)
+    return Point(frames, math.fsum(values) / len(values), estimate.low, estimate.high, len(values))
 
 
 def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:

@@ -15,7 +15,7 @@ from ctgraph_rl import RunLog
 from ctgraph_rl.report import __main__ as command
 from ctgraph_rl.report.gallery import Gallery
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.report.sections import evaluation_curve, sections, training_curve
+from ctgraph_rl.report.sections import evaluation_curve, over_seeds, sections, training_curve
 from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
 from ctgraph_rl.runs.load import Trained
@@ -189,8 +189,15 @@ def test_curves_are_means_where_every_seed_has_a_value(tmp_path):
     evaluations = evaluation_curve(found, "goal1")
     training = training_curve(found, block=1, start=0, end=1000, places=1)
 
-    assert evaluations == [(0, 0.0, 0.0, 0.0, 2), (2000, 0.375, 0.25, 0.5, 2)]
-    assert training == [(1000, 0.75, 0.5, 1.0, 2)]
+    assert evaluations == [(0, 0.0, None, None, 2), (2000, 0.375, None, None, 2)]
+    assert training == [(1000, 0.75, None, None, 2)]
+
+
+def test_curves_have_bands_from_ten_seeds_on_within_what_is_possible():
+    curve = over_seeds([[(0, 1.0), (1, float(seed > 0))] for seed in range(10)], bounds=(0, 1))
+
+    assert [(point.high, point.n) for point in curve] == [(1.0, 10), (pytest.approx(0.99747, abs=5e-6), 10)]
+    assert [point.low for point in curve] == pytest.approx([0.69150, 0.55498], abs=5e-6)
 
 
 def test_more_agents_than_colours_are_in_the_tables_and_it_is_said(tmp_path):
