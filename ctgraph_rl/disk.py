@@ -96,6 +96,12 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
+def sync_folders(folder: Path) -> None:
+    """Make a folder and all above it last, whoever has made them."""
+    for each in (folder.absolute(), *folder.absolute().parents):
+        sync_folder(each)
+
+
 def made_folder(folder: Path) -> Path:
     """Make a folder that the package names itself, unless it is there.
 
@@ -103,7 +109,9 @@ def made_folder(folder: Path) -> Path:
         ValueError: if a link is there.
     """
     require_no_link(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    if not folder.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        sync_folder(folder.parent)
     return folder
 
 

@@ -54,6 +54,9 @@ FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
 SCHEMA = 1
 """Raised when a line means something else than before; fields may be added without."""
 
+BEGINNING = b'{"kind": "run"'
+"""Of the first line of a run's log."""
+
 
 class RunLog:
     """Measurements of one run, in memory and, with a path, in a file that is written line by line.
@@ -98,14 +101,18 @@ class RunLog:
 
     def position(self) -> dict[str, float]:
         """Return the length of the file, in bytes that have reached the disk, and the time of the run, in seconds."""
-        size = 0
-        if self._file is not None and self._path is not None:
-            size = self._file.tell()
-            try:
-                os.fsync(self._file.fileno())
-            except OSError as error:
-                raise cannot_write(self._path, size, error) from error
-        return {"bytes": size, "seconds": round(time.perf_counter() - self._start, 3)}
+        return {"bytes": self.sync(), "seconds": round(time.perf_counter() - self._start, 3)}
+
+    def sync(self) -> int:
+        """Let the lines so far reach the disk; return the length of the file, in bytes."""
+        if self._file is None or self._path is None or self._file.closed:
+            return 0
+        size = self._file.tell()
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise cannot_write(self._path, size, error) from error
+        return size
 
     def append(self, kind: str, **values: Any) -> None:
         """Add one measurement; NaN and infinity become null, as JSON has neither."""
@@ -124,9 +131,12 @@ class RunLog:
             listener(measurement)
 
     def close(self) -> None:
-        """Close the file."""
+        """Let all lines reach the disk, and close the file."""
         if self._file is not None:
-            self._file.close()
+            try:
+                self.sync()
+            finally:
+                self._file.close()
 
     @classmethod
     def read(cls, path: Path | str) -> RunLog:
@@ -158,6 +168,22 @@ class RunLog:
             newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
             require((schema <= SCHEMA, newer))
         return log
+
+    @classmethod
+    def begun(cls, path: Path | str) -> dict[str, Any] | None:
+        """Return the first line of a run's log, None where it has none; what follows it may be anything."""
+        try:
+            first = parsed(read_regular(path, MOST_BYTES).partition(b"\n")[0])
+            check(first)
+        except (FileNotFoundError, ValueError):
+            return None
+        return first if first["kind"] == "run" else None
+
+    @classmethod
+    def is_blank(cls, path: Path | str) -> bool:
+        """Return whether a log holds no more than a part of its first line, as where the machine stopped early."""
+        content = Path(path).read_bytes().strip(b"\0")
+        return b"\n" not in content and BEGINNING.startswith(content[: len(BEGINNING)])
 
     def of_kind(self, kind: str) -> list[dict[str, Any]]:
         """Measurements of one kind, in order."""
@@ -324,5 +350,10 @@ def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
 
     One run is one seed, and has no interval; `ctgraph_rl.report.results` has those of several.
     """
+    write_whole(path, metrics_text(metrics))
+
+
+def metrics_text(metrics: Mapping[str, Any]) -> bytes:
+    """Return the content of a file of metrics."""
     content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
-    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+    return (json.dumps(content, indent=2) + "\n").encode()

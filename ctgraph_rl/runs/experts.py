@@ -17,6 +17,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.files import LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.sums import damaged
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
 from ctgraph_rl.tasks.task import Task
 
@@ -42,7 +43,14 @@ class Expert(NamedTuple):
 
     @property
     def log(self) -> RunLog:
-        """Its measurements."""
+        """Its measurements.
+
+        Raises:
+            ValueError: if its files are not what was written.
+        """
+        lost = damaged(self.run_dir)
+        said = f"the expert of task {self.task}, {self.run_dir}, has lost {', '.join(lost)}"
+        require((not lost, f"{said}: the same command trains it again"))
         return RunLog.read(self.run_dir / LOG)
 
 
@@ -112,7 +120,7 @@ def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callabl
 
 
 def _is_trained(run_dir: Path) -> bool:
-    return (run_dir / METRICS).exists()
+    return (run_dir / METRICS).exists() and not damaged(run_dir)
 
 
 def directory_name(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:

@@ -18,11 +18,11 @@ from rich.console import Console
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
-from ctgraph_rl.disk import read_regular, write_whole
-from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOG, METRICS, locked
-from ctgraph_rl.log.measurement import check, parsed
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
-from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.sums import RESULTS, damaged
 from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
@@ -31,7 +31,7 @@ from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import RESULTS, START_AGAIN, MakeAgent, new_agent, remove_results, train, with_method
+from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
@@ -183,12 +183,28 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     stale, unknown = changed_code(cfg, run_dir, {})
     if stale and cfg.overwrite != config.STALE:
         raise FileExistsError(f"{run_dir} holds a run of other code: {', '.join(stale)} changed; {START_AGAIN}")
-    finished = (run_dir / METRICS).exists() and not stale
+    finished = (run_dir / METRICS).exists() and not stale and _is_whole(run_dir)
     if finished:
         print("this configuration was run before; overwrite=true runs it again")
         if unknown:
             print("note: this run does not say of which source it is, so whether that has changed is unknown")
     return finished
+
+
+def _is_whole(run_dir: Path) -> bool:
+    """Return whether the results of a run that says that it is complete are whole; False where it can be resumed.
+
+    Raises:
+        ValueError: if they are damaged and there is no checkpoint.
+    """
+    lost = damaged(run_dir)
+    if not lost:
+        return True
+    said = f"{run_dir} says that it is complete, but {', '.join(lost)} cannot be read or is not what was written"
+    has_checkpoint = bool(Checkpoints(run_dir / CHECKPOINTS).files())
+    require((has_checkpoint, f"{said}: restore it, or run again with overwrite=true"))
+    print(f"{said}: the run is resumed from its last checkpoint")
+    return False
 
 
 def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]]) -> tuple[list[str], bool]:
@@ -228,23 +244,17 @@ def first_line(run_dir: Path) -> Mapping[str, Any] | None:
     Raises:
         FileExistsError: if it holds files that a run would replace, and that are of no run.
     """
+    begun = RunLog.begun(run_dir / LOG)
+    if begun is not None:
+        return begun
     there = [name for name in RESULTS if (run_dir / name).exists()]
-    about = _first_line(run_dir / LOG) if LOG in there else None
-    if about is not None or not there:
-        return about
-    if there == [LOG] and not RunLog.read(run_dir / LOG).measurements:  # stopped while its first line was written
+    if not there:
+        return None
+    if {*there} <= {LOG, CURRICULUM} and LOG in there and RunLog.is_blank(run_dir / LOG):
+        print(f"{run_dir / LOG} has lost its first line, as the machine stopped: the run starts again")
         return None
     advice = "choose another hydra.run.dir, or overwrite=true to replace them"
     raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
-
-
-def _first_line(path: Path) -> Mapping[str, Any] | None:
-    try:
-        about = parsed(read_regular(path, MOST_BYTES).partition(b"\n")[0])
-        check(about)
-    except ValueError:
-        return None
-    return about if about["kind"] == "run" else None
 
 
 @contextmanager

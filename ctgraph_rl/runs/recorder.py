@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.disk import sync_folders
 from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
 from ctgraph_rl.log.files import LOG
@@ -81,12 +82,16 @@ class Recorder:
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
         path = None if self.run_dir is None else self.run_dir / LOG
         if path is not None:
-            if path.exists():
+            if path.exists() and not RunLog.is_blank(path):
                 raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
+            path.unlink(missing_ok=True)
             path.parent.mkdir(parents=True, exist_ok=True)
         self.log = RunLog(path)
         names = None if code is None else [full_name(each) for each in code]
         self.log.append("run", **provenance(curriculum, names), config={"seed": seed, **(about or {})})
+        if path is not None:
+            self.log.sync()
+            sync_folders(path.parent)
         self._evaluator = Evaluator(curriculum, seed, self.log)
         self._frames, self._trained = -1, 0
 
@@ -127,6 +132,7 @@ class Recorder:
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
         before = len(self.log.measurements)
         self._evaluator.evaluate(acts, frames, where)
+        self.log.sync()
         self._frames = frames
         return {m["label"]: m["return_mean"] for m in self.log.measurements[before:]}
 

@@ -20,6 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from ctgraph_rl.disk import read_text
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
+from ctgraph_rl.log.sums import SUMS, is_complete
 
 DONE, STALE, FAILED, IN_USE, MISSING = "done", "stale", "failed", "in use", "missing"
 
@@ -48,7 +49,8 @@ class Outcome(NamedTuple):
     @classmethod
     def of(cls, folder: Path) -> Outcome:
         """Return what a directory holds; no clock is compared, for that of another machine may be behind."""
-        return cls(_identity(folder / METRICS), _identity(folder / FAILURE))
+        results = _identity(folder / METRICS)
+        return cls(results and (results, _content(folder / SUMS)), _identity(folder / FAILURE))
 
 
 NOTHING = Outcome()
@@ -57,6 +59,13 @@ NOTHING = Outcome()
 def holds_results(folder: Path) -> bool:
     """Return whether a run directory holds results or a checkpoint, which a change of code would make stale."""
     return (folder / METRICS).exists() or any((folder / CHECKPOINTS).glob("*.pt"))
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
 
 
 def _identity(path: Path) -> Hashable:
@@ -76,7 +85,7 @@ def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None)
         error: what it raised, where that is known.
     """
     now = Outcome.of(folder)
-    if now.results not in (None, before.results):
+    if now.results not in (None, before.results) and is_complete(folder):
         return Status(DONE)
     user = lock_holder(folder)
     if user is not None:
@@ -85,6 +94,8 @@ def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None)
         return Status(FAILED, error)
     if now.failure not in (None, before.failure):
         return Status(FAILED, _failure(folder))
+    if now.results not in (None, before.results):
+        return Status(MISSING, "its results are not what was written; the next start says more")
     return Status(MISSING, "stopped; the next start resumes it" if (folder / LOG).exists() else "not begun")
 
 

@@ -14,19 +14,21 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require, require_memory
-from ctgraph_rl.disk import append_line, write_whole
+from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
-from ctgraph_rl.log.run_log import RunLog, write_metrics, write_performance
+from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.sums import RESULTS, write_sums
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import Checkpoints, State
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.progress import ProgressBar
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum_json import file_text
 
 MakeAgent = Callable[[Composite, TensorSpec], Agent]
 """Builds an agent for an environment's unbatched observation and action specs."""
@@ -36,10 +38,6 @@ MEMBERS = (
     *("start_task", "end_task", "learn", "to", "state_dict"),
 )
 """Members that a run needs of an agent."""
-
-RESULTS = (LOG, CURRICULUM, AGENT, "evaluations.csv", "training.csv", "performance.csv", METRICS)
-"""Files that a run writes into its directory, in this order; ``metrics.json`` is there when the run is complete,
-``curriculum.json`` where the curriculum has only parts of this package's classes."""
 
 START_AGAIN = "overwrite=stale runs it again from the beginning, as overwrite=true does with any run"
 
@@ -115,9 +113,11 @@ def train(
     log.listeners.extend(listeners)
     if saved is None:
         log.append("run", **about, config=config)
-        write_curriculum(curriculum, run_dir)
         if experts is not None:
             log.append("experts", experts=[expert.about for expert in experts])
+        log.sync()
+        sync_folders(run_dir)
+    write_curriculum(curriculum, run_dir)
     done = 0 if saved is None else saved["frames"]
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
         learn_curriculum(
@@ -134,16 +134,18 @@ def train(
 def write_curriculum(curriculum: Curriculum, run_dir: Path) -> None:
     """Write ``curriculum.json``, or say why it cannot be written: parts of a user's own classes have no JSON."""
     try:
-        curriculum.to_json(run_dir / CURRICULUM)
+        write_whole(run_dir / CURRICULUM, file_text(curriculum.to_json()))
     except ValueError as error:
         print(f"note: {CURRICULUM} is not written, so loading this run needs the curriculum: {terminal_text(error)}")
 
 
 def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: Sequence[RunLog] | None = None) -> None:
-    """Write the tables of a log and, last of all, its metrics."""
+    """Write the tables of a log that is closed, the sums of all results and, last of all, the metrics."""
     write_tables(log, run_dir, parquet=False)
     write_performance(run_dir / "performance.csv", log, curriculum.labels)
-    write_metrics(run_dir / METRICS, scores(log, curriculum, experts))
+    metrics = scores(log, curriculum, experts)
+    write_sums(run_dir, metrics_text(metrics))
+    write_metrics(run_dir / METRICS, metrics)
 
 
 def _new_log(run_dir: Path) -> RunLog:
@@ -154,8 +156,16 @@ def _new_log(run_dir: Path) -> RunLog:
 
 def remove_results(run_dir: Path) -> None:
     """Remove what a run left: first what says that it is complete, last what says that there was one."""
+    _reopen(run_dir)
     for name in (*reversed(RESULTS[1:]), RESTARTS, LOG):
         (run_dir / name).unlink(missing_ok=True)
+
+
+def _reopen(run_dir: Path) -> None:
+    """Remove what says that a run is complete, for good before anything else of it is changed."""
+    if (run_dir / METRICS).exists():
+        (run_dir / METRICS).unlink()
+        sync_folder(run_dir)
 
 
 def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
@@ -164,10 +174,10 @@ def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: 
     Raises:
         ValueError: if the log does not fit the checkpoint, and if ``strict`` for what may change the run's bits.
     """
-    path = run_dir / LOG
-    runs = RunLog.read(path).of_kind("run") if path.exists() else []
-    require((bool(runs), f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"))
-    before, same = runs[0], ("versions", "machine", "num_threads")
+    path, same = run_dir / LOG, ("versions", "machine", "num_threads")
+    before = RunLog.begun(path) or {}
+    lost = f"{run_dir} has checkpoints, but no {LOG} of a run: restore it, or start with overwrite=true"
+    require((bool(before), lost))
     changed = ", ".join(code_changes(before, about))
     require((not changed, f"{run_dir} was begun with other code: {changed} changed; {START_AGAIN}"))
     other = {key: [before.get(key), about[key]] for key in same if before.get(key) != about[key]}
@@ -175,6 +185,7 @@ def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: 
     require((not (strict and other), f"{message}; resume=warn resumes it all the same"))
     if other:
         warnings.warn(message, stacklevel=2)
+    _reopen(run_dir)
     log = RunLog.resume(path, saved["log"])
     append_line(run_dir / RESTARTS, {"frames": saved["frames"], "versions": about["versions"], **machine()})
     return log

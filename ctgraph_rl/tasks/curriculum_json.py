@@ -68,7 +68,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
         _check_form(content)
     content[_DERIVED] = _about(curriculum)
     if path is not None:
-        write_whole(path, _text(content) + "\n")
+        write_whole(path, file_text(content))
     return content
 
 
@@ -121,6 +121,11 @@ def _about(curriculum: Curriculum) -> dict[str, Any]:
             for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
         ],
     }
+
+
+def file_text(content: Mapping[str, Any]) -> str:
+    """Return the text of the file of a curriculum that is given as JSON."""
+    return _text(content) + "\n"
 
 
 def _text(value: Any, margin: str = "\n") -> str:

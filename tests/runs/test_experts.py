@@ -29,9 +29,14 @@ def write_result(trained: list):
 
     def learn(alone, run_dir):
         trained.append(alone)
-        (run_dir / "metrics.json").write_text("{}")
+        finish(run_dir)
 
     return learn
+
+
+def finish(run_dir, log: str = '{"kind": "run"}\n', metrics: str = "{}") -> None:
+    (run_dir / "run.jsonl").write_text(log)
+    (run_dir / "metrics.json").write_text(metrics)
 
 
 def test_an_expert_has_its_task_alone_for_the_frames_of_its_first_block():
@@ -139,14 +144,14 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
         def waiting():
             waited.append(1)
             if len(waited) == 3:
-                (run_dir / "metrics.json").write_text("theirs")
+                finish(run_dir, metrics='{"theirs": 1}')
                 other.close()
 
         learn = lambda *_: pytest.fail("trained twice")  # noqa: E731
         (expert,) = find_or_train(curriculum(Block(ONE, 12)), learn, tmp_path, SETTINGS, print, waiting)
 
     assert len(waited) == 3
-    assert (expert.run_dir / "metrics.json").read_text() == "theirs"
+    assert (expert.run_dir / "metrics.json").read_text() == '{"theirs": 1}'
 
 
 def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, monkeypatch, tmp_path):
