@@ -54,7 +54,7 @@ def test_a_run_writes_its_results_and_nothing_else(finished):
     hydra_files = {".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml"}
 
     tables = {"evaluations.csv", "training.csv", "performance.csv"}
-    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "agent.pt", "curriculum.json"}
+    assert set(RESULTS) == {"run.jsonl", *tables, "metrics.json", "sums.json", "agent.pt", "curriculum.json"}
     assert files_in(finished) == {f"out/{name}" for name in {*hydra_files, *RESULTS}}
 
 
