@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 from pathlib import Path
 
@@ -99,11 +100,12 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_block_and_loss(monkey
 
 def test_a_full_disk_is_one_message_with_sizes_after_the_first_update(monkeypatch, capsys, tmp_path):
     def full(number):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        if os.readlink(f"/proc/self/fd/{number}").endswith("run.jsonl"):
+            raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr("ctgraph_rl.log.files.os.fsync", full)
+        patch.setattr("ctgraph_rl.disk.os.fsync", full)
         code = command_line(monkeypatch, *SHORT, "hydra.run.dir=out")
 
     error = capsys.readouterr().err

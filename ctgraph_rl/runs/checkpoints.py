@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from ctgraph_rl.checks import is_int
-from ctgraph_rl.disk import PART, made_folder, require_no_link, write_whole
+from ctgraph_rl.disk import PART, made_folder, require_no_link, sync_folder, write_whole
 from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.interrupt import Interrupt
 
@@ -123,8 +123,10 @@ class Checkpoints:
         return None
 
     def clear(self) -> None:
-        """Remove all."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove all, for good."""
+        if self.folder.exists():
+            shutil.rmtree(self.folder, ignore_errors=True)
+            sync_folder(self.folder.parent)
 
     def tidy(self) -> None:
         """Remove what was being written when a process was killed."""

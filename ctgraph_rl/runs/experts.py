@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder
-from ctgraph_rl.log.files import LOG, METRICS, locked
+from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.sums import damaged
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
@@ -106,7 +107,9 @@ def find_or_train(
         found = _is_trained(expert.run_dir)
         state = "found in" if found else "learns into"
         tell(f"expert {expert.task} of {len(experts)}, {label}: {state} {expert.run_dir}")
-        if not found:
+        if found:
+            shutil.rmtree(expert.run_dir / CHECKPOINTS, ignore_errors=True)  # if it was stopped at its very end
+        else:
             _train(each, learn, expert.run_dir, waiting)
     return experts
 

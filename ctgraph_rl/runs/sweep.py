@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import CHECKPOINTS
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import become_portable
 from ctgraph_rl.runs.config import check_overwrite, save_yaml
@@ -96,7 +97,8 @@ class Sweeper(Base):
         cells = self.cells(batch)
         again = cells if overwrite is True else self._stale
         before = {folder: Outcome.of(folder) if folder in again else NOTHING for folder in cells}
-        left = [folder for folder in cells if status_of(folder, before[folder]).state != DONE]
+        done = {folder for folder in cells if status_of(folder, before[folder]).state == DONE}
+        left = [folder for folder in cells if folder not in done or (folder / CHECKPOINTS).exists()]  # to remove these
         errors: dict[Path, str] = {}
         try:
             if left and not self.status and (overwrite or not self._stale):

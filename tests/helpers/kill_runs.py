@@ -9,6 +9,7 @@ fork one that has imported everything.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import random
@@ -23,6 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from ctgraph_rl.log.sums import TABLES, damaged
 
 TINY = ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", "checkpoint_seconds=0.01"]
 BLOCKS = ["curriculum=fo_b1_4tasks", "curriculum.num_frames=512", "evaluation.num_episodes=4", "evaluation.every=256"]
@@ -169,6 +172,24 @@ def differences(one: Path, other: Path) -> list[str]:
     found += ["run.jsonl"] if logs[0] != logs[1] else []
     left = [path for path in other.rglob("*") if path.name.endswith(".part") or path.name in ("checkpoints", ".lock")]
     return found + [f"{path} is left" for path in left]
+
+
+def unlike(whole: Path, other: Path) -> list[str]:
+    """All in which the runs of two folders differ."""
+    pairs = [(path.parent, other / path.parent.relative_to(whole)) for path in sorted(whole.rglob("metrics.json"))]
+    found = [f"{run} has no metrics.json" for _, run in pairs if not (run / "metrics.json").exists()]
+    for one, run in () if found else pairs:
+        found += [f"{name} is damaged" for name in damaged(run)]
+        found += [name for name in TABLES if untimed(one / name) != untimed(run / name)]
+        found += differences(one, run) if (one / "agent.pt").exists() else []
+        found += [name for name in COMPARED if (one / name).read_bytes() != (run / name).read_bytes()]
+        found += ["run.jsonl"] if lines(one) != lines(run) else []
+    return found
+
+
+def untimed(table: Path) -> list[dict[str, str]]:
+    with table.open(newline="") as file:
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
 
 
 def lines(run_dir: Path) -> list[dict[str, Any]]:

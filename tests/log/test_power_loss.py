@@ -8,7 +8,6 @@ the same command must end with the results of the run that was never stopped.
 from __future__ import annotations
 
 import builtins
-import csv
 import io
 import os
 import random
@@ -23,18 +22,21 @@ from typing import Any
 import hydra
 import numpy as np
 import pytest
-from helpers.kill_runs import differences, lines
+from helpers.kill_runs import unlike
 from helpers.scripted import DECISION_ID, ONE, TWO
 from helpers.small_agents import TINY
 from helpers.sweeping import sweep
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from ctgraph_rl import Block, Curriculum, Evaluation
-from ctgraph_rl.log.sums import TABLES, damaged
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog
+from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.job import run_job
 from ctgraph_rl.runs.recorder import Recorder
+from ctgraph_rl.runs.status import status_of
 
 CHANGES = ("fsync", "replace", "rename", "unlink", "remove", "mkdir", "rmdir", "truncate")
 """Functions of `os` that change files and folders, or make changes last."""
@@ -231,7 +233,7 @@ SCENARIOS: dict[str, tuple[Callable[[], None], Callable[[], None] | None]] = {
 }
 """What is watched, and what was there before."""
 
-CASES = {"checkpoints": 50, "experts": 50, "overwritten": 40, "swept": 20, "recorded": 40}
+CASES = {"checkpoints": 60, "experts": 50, "overwritten": 50, "swept": 20, "recorded": 20}
 """Number of states of each, 200 in all."""
 
 
@@ -273,28 +275,6 @@ def check(watched, name: str, count: int, tmp_path: Path, monkeypatch) -> None:
     assert problems == []
 
 
-def unlike(whole: Path, other: Path) -> list[str]:
-    """All in which the runs of two folders differ."""
-    pairs = [(path.parent, other / path.parent.relative_to(whole)) for path in sorted(whole.rglob("metrics.json"))]
-    found = [f"{run} has no metrics.json" for _, run in pairs if not (run / "metrics.json").exists()]
-    for one, run in () if found else pairs:
-        found += [f"{name} is damaged" for name in damaged(run)]
-        found += [name for name in TABLES if untimed(one / name) != untimed(run / name)]
-        found += differences(one, run) if (one / "agent.pt").exists() else []
-        found += [
-            name
-            for name in ("metrics.json", "curriculum.json")
-            if (one / name).read_bytes() != (run / name).read_bytes()
-        ]
-        found += ["run.jsonl"] if lines(one) != lines(run) else []
-    return found
-
-
-def untimed(table: Path) -> list[dict[str, str]]:
-    with table.open(newline="") as file:
-        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_a_run_whose_machine_stopped_ends_as_if_it_had_not(watched, tmp_path, monkeypatch, name):
     check(watched, name, CASES[name] // 10, tmp_path, monkeypatch)
@@ -304,3 +284,114 @@ def test_a_run_whose_machine_stopped_ends_as_if_it_had_not(watched, tmp_path, mo
 @pytest.mark.parametrize("name", CASES)
 def test_200_runs_whose_machine_stopped_end_as_if_it_had_not(watched, tmp_path, monkeypatch, name):
     check(watched, name, CASES[name], tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory) -> Path:
+    """The folder of a finished run whose checkpoints were not yet removed."""
+    folder = tmp_path_factory.mktemp("complete")
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()):
+        patch.chdir(folder)
+        patch.setattr(Checkpoints, "clear", lambda _: None)
+        start()
+    return folder
+
+
+@pytest.fixture
+def copied(complete, tmp_path, monkeypatch) -> Path:
+    """The directory of that run, which a test may change."""
+    shutil.copytree(complete, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    return tmp_path / "copy" / "runs" / "one"
+
+
+LOST = {
+    **{name: lambda _: b"" for name in RESULTS if name != "run.jsonl"},
+    "run.jsonl": lambda content: content[: content.rindex(b"\n", 0, -1) + 1],
+    "performance.csv": lambda content: bytes(len(content)),
+}
+"""What the machine may leave of each file."""
+
+
+@pytest.mark.parametrize("has_sums", [True, False])
+@pytest.mark.parametrize("name", LOST)
+def test_a_complete_run_with_a_damaged_file_is_resumed_from_its_checkpoint(copied, complete, capsys, name, has_sums):
+    if not has_sums:
+        (copied / "sums.json").unlink()
+        if name in ("run.jsonl", "sums.json"):
+            pytest.skip("a log that lacks whole lines is readable")
+    (copied / name).write_bytes(LOST[name]((copied / name).read_bytes()))
+
+    start()
+
+    said = (
+        f"runs/one says that it is complete, but {name} cannot be read or is not what was written: the run is resumed"
+    )
+    assert said in capsys.readouterr().out
+    assert unlike(complete, copied.parents[1]) == []
+
+
+@pytest.mark.parametrize("name", ["agent.pt", "training.csv", "sums.json"])
+def test_without_a_checkpoint_a_damaged_run_is_refused_and_left_as_it_is(copied, name):
+    shutil.rmtree(copied / "checkpoints")
+    (copied / name).write_bytes(b"")
+    before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
+
+    with pytest.raises(
+        ValueError, match=rf"complete, but {name} cannot be read .*: restore it, or run again with over"
+    ):
+        start()
+
+    after = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
+    assert {path: after[path] for path in before} == before
+    assert status_of(copied).state != "done"
+
+
+@pytest.mark.parametrize("log", [b"", bytes(300), b'{"kind": "run", "sche', b'{"kind"' + bytes(99)])
+def test_a_run_that_lost_its_first_line_starts_again(tmp_path, complete, monkeypatch, capsys, log):
+    monkeypatch.chdir(tmp_path)
+    run_dir = Path("runs/one")
+    run_dir.mkdir(parents=True)
+    (run_dir / "run.jsonl").write_bytes(log)
+    (run_dir / "curriculum.json").write_bytes(b"")
+
+    start()
+
+    assert "has lost its first line, as the machine stopped: the run starts again" in capsys.readouterr().out
+    assert unlike(complete, tmp_path) == []
+
+
+@pytest.mark.parametrize("log", [b"", bytes(300), b'{"kind": "run", "sche'])
+def test_a_recording_that_lost_its_first_line_starts_again(tmp_path, log):
+    (tmp_path / "run.jsonl").write_bytes(log)
+
+    Recorder(LEARNED, tmp_path).log.close()
+
+    assert RunLog.begun(tmp_path / "run.jsonl")["curriculum"] == "recorded"
+
+
+def test_what_follows_a_checkpoint_may_be_anything(copied, complete):
+    saved = Checkpoints(copied / "checkpoints").newest()
+    (copied / "metrics.json").unlink()
+    log = (copied / "run.jsonl").read_bytes()[: int(saved["log"]["bytes"])]
+    (copied / "run.jsonl").write_bytes(log + bytes(50) + b'\n{"kind": "training"}\n')
+
+    start()
+
+    assert unlike(complete, copied.parents[1]) == []
+
+
+@pytest.mark.parametrize("lost", [lambda log: b"", lambda log: log[: log.index(b"\n") + 1]])
+def test_an_expert_that_lost_its_measurements_is_noticed_and_trained_again(watched, tmp_path, monkeypatch, lost):
+    whole, _ = watched("experts")
+    shutil.copytree(whole, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    Path("runs/one/metrics.json").unlink()
+    (log, *_) = sorted(Path("runs/experts").rglob("run.jsonl"))
+    log.write_bytes(lost(log.read_bytes()))
+
+    with pytest.raises(ValueError, match=r"has lost run\.jsonl: the same command trains it again"):
+        _ = Expert(1, "", log.parent).log
+    experts()
+
+    assert unlike(whole, tmp_path / "copy") == []
