@@ -17,9 +17,10 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import MLP, QValueActor
 from torchrl.objectives import DQNLoss
 
-from baselines.networks import Data, encoder
-from baselines.q_learning import QLearner
-from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, true_or_false
+from baselines.networks import Data, encoder, require_weights
+from baselines.prioritized import LARGEST_ALPHA
+from baselines.q_learning import QLearner, require_replay
+from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 
 class DQN(QLearner):
@@ -59,7 +60,10 @@ class DQN(QLearner):
             *true_or_false(double=double),
             *fraction(priority_beta=priority_beta),
             *not_negative(priority_alpha=priority_alpha),
+            *at_most(LARGEST_ALPHA, priority_alpha=priority_alpha),
         )
+        require_weights(observation_spec, hidden_size, 2, action_spec.space.n)
+        require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
         self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
         super().__init__(gamma=gamma, **settings)
         head = MLP(hidden_size, action_spec.space.n, num_cells=[hidden_size], activation_class=nn.ReLU)

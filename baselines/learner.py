@@ -18,6 +18,9 @@ from baselines.networks import Data
 from baselines.optimisers import functional_step
 from ctgraph_rl.checks import at_least_one, positive, require, true_or_false
 
+MOST_PASSES = 10**6
+"""Passes over a batch, or gradient steps after it; more do not end."""
+
 LARGEST_WEIGHT = 1e12
 """Beyond this a network has diverged, and its outputs soon overflow."""
 

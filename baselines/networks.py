@@ -14,6 +14,8 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor, ValueOperator
 
+from ctgraph_rl.checks import require_memory
+
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
 
@@ -152,6 +154,20 @@ def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, 
         h = o.sigmoid() * c.tanh()
         memory.append(h)
     return torch.cat(memory)
+
+
+def require_weights(
+    observation_spec: Composite, hidden_size: int, num_layers: int = 1, num_outputs: int = 1, memory: bool = False
+) -> None:
+    """Refuse networks whose weights, gradients and moments of Adam the machine cannot hold.
+
+    Raises:
+        ValueError: names the layers and the bytes.
+    """
+    num_inputs = observation_spec["observation"].shape.numel()
+    squares = num_layers - 1 + (8 if memory else 0)
+    count = hidden_size * (num_inputs + squares * hidden_size + num_outputs)
+    require_memory(f"weights of hidden_size={hidden_size} in num_layers={num_layers}", 16 * count, "or smaller layers")
 
 
 def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:

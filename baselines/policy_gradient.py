@@ -23,10 +23,17 @@ from baselines.networks import (
     log_probabilities,
     make_orthogonal,
     recurrent,
+    require_weights,
     zero_state,
 )
 from baselines.optimisers import OPTIMISERS, make_optimiser
-from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require, true_or_false
+from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
+
+MOST_LAYERS = 1000
+"""Far beyond what trains."""
+
+SMALLEST_DECAY = 1e-6
+"""TorchRL's advantages leave out terms below 1e-7, and need at least one."""
 
 ACTED_KEYS = ("action", "action_log_prob", "state_value")
 
@@ -80,11 +87,16 @@ class PolicyGradient(Learner):
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
         require(
             *at_least_one(hidden_size=hidden_size, num_layers=num_layers),
+            *at_most(MOST_LAYERS, num_layers=num_layers),
             *one_of(OPTIMISERS, optimiser=optimiser),
             *positive(learning_rate=learning_rate, gamma=gamma, gae_lambda=gae_lambda),
             *fraction(gamma=gamma, gae_lambda=gae_lambda),
             *true_or_false(normalize_advantage=normalize_advantage, orthogonal_init=orthogonal_init),
         )
+        decay = gamma * gae_lambda
+        rule = f"gamma * gae_lambda must be >= {SMALLEST_DECAY:g}, got {gamma!r} * {gae_lambda!r} = {decay:g}"
+        require((decay >= SMALLEST_DECAY, f"{rule}; use a larger gae_lambda"))
+        require_weights(observation_spec, hidden_size, num_layers, action_spec.space.n + 1, self.memory)
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
         self.features = "memory" if self.memory else "features"

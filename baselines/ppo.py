@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
+from baselines.learner import MOST_PASSES
 from baselines.networks import Data
 from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss
-from ctgraph_rl.checks import at_least_one, is_int, not_negative, positive, require
+from ctgraph_rl.checks import at_least_one, at_most, is_int, not_negative, positive, require
 
 
 class PPO(PolicyGradient):
@@ -45,8 +46,10 @@ class PPO(PolicyGradient):
     ) -> None:
         require(
             *positive(clip_epsilon=clip_epsilon),
+            *at_most(1, clip_epsilon=clip_epsilon),
             *not_negative(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff),
             *at_least_one(num_epochs=num_epochs, num_minibatches=num_minibatches),
+            *at_most(MOST_PASSES, num_epochs=num_epochs),
         )
         super().__init__(observation_spec, action_spec, **settings)
         require(self._split_rule(num_minibatches))

@@ -14,6 +14,9 @@ from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 
+LARGEST_ALPHA = 4
+"""Beyond it the powers of errors leave the range of float32; Schaul et al. use 0.6 and 0.7."""
+
 
 class PrioritySampler(Sampler):
     """Draws item i with probability p_i^alpha / sum p^alpha, with replacement, from torch's global generator.

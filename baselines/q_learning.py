@@ -7,18 +7,39 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
+from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
 from torchrl.data.postprocs import MultiStep
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from baselines.learner import Learner
+from baselines.learner import MOST_PASSES, Learner
 from baselines.networks import Data
 from baselines.optimisers import make_optimiser
 from baselines.prioritized import PrioritySampler
-from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
+from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
+
+LONGEST_TARGET = 10**4
+"""Most steps of a multi-step target: beyond any episode that replay can hold, and held as a table."""
+
+
+def require_replay(observation_spec: Composite, buffer_size: int, batch_size: int, size: int = 1) -> None:
+    """Refuse a replay buffer, and minibatches of it, that the machine cannot hold.
+
+    Args:
+        observation_spec: the environment's, without batch dimensions.
+        buffer_size: steps in the buffer.
+        batch_size: items of a minibatch.
+        size: numbers that an item of a minibatch takes beside its observations.
+
+    Raises:
+        ValueError: names the sizes and the bytes.
+    """
+    observation = observation_spec["observation"].shape.numel()
+    require(*at_least_one(buffer_size=buffer_size, batch_size=batch_size))
+    require_memory(f"replay of buffer_size={buffer_size} steps", buffer_size * observation, "steps")
+    require_memory(f"minibatches of batch_size={batch_size}", batch_size * (observation + 4 * size), "items")
 
 
 class EpsilonGreedy(TensorDictSequential):
@@ -85,6 +106,8 @@ class QLearner(Learner):
         require(
             *at_least_one(**counts, target_update_interval=target_update_interval),
             *at_least_one(annealing_num_steps=annealing_num_steps),
+            *at_most(MOST_PASSES, num_updates=num_updates),
+            *at_most(LONGEST_TARGET, n_steps=n_steps),
             *positive(gamma=gamma),
             *fraction(gamma=gamma, eps_init=eps_init, eps_end=eps_end),
             *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),

@@ -17,8 +17,8 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
 from torchrl.objectives.common import LossModule
 
-from baselines.networks import STATE_KEYS, Data, recurrent, zero_state
-from baselines.q_learning import QLearner
+from baselines.networks import STATE_KEYS, Data, recurrent, require_weights, zero_state
+from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 
 
@@ -115,6 +115,10 @@ class RecurrentQ(QLearner):
             *positive(learning_rate=learning_rate),
             (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
         )
+        num_outputs = action_spec.space.n * self.num_quantiles
+        require_weights(observation_spec, hidden_size, 1, num_outputs, memory=True)
+        pairs = num_steps * self.num_quantiles**2
+        require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
         self.trunk = recurrent(observation_spec, hidden_size, 1)
         head = Quantiles(hidden_size, action_spec.space.n, self.num_quantiles)

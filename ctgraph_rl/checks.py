@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+LARGEST_INT = 2**63 - 1
+"""Of an int64."""
+
+LONGEST_NAME, LONGEST_PATH = 255, 4095
+"""Bytes of a part of a path, and of a path, that file systems take."""
 
 
 def require(*rules: tuple[bool, str]) -> None:
@@ -57,6 +65,33 @@ def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bo
         return False
 
 
+def as_path(name: str, value: object) -> Path:
+    """Return a path that a file system can take.
+
+    Raises:
+        ValueError: for what is no path, has a null character, or is too long.
+    """
+    require((isinstance(value, (str, os.PathLike)), f"{name} must be a path, got {value!r:.80}"))
+    path = Path(value)  # type: ignore[arg-type]
+    longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
+    fits = longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
+    shown = f"got {len(str(path)):,} characters, {str(path)!r:.80}"
+    require(
+        ("\0" not in str(path), f"{name} must have no null character, got {str(path)!r:.80}"),
+        (fits, f"{name} must have at most {LONGEST_PATH} bytes, {LONGEST_NAME} in each part; {shown}"),
+    )
+    return path
+
+
+def is_json_object(value: object) -> bool:
+    """Return whether a value is None, or plain values of JSON by name."""
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return value is None or isinstance(value, Mapping)
+
+
 def is_shallow(value: object, levels: int) -> bool:
     """True for a value of JSON with at most so many lists and objects within each other."""
     if not isinstance(value, (dict, list)):
@@ -66,8 +101,23 @@ def is_shallow(value: object, levels: int) -> bool:
 
 
 def at_least_one(**values: object) -> list[tuple[bool, str]]:
-    """Rules that each named value is an integer >= 1."""
-    return [(is_int(value, 1), f"{name} must be an integer >= 1, got {value!r}") for name, value in values.items()]
+    """Rules that each named value is an integer in 1..2**63 - 1."""
+    return [
+        (is_int(value, 1, LARGEST_INT), f"{name} must be an integer {_limit(value)}, got {value!r}")
+        for name, value in values.items()
+    ]
+
+
+def _limit(value: object) -> str:
+    return "< 2**63" if is_int(value, 1) else ">= 1"
+
+
+def at_most(limit: float, **values: object) -> list[tuple[bool, str]]:
+    """Rules that each named number is no larger than a limit; what is no number breaks other rules."""
+    return [
+        (not is_real(value) or value <= limit, f"{name} must be at most {limit:,}, got {value!r}")  # type: ignore[operator]
+        for name, value in values.items()
+    ]
 
 
 def positive(**values: object) -> list[tuple[bool, str]]:
@@ -91,7 +141,7 @@ def not_negative(**values: object) -> list[tuple[bool, str]]:
 def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is one of the choices."""
     return [
-        (value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        (isinstance(value, str) and value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
         for name, value in values.items()
     ]
 

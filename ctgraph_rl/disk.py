@@ -52,6 +52,11 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
         raise cannot_write(path, len(data), error) from error
 
 
+def is_writable(folder: Path | str) -> bool:
+    """Return whether files can be made in a folder; on a read-only file system nobody can."""
+    return os.access(folder, os.W_OK)
+
+
 def publish(made: Path, path: Path) -> None:
     """Move a finished file of the same file system to its place, so that after a power cut it is there whole, or not.
 

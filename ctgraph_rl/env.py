@@ -16,8 +16,10 @@ from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.core import dynamics
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
@@ -87,6 +89,7 @@ class CTGraphEnv(EnvBase):
         require(*((isinstance(v, bool), f"{name} must be true or false, got {v!r}") for name, v in flags.items()))
         tasks = require_all(Task, "tasks", tasks)
         self.num_task_ids = _num_task_ids(task_ids, num_task_ids)
+        device = None if device is None else checked_device(device)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions, self.info = check_actions, info
         self.rows = Rows(
@@ -366,8 +369,10 @@ def _num_task_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None)
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
         return 0
     ids = list(task_ids.values()) if isinstance(task_ids, Mapping) else [task_ids]
-    require((bool(ids) and all(is_int(i, 0) for i in ids), f"task_ids must be integers >= 0, got {ids[:5]!r}"))
+    by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
+    require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
     needed = max(ids) + 1
     room = needed if num_task_ids is None else num_task_ids
-    require((is_int(room, needed), f"num_task_ids must be an integer >= {needed}, the largest id + 1, got {room!r}"))
+    rule = f"num_task_ids must be an integer in {needed}..{MOST_IDS}, from the largest id + 1, got {room!r}"
+    require((is_int(room, needed, MOST_IDS), rule))
     return room

@@ -26,11 +26,12 @@ FLOORS = (
     ("packages", "batch", "agent", "curricula"),
     ("env", "gym", "log"),
     ("policies", "sb3"),
-    ("learn", "benchmark"),
+    ("learn",),
     ("runs", "baselines"),
     ("visualize", "hydra_plugins"),
     ("report",),
     ("cli", "run", "describe"),
+    ("benchmark",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.batch.params import Tables
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import one_of, require
 from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown
 from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
@@ -22,7 +22,7 @@ KERNELS = ("auto", "off", "required")
 
 def kernel_rule(kernel: object) -> tuple[bool, str]:
     """Return the rule for values of ``kernel``."""
-    return kernel in KERNELS, f"kernel must be one of {', '.join(KERNELS)}, got {kernel!r}"
+    return one_of(KERNELS, kernel=kernel)[0]
 
 
 def knows(reward_fns: Iterable[RewardFn], device: torch.device) -> bool:

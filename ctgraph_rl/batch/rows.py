@@ -14,6 +14,7 @@ from ctgraph_rl.batch.params import make_tables, shared_bank
 from ctgraph_rl.batch.tensor_engine import TensorEngine
 from ctgraph_rl.checks import is_int, require, require_all
 from ctgraph_rl.core import dynamics, philox
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.kernel import is_available, is_traced
@@ -89,6 +90,7 @@ class Rows(nn.Module):
             (is_int(noise_bank, 0, 2**31), f"noise_bank must be an integer in 0..2**31, got {noise_bank!r}"),
             kernel_rule(kernel),
         )
+        device = None if device is None else checked_device(device)
         super().__init__()
         self.kernel = kernel
         self.pool = pool

@@ -11,7 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_of_episodes
@@ -58,9 +59,12 @@ def evaluate(
         ValueError: for values out of range, a task with changing goals and one episode a row, and a reference policy
             that was built on another environment.
     """
+    tasks = require_all(Task, "tasks", tasks)
     Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
     bound = isinstance(policy, RandomPolicy)
+    require((callable(policy), f"policy must be a function or a module that writes actions, got {policy!r:.80}"))
     require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
+    device = checked_device(device)
     rows = [task for task in tasks for _ in range(num_episodes // episodes_per_row)]
     env = CTGraphEnv(rows, seed, device=device) if curriculum is None else make_env(curriculum, rows, seed, device)
     acts = policy(env) if isinstance(policy, type) else policy

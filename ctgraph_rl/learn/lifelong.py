@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import batches, make_env
 from ctgraph_rl.learn.evaluate import Evaluator, episode_means
@@ -68,8 +69,9 @@ def learn_curriculum(
         FloatingPointError: if a loss or weight is not finite; names it, block and frames.
     """
     log = RunLog() if log is None else log
+    device = checked_device(device)
     check_rows(curriculum, agent.num_envs)
-    _check_ids(curriculum, agent)
+    check_ids(curriculum, agent)
     env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
     evaluator = Evaluator(curriculum, seed, log, device)
     if saved is None:
@@ -232,7 +234,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     require(*rules.values())
 
 
-def _check_ids(curriculum: Curriculum, agent: Agent) -> None:
+def check_ids(curriculum: Curriculum, agent: Agent) -> None:
     """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
     reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
     shows = curriculum.protocol.task_id == "one_hot"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from ctgraph_rl.checks import is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import LARGEST_INT, is_int, is_real, is_shallow, require
 
 MOST = 10**6
 """Largest number of a block or task: tables are as long."""
@@ -94,6 +94,10 @@ def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
     missing = [name for name in NEEDED.get(kind if isinstance(kind, str) else "", ()) if name not in measurement]
     require(
         *((holds(value), f"{name} must be {what}, got {value!r:.80}") for (holds, what), name, value in rules),
+        *(
+            (not is_int(value) or is_int(value, -LARGEST_INT, LARGEST_INT), f"{name} must be an integer of 64 bits")
+            for name, value in measurement.items()
+        ),
         (not missing, f"{', '.join(missing)} must be there"),
         (is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
     )

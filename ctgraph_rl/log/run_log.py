@@ -33,7 +33,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import as_path, require
 from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
@@ -76,7 +76,7 @@ class RunLog:
         self._num_bytes = MOST_BYTES  # of the file that was read
         self.listeners: list[Callable[[dict[str, Any]], object]] = []
         self._start = time.perf_counter()
-        self._path = None if path is None else Path(path)
+        self._path = None if path is None else as_path("path", path)
         self._file: BinaryIO | None = None
         if self._path is not None:
             self._file = open_own(self._path, "xb")
@@ -149,7 +149,7 @@ class RunLog:
                 most `MOST_BYTES`, and for numbers of blocks and tasks that a file of its size cannot measure.
         """
         log = cls()
-        content = read_regular(path, MOST_BYTES)
+        content = read_regular(as_path("path", path), MOST_BYTES)
         lines, log._num_bytes = content.splitlines(), len(content)
         most = FEW + len(content) // BYTES_OF_A_NUMBER
         for number, line in enumerate(lines, 1):
@@ -274,7 +274,7 @@ class RunLog:
         mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
         several = f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several"
         require((not mixed, several))
-        said = {m["task"]: str(m.get("label", f"task {m['task']}")) for m in self._evaluations(during=True)}
+        said = {m["task"]: label_of(m) for m in self._evaluations(during=True)}
         require((all(block[0] + 1 in said for block in tasks), "lifelong metrics need an evaluation of every task"))
         label = said if labels is None else dict(enumerate(labels, 1))
         names: dict[str, int] = {}
@@ -322,6 +322,11 @@ class RunLog:
         most = min(MOST_CELLS, FEW_CELLS + CELLS_OF_A_BYTE * self._num_bytes)
         require((size <= most, f"a table of {len(rows):,} x {len(tasks):,} is no run's: restore the log"))
         return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
+
+
+def label_of(evaluation: Mapping[str, Any]) -> str:
+    """Return the name of the task of an evaluation: its label, or its number where it has none."""
+    return str(evaluation.get("label", f"task {evaluation['task']}"))
 
 
 def _row(values: Sequence[float | None]) -> Tensor:

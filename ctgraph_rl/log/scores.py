@@ -73,6 +73,11 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
         learned = run.get("fingerprint", given)
         other = f"the log is of {run.get('curriculum')} (fingerprint {learned}), not of {curriculum.name} ({given})"
         require((learned == given, f"{other}: give the curriculum that the run learned, with all its changes"))
+    tasks = max((m["task"] for m in log.of_kind("evaluation") if not m.get("held_out")), default=0)
+    blocks = max((m["block"] for kind in ("training", "evaluation") for m in log.of_kind(kind)), default=0)
+    most = len(curriculum.tasks), len(curriculum.blocks)
+    more = f"the log has task {tasks} and block {blocks}, {curriculum.name} has {most[0]} tasks and {most[1]} blocks"
+    require((tasks <= most[0] and blocks <= most[1], f"{more}: give the curriculum that the run learned"))
 
 
 def optimal_values(tasks: Sequence[Task]) -> Tensor:
@@ -106,7 +111,7 @@ def _known(value: Callable[[Task, float], float], task: Task) -> float:
 
 def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
     """The evaluation curves; where nothing was evaluated, one evaluation without values."""
-    if log.of_kind("evaluation"):
+    if any(not m.get("held_out") for m in log.of_kind("evaluation")):
         return log.curves(curriculum.trained)
     return Curves(torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64), (0,), (0,), curriculum.trained)
 

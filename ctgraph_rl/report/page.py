@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.disk import is_writable, made_folder, write_whole
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 from ctgraph_rl.report import results
 from ctgraph_rl.report.code_states import code_notes, mixed_code
@@ -84,7 +84,8 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
 
     Args:
         paths: run directories, or folders that hold them.
-        folder: where the report goes; None: ``report`` within the one path, or within the working directory.
+        folder: where the report goes; None: ``report`` within the one path, or, of several or a read-only one, within
+            the working directory.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
@@ -94,7 +95,8 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
     runs, problems = find_runs(paths)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
     if folder is None:
-        folder = made_folder(Path(paths[0]) / "report" if len(paths) == 1 else Path("report"))
+        within = len(paths) == 1 and is_writable(paths[0])
+        folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
     gallery = Gallery(Path(folder))
     parts = [_part(section, gallery) for section in sections(runs)]
     about = {

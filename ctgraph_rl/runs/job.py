@@ -17,8 +17,9 @@ from rich.console import Console
 
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import is_writable, write_whole
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
@@ -137,13 +138,17 @@ class Job:
 
 
 def run_job(cfg: DictConfig, run_dir: Path) -> None:
-    """Run a configuration in an existing directory, unless its results are there.
+    """Run a configuration in an existing directory, unless its results are there; a read-only one may hold them.
 
     Raises:
         ValueError: before any work, for a value out of range.
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    if (run_dir / METRICS).exists() and not is_writable(run_dir):  # no lock either, and nobody else can write
+        config.check_values(cfg)
+        if is_finished(cfg, run_dir):
+            return
     with locked(run_dir):
         with marked_if_it_fails(run_dir) if config.in_sweep() and not (run_dir / METRICS).exists() else nullcontext():
             config.check_values(cfg)
@@ -270,18 +275,6 @@ def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
             with suppress(OSError):
                 write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
         raise
-
-
-def checked_device(name: str) -> torch.device:
-    """Return the torch device of a name.
-
-    Raises:
-        ValueError: if there is no such device on this machine; lists the choices.
-    """
-    choices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    choices += [f"cuda:{i}" for i in range(torch.cuda.device_count())]
-    require((name in choices, f"device must be one of {', '.join(choices)} on this machine, got {name!r}"))
-    return torch.device(name)
 
 
 def curriculum_of(cfg: DictConfig, method: Method) -> Curriculum:

@@ -15,7 +15,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.agent import Agent, Method
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import as_path, is_int, require
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, read_plain, require_records
@@ -72,7 +73,7 @@ def load(
         FileNotFoundError: if there is no run, or none that has been saved.
         ValueError: for an agent, a method or a curriculum that must be given, and files that do not belong together.
     """
-    run_dir = Path(run_dir)
+    run_dir, device = as_path("run_dir", run_dir), checked_device(device)
     if not (run_dir / LOG).exists():
         raise FileNotFoundError(f"{run_dir} holds no run: there is no {LOG}")
     log = RunLog.read(run_dir / LOG)
@@ -88,7 +89,7 @@ def load(
         with torch.random.fork_rng():
             agent = new_agent(learned, build, seed, device)
         agent.load_state_dict(weights)
-    except (RuntimeError, KeyError, TypeError, AttributeError) as error:
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{run_dir} holds weights that are not of the agent that was built: {error}") from error
     return Trained(agent, learned, seed, frames, log)
 

@@ -18,7 +18,7 @@ from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog
+from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
 from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
@@ -175,8 +175,10 @@ def read_run(path: Path) -> Run:
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
     ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if metrics else []
-    success, returns = ({m["label"]: m.get(name) for m in ends} for name in ("success_rate", "return_mean"))  # the last
-    tasks = list(dict.fromkeys(m["label"] for m in ends if not m.get("held_out")))
+    success, returns = (
+        {label_of(m): m.get(name) for m in ends} for name in ("success_rate", "return_mean")
+    )  # the last
+    tasks = list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out")))
     results: dict[str, Any] = {
         "metrics": metrics,
         "success": success,
@@ -257,7 +259,7 @@ def _history(log: RunLog) -> History:
     performance = log.performance().tolist()
     evaluations: dict[str, Curve] = {}
     for m in own:
-        evaluations.setdefault(m["label"], []).append((m["frames"], _number(m["return_mean"])))
+        evaluations.setdefault(label_of(m), []).append((m["frames"], _number(m["return_mean"])))
     training: dict[int, Curve] = {}
     for m in log.of_kind("training"):
         if m["return_mean"] is not None:
@@ -277,7 +279,7 @@ def _history(log: RunLog) -> History:
 def _labels(log: RunLog, own: Iterable[Mapping[str, Any]], count: int) -> tuple[str, ...]:
     """Name of each task, as the first line says or else its evaluations."""
     said = log.of_kind("run")[0].get("tasks") or ()
-    known = {**dict(enumerate(said, 1)), **{m["task"]: m["label"] for m in own}}
+    known = {**dict(enumerate(said, 1)), **{m["task"]: label_of(m) for m in own}}
     return tuple(str(known.get(task, f"task {task}")) for task in range(1, count + 1))
 
 

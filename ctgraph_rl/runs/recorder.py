@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import as_path, is_int, is_json_object, require
 from ctgraph_rl.disk import sync_folders
 from ctgraph_rl.learn.collect import Policy
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
@@ -75,11 +74,11 @@ class Recorder:
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
             ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
-            (_is_json(about), f"about must be plain JSON values by name, got {about!r}"),
+            (is_json_object(about), f"about must be plain JSON values by name, got {about!r}"),
             (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
-        self.curriculum, self.run_dir = curriculum, None if run_dir is None else Path(run_dir)
+        self.curriculum, self.run_dir = curriculum, None if run_dir is None else as_path("run_dir", run_dir)
         path = None if self.run_dir is None else self.run_dir / LOG
         if path is not None:
             if path.exists() and not RunLog.is_blank(path):
@@ -195,14 +194,6 @@ class Recorder:
         return by_slices(
             [adapt(policy_for(ids[task]), greedy, shown == "one_hot") for task in self._evaluator.tasks_at(frames)]
         )
-
-
-def _is_json(about: object) -> bool:
-    try:
-        json.dumps(about)
-    except (TypeError, ValueError):
-        return False
-    return about is None or isinstance(about, Mapping)
 
 
 def _is_code(code: object) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
-from ctgraph_rl.checks import require, require_memory
+from ctgraph_rl.batch.rows import seed_rule
+from ctgraph_rl.checks import as_path, is_json_object, require, require_memory
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
-from ctgraph_rl.learn.lifelong import check_rows, learn_curriculum
+from ctgraph_rl.learn.lifelong import check_ids, check_rows, learn_curriculum
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
@@ -51,19 +54,44 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     Raises:
         ValueError: if it cannot learn the curriculum.
     """
+    example = "make_agent must be a function of two specs, such as partial(PPO, num_envs=8, ...)"
+    require(_curriculum_rule(curriculum), seed_rule(seed), (callable(make_agent), f"{example}, got {make_agent!r:.80}"))
+    device = checked_device(device)
     torch.manual_seed(seed)
     specs = agent_specs(curriculum)
+    require(_takes_specs(make_agent))
     agent: Agent = make_agent(*specs)
-    missing = [name for name in MEMBERS if not hasattr(agent, name)]
-    require(
-        (not missing, f"{type(agent).__name__} is no agent, it lacks {', '.join(missing)}: see ctgraph_rl.agent.Agent")
-    )
+    require(_agent_rule(agent))
     frames = agent.num_envs * agent.num_steps
     batch = f"batches of num_envs={agent.num_envs} x num_steps={agent.num_steps} frames"
     require_memory(batch, 2 * frames * specs.observation["observation"].shape.numel(), "of either")
     agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
     return agent
+
+
+def _curriculum_rule(curriculum: object) -> tuple[bool, str]:
+    return isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"
+
+
+def _agent_rule(agent: object) -> tuple[bool, str]:
+    missing = [name for name in MEMBERS if not hasattr(agent, name)]
+    built = not missing and not isinstance(agent, type)
+    fix = "see ctgraph_rl.agent.Agent, and build it by new_agent(curriculum, make_agent, seed)"
+    name = getattr(agent, "__name__", type(agent).__name__)
+    return built, f"{name} is no agent, it lacks {', '.join(missing)}: {fix}"
+
+
+def _takes_specs(make_agent: Callable[..., object]) -> tuple[bool, str]:
+    """The rule that a function can be called with the two specs."""
+    try:
+        signature(make_agent).bind(None, None)
+    except TypeError as error:
+        name = getattr(make_agent, "__name__", type(make_agent).__name__)
+        return False, f"make_agent must take two specs and nothing else, {name}: {error}; bind the rest, by partial"
+    except ValueError:  # what has no signature
+        pass
+    return True, ""
 
 
 def with_method(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
@@ -96,15 +124,27 @@ def train(
         run_dir: an existing directory.
         seed: decides the run, in [0, 2**63).
         device: where the environment lives, and the agent.
-        config: what else the first line of the log should hold.
+        config: what the first line of the log holds beside the seed, as JSON.
         experts: the single-task expert of each task; they are named in the log.
         checkpoints: default: those in the directory, every five minutes.
         listeners: are called with every measurement.
         console: where progress shows; default: standard error.
 
     Raises:
-        ValueError: if the directory holds a run that cannot be resumed.
+        ValueError: before any work, for arguments out of range and an agent that cannot learn the curriculum; and if
+            the directory holds a run that cannot be resumed.
     """
+    run_dir = as_path("run_dir", run_dir)
+    require(
+        _curriculum_rule(curriculum),
+        _agent_rule(agent),
+        seed_rule(seed),
+        (is_json_object(config), f"config must be plain JSON values by name, got {config!r:.80}"),
+        (run_dir.is_dir(), f"run_dir must be an existing directory, got {str(run_dir)!r:.80}; make it"),
+    )
+    device, config = checked_device(device), {"seed": seed, **(config or {})}
+    check_rows(curriculum, agent.num_envs)
+    check_ids(curriculum, agent)
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
     checkpoints.tidy()
     saved = checkpoints.newest()

@@ -13,7 +13,7 @@ from itertools import accumulate
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.checks import as_path, as_tuple, is_int, require
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, write_curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
@@ -53,6 +53,7 @@ class Curriculum:
         require(
             (isinstance(self.name, str) and bool(self.name), f"a curriculum needs a name, got {self.name!r}"),
             (is_int(self.version, 1), f"version must be an integer >= 1, got {self.version!r}"),
+            (isinstance(self.source, str), f"source must be a text, got {self.source!r:.80}"),
             (only_blocks, f"a curriculum needs at least one Block and nothing else, got {self.blocks!r}"),
             (isinstance(self.evaluation, Evaluation), f"evaluation must be an Evaluation, got {self.evaluation!r}"),
             (isinstance(self.protocol, Protocol), f"protocol must be a Protocol, got {self.protocol!r}"),
@@ -159,7 +160,7 @@ class Curriculum:
         Raises:
             ValueError: for a file that exists, and rewards, image sets or switches that are not of this package.
         """
-        return write_curriculum(self, path)
+        return write_curriculum(self, None if path is None else as_path("path", path))
 
     @classmethod
     def from_json(cls, path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> Curriculum:

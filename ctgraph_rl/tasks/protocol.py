@@ -47,7 +47,7 @@ class Block:
         switches = self.switch is None or (is_dataclass(self.switch) and switch_rule(self.switch)[0])
         require(
             (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
-            *at_least_one(num_frames=self.num_frames),
+            (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
             (switches, f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}"),
         )
         enough = self.switch is None or len(self.tasks) > 1

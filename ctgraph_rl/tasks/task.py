@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, is_int, is_real, require, true_or_false
+from ctgraph_rl.checks import as_path, as_tuple, is_int, is_real, one_of, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.tasks import reference, values
@@ -127,7 +127,7 @@ class Task:
         Raises:
             ValueError: lists everything of the task that the file cannot express.
         """
-        return reference.write_task(self, path, general_seed)
+        return reference.write_task(self, None if path is None else as_path("path", path), general_seed)
 
     def _check_parts(self) -> None:
         images, reward_fn, shown = self.images, self.reward_fn, self.observations
@@ -150,13 +150,14 @@ class Task:
             *true_or_false(extra_end_step=self.extra_end_step, legacy_goal_change=self.legacy_goal_change),
             (is_real(self.reward_std, 0), f"reward_std must be >= 0, got {self.reward_std!r}"),
             (self._noise_is_finite(), f"goal_reward times reward_std must be at most {LARGEST_REWARD:g} in size"),
-            (self.reward_noise in NOISES, f"reward_noise must be one of {NOISES}, got {self.reward_noise!r}"),
+            *one_of(NOISES, reward_noise=self.reward_noise),
             (lasts, f"goal_change must be (first, last) with 1 <= first <= last <= 2**31, got {change!r}"),
             (cues, f"reward_cue needs goal_reward > 0, got {self.goal_reward!r}"),
         ]
 
     def _noise_is_finite(self) -> bool:
-        if self.reward_noise != "multiplicative" or not (is_real(self.goal_reward) and is_real(self.reward_std)):
+        multiplicative = isinstance(self.reward_noise, str) and self.reward_noise == "multiplicative"
+        if not multiplicative or not (is_real(self.goal_reward) and is_real(self.reward_std)):
             return True
         return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 

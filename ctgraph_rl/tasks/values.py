@@ -52,7 +52,8 @@ def optimal_value(task: Task, gamma: float) -> float:
         ValueError: for a gamma out of range, and rewards other than `Needle` beyond `MAX_ENUMERATED_STATES` states.
     """
     require(*fraction(gamma=gamma))
-    return _value_at_home(smallest_tree(task, is_needle(task)), BestActions(task, gamma))
+    tree = _GoalAndAnother(task) if is_needle(task) else smallest_tree(task, False)
+    return _value_at_home(tree, BestActions(task, gamma))
 
 
 def worst_value(task: Task, gamma: float) -> float:
@@ -239,6 +240,14 @@ class _GoalPath:
         children = values[1].repeat(2, self.task.graph.branching_factor)
         children[0, self.task.goal[level] - 1] = values[0]
         return children
+
+
+class _GoalAndAnother(_GoalPath):
+    """`_GoalPath` with two of the b decisions, which are all that a best choice depends on."""
+
+    def children(self, values: Tensor, level: int) -> Tensor:
+        """Values of level + 1 by parent, of the decision for the goal and of any other one: float64 [2, 2]."""
+        return torch.stack([values, values[1].repeat(2)])
 
 
 @dataclass(frozen=True)

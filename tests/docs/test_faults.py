@@ -16,11 +16,11 @@ from helpers.scripted import ONE
 from helpers.stopped_runs import with_header
 
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, Observations, OneHot, RunLog
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.run import run
 from ctgraph_rl.runs.checkpoints import decoded
 from ctgraph_rl.runs.config import run_name
-from ctgraph_rl.runs.job import checked_device
 from ctgraph_rl.runs.read import find_runs
 from curricula.paper import ct_su_b1
 

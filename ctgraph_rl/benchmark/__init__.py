@@ -30,6 +30,7 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.benchmark import sizes
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
@@ -294,7 +295,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
     parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
+    parser.add_argument("--sizes", type=int, nargs="*", help="instead: readers of curricula and logs, by tasks")
     options = parser.parse_args(arguments)
+    if options.sizes is not None:
+        require(*at_least_one(**{f"sizes[{i}]": n for i, n in enumerate(options.sizes)}))
+        print(f"{machine()}\n\n{sizes.table(sizes.measured(options.sizes or sizes.SIZES))}")
+        return
     require(
         *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
         *positive(seconds=options.seconds),
@@ -308,7 +314,3 @@ def main(arguments: list[str] | None = None) -> None:
     for one in track(measured * options.rounds, "measuring", console=console):
         one.measure(options.seconds)
     print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(measured)}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,5 @@
+"""``python -m ctgraph_rl.benchmark``."""
+
+from ctgraph_rl.benchmark import main
+
+main()
