@@ -1,9 +1,9 @@
-"""How fast the environment runs: ``python -m ctgraph_rl.benchmark``.
+"""How fast the environment runs, and with ``--sizes`` what reading costs: ``python -m ctgraph_rl.benchmark``.
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
-table has the medians of the rounds. An observation is one row for one step. The yardsticks are memset and memcpy of as
-many bytes as the observations have, and a native TorchRL environment that does nothing but count, where some rows end
-at every step, as in any batch of episodes.
+table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of
+as many bytes as the observations have, and a native TorchRL environment that does nothing but count, where some rows
+end at every step, as in any batch of episodes.
 """
 
 from __future__ import annotations

@@ -161,6 +161,7 @@ class Protocol:
     task_ids: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
+        require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
         ids = as_tuple(self.task_ids)
         object.__setattr__(self, "task_ids", ids)
         is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0, MOST_IDS) for i in ids))
@@ -168,8 +169,6 @@ class Protocol:
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
         is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
-            *one_of(TASK_IDS, task_id=self.task_id),
-            *one_of(BOUNDARIES, boundaries=self.boundaries),
             (is_length, f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}"),
             (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
             (names_ids, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
