@@ -302,7 +302,8 @@ def test_the_status_of_a_cell_is_read_from_its_directory(tmp_path):
     found.append(status_of(tmp_path))
     with locked(tmp_path):
         found.append(status_of(tmp_path))
-    (tmp_path / "metrics.json").touch()
+    (tmp_path / "run.jsonl").write_text("{}\n")
+    (tmp_path / "metrics.json").write_text("{}")
     found.append(status_of(tmp_path))
 
     assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
@@ -343,7 +344,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     cells = [tmp_path / str(number) for number in range(300)]
     for cell in cells[:10]:
         cell.mkdir()
-        (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).touch()
+        (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).write_text("{}")
     progress = SweepProgress(dict.fromkeys(cells, Outcome()), console=Console(file=io.StringIO()))
 
     done, failed, running = progress.look()
@@ -361,7 +362,7 @@ def test_progress_on_a_terminal_ends_with_the_cells_that_were_done_last(tmp_path
     with SweepProgress(dict.fromkeys([tmp_path / "a", tmp_path / "b"], Outcome()), console):
         for name in "ab":
             (tmp_path / name).mkdir()
-            (tmp_path / name / "metrics.json").touch()
+            (tmp_path / name / "metrics.json").write_text("{}")
 
     assert "2/2 cells done" in shown.getvalue()
 
@@ -370,7 +371,7 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
 
-    (tmp_path / "metrics.json").touch()  # done before, so it tells nothing of the rate
+    (tmp_path / "metrics.json").write_text("{}")  # done before, so it tells nothing of the rate
 
     cells = dict.fromkeys([tmp_path, tmp_path / "b"], Outcome())
     with SweepProgress(cells, console=Console(file=shown)) as progress:
