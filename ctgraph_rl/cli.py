@@ -10,7 +10,7 @@ from ctgraph_rl.packages import command
 
 COMMANDS = {
     "agents": "baselines.__main__",
-    "compare": "ctgraph_rl.report.compare",
+    "compare": "ctgraph_rl.compare",
     "curricula": "curricula.__main__",
     "draw": "ctgraph_rl.visualize.draw",
     "export": "ctgraph_rl.log.export",

@@ -30,7 +30,7 @@ FLOORS = (
     ("runs", "baselines"),
     ("visualize", "hydra_plugins"),
     ("report",),
-    ("cli", "run", "describe"),
+    ("cli", "run", "describe", "compare"),
     ("benchmark",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""

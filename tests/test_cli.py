@@ -169,7 +169,7 @@ def test_an_unknown_command_is_refused_with_the_choices(call):
     code, *_ = call(cli.main, "curiculum")
 
     assert str(code).startswith(
-        "error: unknown command 'curiculum'; did you mean 'curricula'? Commands: agents, curricula, "
+        "error: unknown command 'curiculum'; did you mean 'curricula'? Commands: agents, compare, curricula, "
     )
 
 
