@@ -72,6 +72,7 @@ def test_the_first_line_of_the_log_holds_all_that_the_numbers_depend_on(finished
         "seed",
         "device",
         "num_threads",
+        "portable",
         "evaluation",
         "protocol",
         "experts",
