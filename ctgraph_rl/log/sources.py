@@ -217,7 +217,7 @@ def syntax(tree: ast.AST) -> Iterator[str]:
         elif isinstance(part, list):
             waiting += [_Text("]"), *reversed(part), _Text("[")]
         else:
-            yield part if isinstance(part, _Text) else repr(part)
+            yield part if isinstance(part, _Text) else ascii(part)
 
 
 def _joined(parts: Iterable[ast.expr]) -> Iterator[Any]:

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import METRICS
-from ctgraph_rl.report.code_states import print_problems
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.report.terminal import print_summary
+from ctgraph_rl.report.terminal import print_problems, print_summary
 
 
 def main() -> None:

@@ -25,8 +25,8 @@ from ctgraph_rl.disk import write_named
 from ctgraph_rl.log.escape import csv_text, latex_text, markdown_text, terminal_lines, terminal_text
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
-from ctgraph_rl.report.code_states import print_problems
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
+from ctgraph_rl.report.terminal import print_problems
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 
 SOLVED = 0.9

@@ -201,6 +201,10 @@ def test_targets_are_found_at_any_depth():
     assert list(targets(settings)) == ["mine.Agent", "mine.loss", "mine.Images"]
 
 
+def test_characters_that_only_some_versions_can_print_do_not_count():
+    assert "'\\U0002ebf0'" in syntax(ast.parse("x = '\U0002ebf0'")), "a letter since Unicode 15.1, of Python 3.13"
+
+
 def test_what_is_no_python_counts_byte_by_byte():
     assert read_module("mine", b"x = (").digest != read_module("mine", b"x = ((").digest
     assert Path(ctgraph_rl.log.sources.__file__).read_text().count("import ctgraph_rl") == 0

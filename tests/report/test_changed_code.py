@@ -16,7 +16,7 @@ from ctgraph_rl import Recorder, RunLog, metrics
 from ctgraph_rl.log import provenance
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.report import page, results
-from ctgraph_rl.report.code_states import code_notes, mixed_code
+from ctgraph_rl.report.terminal import code_notes, mixed_code
 from ctgraph_rl.runs import config, job
 from ctgraph_rl.runs.read import grouped
 from ctgraph_rl.runs.train import new_agent, train
@@ -273,7 +273,7 @@ def test_runs_of_one_configuration_whose_curriculum_changed_are_named(mine, ran,
 
 def test_runs_of_an_older_numbers_version_are_named(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20,21")
-    monkeypatch.setattr("ctgraph_rl.report.code_states.NUMBERS", 2)
+    monkeypatch.setattr("ctgraph_rl.report.terminal.NUMBERS", 2)
     capsys.readouterr()
 
     assert run_results(monkeypatch) == 0
