@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -86,16 +86,26 @@ def become_portable() -> None:
     """Ask for a restart of the command with `VARIABLES`, unless this process is portable.
 
     Raises:
-        Restart: which the command's entry point takes to `restart`.
-        ValueError: see `check_portable`; once torch is imported it is too late for a restart.
+        Restart: which the command's entry point answers with `restart`.
+        ValueError: for a CPU that lacks instructions.
     """
-    if "torch" not in sys.modules and not _has_variables() and not _lacking():
+    if not _has_variables() and not _lacking():
         raise Restart
     check_portable()
 
 
-def restart(environment: Mapping[str, str]) -> NoReturn:
-    """Start the command of this process again, in the same process, with `VARIABLES` in its environment."""
+def restart(environment: Mapping[str, str], arguments: Sequence[str]) -> NoReturn:
+    """Start the command of this process again, in the same process, with `VARIABLES` in its environment.
+
+    Args:
+        environment: of the command, as it was given.
+        arguments: of the command, as they were given.
+
+    Raises:
+        ValueError: in a process that was started for something else, such as a notebook's.
+    """
+    if sys.orig_argv[len(sys.orig_argv) - len(arguments) :] != list(arguments):
+        check_portable()
     sys.stdout.flush()
     sys.stderr.flush()
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**environment, **VARIABLES})

@@ -78,20 +78,21 @@ def _job(cfg: DictConfig) -> None:
 
 def main() -> None:
     """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
-    environment = dict(os.environ)
+    environment, arguments = dict(os.environ), sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
     sys.argv[1:] = sweepable(sys.argv[1:])
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
-        _job()
+        try:
+            _job()
+        except Restart:
+            restart(environment, arguments)
     except (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError) as error:
         if full_error:
             raise
         print(f"error: {terminal_lines(explain(error))}", file=sys.stderr)
         sys.exit(1)
-    except Restart:
-        restart(environment)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)
         sys.exit(130)

@@ -105,11 +105,11 @@ def test_processes_of_a_portable_sweep_are_portable(tmp_path, monkeypatch, conso
     assert [first["machine"] for first in firsts] == [f"{platform.machine()} portable"] * 2
 
 
-def test_before_torch_is_imported_the_command_starts_again_as_it_was_given(monkeypatch):
+def test_a_command_starts_again_as_it_was_given(monkeypatch):
     started = []
     monkeypatch.setattr(os, "execve", lambda *call: started.append(call))
-    monkeypatch.delitem(sys.modules, "torch")
-    monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", "/bin/ctgraph-rl", "portable=true"])
+    monkeypatch.setattr(sys, "argv", ["/bin/ctgraph-rl", "portable=true"])
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", *sys.argv])
     monkeypatch.setattr(run, "_job", become_portable)
     monkeypatch.delenv("HYDRA_FULL_ERROR")
     before = dict(os.environ)
@@ -122,8 +122,6 @@ def test_before_torch_is_imported_the_command_starts_again_as_it_was_given(monke
 
 
 def test_a_portable_process_does_not_start_again(prepared, monkeypatch):
-    monkeypatch.delitem(sys.modules, "torch")
-
     become_portable()
 
     monkeypatch.setenv("MKL_CBWR", "AVX2")
@@ -131,7 +129,7 @@ def test_a_portable_process_does_not_start_again(prepared, monkeypatch):
         become_portable()
 
 
-def test_once_torch_is_imported_a_portable_run_is_refused_with_the_variables(monkeypatch, capsys, tmp_path):
+def test_in_a_process_of_another_command_a_portable_run_is_refused_with_the_variables(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     for sweep in ([], ["-m"]):

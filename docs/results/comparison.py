@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from raw import HERE, Raw, groups, mean_of, read, share_of, shown, table, write
+from raw import HERE, Raw, groups, machine_of, mean_of, read, share_of, shown, table, write
 
 from ctgraph_rl import metrics
 from ctgraph_rl.log.run_log import RunLog
@@ -80,13 +80,14 @@ def evaluations(run_dir: Path) -> Raw:
     if "-" in agent:
         agent, method = agent.split("-")
     who = {"curriculum": run_dir.parent.name, "fingerprint": about["fingerprint"], "agent": agent}
-    cell = {**who, "method": method, "seed": str(about["config"]["seed"])}
+    cell = {**who, "method": method, "seed": str(about["config"]["seed"]), **machine_of(about)}
     lines = _lines(cell, log.of_kind("evaluation"))
     experts = [expert for line in log.of_kind("experts") for expert in line["experts"]]
     own = []
     for expert in experts:
         alone = RunLog.read(run_dir.parent.parent / "experts" / Path(expert["run"]).name / "run.jsonl")
         own += [{**line, "task": expert["task"]} for line in alone.of_kind("evaluation")]
+        cell |= machine_of(alone.of_kind("run")[0])
     return lines + _lines({**cell, "method": EXPERT}, own)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import comparison
 import pairs
-from raw import HERE, Raw, groups, mean_of, read, share_of, table, write
+from raw import HERE, Raw, groups, machine_of, machines, mean_of, read, share_of, table, write
 
 if TYPE_CHECKING:
     from ctgraph_rl import Task
@@ -54,7 +54,8 @@ def collect(name: str, folder: Path) -> None:
 def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
     """The part of a line that says what was learned by whom."""
     (task,) = trained.curriculum.tasks
-    configured = trained.log.of_kind("run")[0]["config"]["curriculum"]
+    about = trained.log.of_kind("run")[0]
+    configured = about["config"]["curriculum"]
     return {
         "configuration": configured.get("configuration", trained.curriculum.name),
         "depth": task.graph.depth,
@@ -63,6 +64,7 @@ def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
         "seed": trained.seed,
         "frames": trained.frames,
         "fingerprint": trained.curriculum.fingerprint,
+        **machine_of(about),
     }
 
 
@@ -190,11 +192,17 @@ def main_job(raw: Raw) -> str:
 
 def collect_main_job(folder: Path) -> None:
     """Write the evaluations of all runs of the main job under a folder."""
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+
     lines = []
     for run in sorted(folder.rglob("evaluations.csv")):
+        kept, (about,) = (
+            ("seed", "block", "frames", "label", "return_mean"),
+            RunLog.read(run.parent / LOG).of_kind("run"),
+        )
         with open(run, newline="", encoding="utf-8") as file:
-            kept = ("seed", "block", "frames", "label", "return_mean")
-            lines += [{key: line[key] for key in kept} for line in csv.DictReader(file)]
+            lines += [{**{key: line[key] for key in kept}, **machine_of(about)} for line in csv.DictReader(file)]
     write("main_job", lines)
 
 
@@ -233,13 +241,19 @@ def page() -> str:
     tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
     tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
-    return template.substitute(tables, main_job=main_job(read("main_job")), **learned_and_met(), **rerun())
+    return template.substitute(
+        tables,
+        main_job=main_job(read("main_job")),
+        machines=machines("main_job", *AGENTS),
+        **learned_and_met(),
+        **rerun(),
+    )
 
 
 def lifelong_page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
-    return template.substitute(comparison.tables() | pairs.tables())
+    return template.substitute(comparison.tables() | pairs.tables(), machines=machines(*comparison.EXPERIMENTS))
 
 
 def draw(path: Path) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,11 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 
 Raw = list[dict[str, str]]
+
+MACHINE = ("machine", "cpu")
+"""Columns for the kind of machine, with its instruction set, and the CPU's model; earlier files lack them."""
+
+NOT_RECORDED = "not recorded"
 
 
 def read(name: str) -> Raw:
@@ -33,10 +39,23 @@ def write(name: str, lines: Sequence[dict[str, Any]]) -> None:
     """
     if not lines:
         raise ValueError(f"no raw results of {name}, whose file stays as it was: give the folder of its runs")
+    columns = dict.fromkeys(column for line in lines for column in line)
     with open(HERE / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
+        writer = csv.DictWriter(file, list(columns), restval=NOT_RECORDED)
         writer.writeheader()
         writer.writerows(lines)
+
+
+def machine_of(about: Mapping[str, Any]) -> dict[str, str]:
+    """The machine of a run, as the first line of its log says it."""
+    return {key: str(about.get(key) or NOT_RECORDED) for key in MACHINE}
+
+
+def machines(*names: str) -> str:
+    """A sentence about the machines that the rows of tables are of."""
+    rows = [line for name in names for line in read(name)]
+    counts = Counter(", ".join(dict.fromkeys(line.get(key) or NOT_RECORDED for key in MACHINE)) for line in rows)
+    return "; ".join(f"{count:,} of {len(rows):,} rows: {what}" for what, count in sorted(counts.items()))
 
 
 def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:

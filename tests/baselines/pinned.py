@@ -110,7 +110,7 @@ def main() -> None:
     try:
         become_portable()
     except Restart:
-        restart(os.environ)
+        restart(os.environ, sys.argv[1:])
     found = all_digests()
     if sys.argv[1:] == ["--print"]:
         print(json.dumps(found))

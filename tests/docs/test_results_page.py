@@ -178,3 +178,22 @@ def test_where_nothing_is_left_to_chance_is_as_the_page_says(make):
     assert without == {"fo_b1", "su_b1"}
     assert "On CT-FO-B1 and CT-SU-B1 nothing is left to chance" in make.PAGE.read_text(encoding="utf-8")
     assert all(task.is_deterministic for task in curricula.load("su_b1_4tasks").tasks)
+
+
+def test_raw_results_say_the_machine_of_each_run_and_where_it_is_not_recorded(make, monkeypatch, tmp_path):
+    raw = sys.modules["raw"]
+    monkeypatch.setattr(raw, "HERE", tmp_path)
+    earlier, new, unknown = {"seed": "0"}, {"machine": "x86_64 AVX512", "cpu": "AMD EPYC"}, {"machine": "x86_64 AVX2"}
+
+    raw.write(
+        "table", [earlier, {"seed": "1", **raw.machine_of({**new, "num_threads": 1})}, {**raw.machine_of(unknown)}]
+    )
+
+    assert [(line["machine"], line["cpu"]) for line in raw.read("table")] == [
+        ("not recorded", "not recorded"),
+        ("x86_64 AVX512", "AMD EPYC"),
+        ("x86_64 AVX2", "not recorded"),
+    ]
+    assert raw.machines("table") == (
+        "1 of 3 rows: not recorded; 1 of 3 rows: x86_64 AVX2, not recorded; 1 of 3 rows: x86_64 AVX512, AMD EPYC"
+    )
