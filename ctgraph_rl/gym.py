@@ -391,7 +391,7 @@ def _frames(env: CTGraphGymEnv | CTGraphVectorEnv) -> tuple[Frame, ...] | None:
 
 for _name in ("CTGraph", *CONFIGURATIONS):
     gymnasium.register(
-        f"ctgraph/{_name}-v0",
+        f"ctgraph/{_name}-v{int(_name == 'CT-POSR-B1')}",  # version 0 of CT-POSR-B1 had noise in its rewards
         entry_point="ctgraph_rl.gym:CTGraphGymEnv",
         vector_entry_point="ctgraph_rl.gym:CTGraphVectorEnv",
         kwargs={"task": _name} if _name in CONFIGURATIONS else {},

@@ -158,6 +158,18 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
     return each(tasks, vary)
 
 
+def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) -> Tasks:
+    """Each task with images that vary whenever they are read; see `Observations`.
+
+    Args:
+        tasks: a task or several, with images.
+        read_noise: largest addition to each pixel, in 0..255.
+        read_rotation: largest rotation in whole degrees, in 0..359.
+    """
+    varied = {"read_noise": read_noise, "read_rotation": read_rotation}
+    return each(tasks, lambda task: [replace(task, observations=replace(task.observations, **varied))])
+
+
 # shape
 
 

@@ -25,7 +25,7 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
 
 def from_axes(
     configuration: str = "su_b1",
-    branching_factor: int | None = None,
+    branching_factor: int | Sequence[int] | None = None,
     depth: int | Sequence[int] | None = None,
     wait_prob: float | Sequence[float] | None = None,
     image_seeds: int | Sequence[int] = 1,
@@ -38,6 +38,9 @@ def from_axes(
     switch: str | None = None,
     switch_episodes: int = 100,
     name: str = "axes",
+    read_noise: int = 0,
+    read_rotation: int = 0,
+    random_graphs: int | None = None,
 ) -> Curriculum:
     """Tasks that differ in goal, images, depth and wait probability, in a chosen order.
 
@@ -46,7 +49,7 @@ def from_axes(
 
     Args:
         configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
-        branching_factor: another b; None: as configured.
+        branching_factor: another b, or several for ``random_graphs``; None: as configured.
         depth: another d, or several: then all have the ids of the deepest graph. None: as configured.
         wait_prob: another p, or several; None: as configured.
         image_seeds: seed of the image set, or several.
@@ -63,26 +66,41 @@ def from_axes(
             drifting from each task to the next in that many episodes (``drift``).
         switch_episodes: for ``switch``.
         name: of the curriculum.
+        read_noise: largest addition to each pixel whenever an image is read, in 0..255.
+        read_rotation: largest rotation whenever an image is read, in whole degrees in 0..359.
+        random_graphs: how many tasks to draw from ``seed``, each with one of the branching factors, depths, wait
+            probabilities and image seeds, and any goal. None: all combinations.
 
     Raises:
         ValueError: for values out of range; lists the choices.
     """
     require((order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"))
-    task, depths = _deepest(configuration, branching_factor, depth)
-    _check_goals(goals, depths)
-    if goals == "nested":
-        (task,) = axes.random_goals(task, 1, seed)
-    probs = _several(task.graph.wait_prob if wait_prob is None else wait_prob)
-    by_seed = []
-    for shown in axes.image_seeds(task, _several(image_seeds)):
-        graphs = axes.growing_depth(axes.wait_probs(shown, probs), depths)
-        by_seed.append([_with_goals(graph, goals, num_goals, seed) for graph in graphs])
-    tasks = axes.cycle(_ordered(by_seed, order, seed), repeats)
+    seeds = _several(image_seeds)
+    if random_graphs is None:
+        task, depths = _deepest(configuration, branching_factor, depth)
+        _check_goals(goals, depths)
+        if goals == "nested":
+            (task,) = axes.random_goals(task, 1, seed)
+        by_seed = _by_seed(task, depths, wait_prob, seeds, lambda graph: _with_goals(graph, goals, num_goals, seed))
+        tasks = _ordered(by_seed, order, seed)
+    else:
+        drawn = f"random_graphs draws goals and order: leave both out, got goals={goals!r} and order={order!r}"
+        require(((goals, order) == ("all", "product"), drawn))
+        shapes = _choices(configuration, branching_factor=branching_factor, depth=depth, wait_prob=wait_prob)
+        kinds = (KINDS[configuration],)
+        tasks = axes.random_tasks(random_graphs, seed, **shapes, kinds=kinds, image_seeds=seeds)
+    tasks = axes.cycle(axes.read_variation(tasks, read_noise, read_rotation), repeats)
     changes = _switch(switch, switch_episodes)
     return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
 
 
-def _deepest(configuration: str, branching_factor: int | None, depth: int | Sequence[int] | None) -> tuple[Task, tuple]:
+def _choices(configuration: str, **given: Any) -> dict[str, tuple]:
+    """The choices of each argument of `axes.random_tasks` for a graph; None: as configured."""
+    graph = configured(configuration).graph
+    return {f"{name}s": _several(getattr(graph, name) if value is None else value) for name, value in given.items()}
+
+
+def _deepest(configuration: str, branching_factor: Any, depth: int | Sequence[int] | None) -> tuple[Task, tuple]:
     """The configured task on its deepest graph, and all depths."""
     task = configured(configuration)
     depths = _several(task.graph.depth if depth is None else depth)
@@ -91,6 +109,18 @@ def _deepest(configuration: str, branching_factor: int | None, depth: int | Sequ
     b = task.graph.branching_factor if branching_factor is None else branching_factor
     graph = replace(task.graph, branching_factor=b, depth=max(depths))
     return axes.reshaped(task, graph, KINDS[configuration], (1,) * graph.depth), depths
+
+
+def _by_seed(
+    task: Task, depths: tuple[int, ...], wait_prob: Any, seeds: tuple[int, ...], with_goals: Callable[[Task], Tasks]
+) -> list[list[Tasks]]:
+    """For each image seed the tasks on each graph."""
+    probs = _several(task.graph.wait_prob if wait_prob is None else wait_prob)
+    found = []
+    for shown in axes.image_seeds(task, seeds):
+        graphs = axes.growing_depth(axes.wait_probs(shown, probs), depths)
+        found.append([with_goals(graph) for graph in graphs])
+    return found
 
 
 def _check_goals(goals: object, depths: tuple[int, ...]) -> None:

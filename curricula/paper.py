@@ -1,9 +1,10 @@
 """Curricula over the configurations of the CT-graph paper.
 
-Soltoggio et al. 2023 (arXiv 2302.10887). Its section on lifelong learning names ways in which tasks can differ: the
-location of the goal, the depth of the graph, the distribution of inputs, and which features vary and which do not. A
-function here is one way, for any of the five baseline configurations: ``su_b1_4tasks`` is `goal_location` of CT-SU-B1.
-The paper gives neither orders nor budgets nor sizes of variations: all of these are choices of this package.
+Soltoggio et al. 2023 (arXiv 2302.10887). Sections 3.4 and 3.5 name ways in which tasks can differ: the location of the
+goal, the distribution of inputs, the shape of the graph, all three at once, and which features vary and which do not. A
+function here is one way, for the five baseline configurations: ``su_b1_4tasks`` is `goal_location` of CT-SU-B1, the
+paper's own example of four tasks. The depths 2, 3, 4, 5 in this order are those of section 4.2. Other orders, the
+numbers of frames and the sizes of variations are choices of this package.
 """
 
 from __future__ import annotations
@@ -31,6 +32,15 @@ DEEPEST_GOAL = (1, 2, 1, 2, 2)
 NUM_VARIATIONS = 4
 FRAMES = 204_800
 
+READ_NOISE = 10
+"""Largest addition to a pixel when an image is read. The paper gives no amplitude: this is a choice of this package."""
+
+READ_ROTATION = 5
+"""Largest rotation when an image is read, in degrees; Table 3 of the paper has 0 or 5."""
+
+DISSIMILAR = {(2, 2): (1, 2), (3, 2): (3, 1), (2, 3): (2, 1, 2), (3, 3): (2, 3, 1)}
+"""Branching factor and depth of tasks that share nothing, each with its goal."""
+
 
 def configured(configuration: str, image_seed: int = 1) -> Task:
     """The task of a configuration such as ``su_b1``, its goal at the first branches.
@@ -42,6 +52,16 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
     return CONFIGURATIONS[f"CT-{configuration.replace('_', '-').upper()}"](image_seed=image_seed)
 
 
+def one_goal(configuration: str, image_seed: int = 1) -> Task:
+    """The configuration's task for curricula with a single goal.
+
+    Where all decision states look alike the goal is (1, 2). Its two decisions differ, so a deterministic policy without
+    memory never reaches it. Elsewhere the goal is (1, 1, ...).
+    """
+    task = configured(configuration, image_seed)
+    return task if KINDS[configuration] == "full" else replace(task, goal=(1, 2))
+
+
 def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """All goals of one graph one after the other, in lexicographic order: does a new goal overwrite the old one?
 
@@ -51,7 +71,30 @@ def goal_location(configuration: str, num_frames: int = FRAMES, image_seed: int 
         image_seed: seed of the image set that all tasks share.
     """
     tasks = axes.all_goals(configured(configuration, image_seed))
-    return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames)
+    return _curriculum(f"{configuration}_{len(tasks)}tasks", tasks, num_frames, _version(configuration))
+
+
+def instances(
+    configuration: str,
+    num_frames: int = FRAMES,
+    image_seed: int = 1,
+    read_noise: int = READ_NOISE,
+    read_rotation: int = READ_ROTATION,
+) -> Curriculum:
+    """All goals of one graph whose images vary on every read: is a class of images recognised by its instances?
+
+    Section 2.4.1 of the paper: noise is added to an image and it is slightly rotated each time it is read. So no two
+    observations of a state are equal, and a table of observations does not solve the tasks.
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+        read_noise: largest addition to each pixel, in 0..255.
+        read_rotation: largest rotation in whole degrees, in 0..359.
+    """
+    varied = axes.read_variation(configured(configuration, image_seed), read_noise, read_rotation)
+    return _curriculum(f"{configuration}_instances", axes.all_goals(varied), num_frames)
 
 
 def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -67,7 +110,8 @@ def depth_growth(configuration: str, num_frames: int = FRAMES, image_seed: int =
     """
     task = configured(configuration, image_seed)
     deepest = axes.reshaped(task, replace(task.graph, depth=DEPTHS[-1]), KINDS[configuration], DEEPEST_GOAL)
-    return _curriculum(f"{configuration}_depth2to5", axes.growing_depth(deepest, DEPTHS), num_frames)
+    tasks = axes.growing_depth(deepest, DEPTHS)
+    return _curriculum(f"{configuration}_depth2to5", tasks, num_frames, _version(configuration))
 
 
 def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -78,12 +122,15 @@ def input_variation(configuration: str, num_frames: int = FRAMES, image_seed: in
         num_frames: frames per task.
         image_seed: seed of the first image set; the others have the next three.
     """
-    tasks = axes.image_seeds(configured(configuration), _seeds(image_seed))
-    return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames)
+    tasks = axes.image_seeds(one_goal(configuration), _seeds(image_seed))
+    version = _version(configuration, has_one_goal=True)
+    return _curriculum(f"{configuration}_{NUM_VARIATIONS}images", tasks, num_frames, version)
 
 
 def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """Four tasks with nothing in common but the shape of the graph: each has its own goal and image set.
+
+    See `dissimilar` for tasks that differ in their shape, too.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
@@ -93,35 +140,88 @@ def uncorrelated(configuration: str, num_frames: int = FRAMES, image_seed: int =
     shown = axes.image_seeds(configured(configuration), _seeds(image_seed))
     goals = axes.random_goals(shown[0], NUM_VARIATIONS, image_seed)
     tasks = [replace(task, goal=other.goal) for task, other in zip(shown, goals, strict=True)]
-    return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames)
+    return _curriculum(f"{configuration}_uncorrelated", tasks, num_frames, _version(configuration))
+
+
+def dissimilar(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """Four tasks that differ in the shape of the graph, in the images and in the goal: is nothing forgotten?
+
+    Section 3.4.1 of the paper: such tasks test a learner for catastrophic forgetting, and not for transfer. The shapes
+    (b, d) are (2, 2), (3, 2), (2, 3) and (3, 3).
+
+    Args:
+        configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1; gives the wait probability and what is observed.
+        num_frames: frames per task.
+        image_seed: seed of the first image set; the others have the next three.
+    """
+    shown = axes.image_seeds(configured(configuration), _seeds(image_seed))
+    tasks = [
+        axes.reshaped(task, CTGraph(b, d, task.graph.wait_prob), KINDS[configuration], goal)
+        for task, ((b, d), goal) in zip(shown, DISSIMILAR.items(), strict=True)
+    ]
+    return _curriculum(f"{configuration}_dissimilar", tasks, num_frames)
 
 
 def new_decisions(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """One goal; decision states get new images with each task, all others keep theirs: variant features.
 
-    What was learned of wait states stays right, so only decisions have to be learned anew.
+    What was learned of wait states stays right. Only the new decision images have to be learned.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = axes.new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("decision",))
-    return _curriculum(f"{configuration}_new_decisions", tasks, num_frames)
+    tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, ("decision",))
+    version = _version(configuration, has_one_goal=True)
+    return _curriculum(f"{configuration}_new_decisions", tasks, num_frames, version)
 
 
 def new_waits(configuration: str, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
     """One goal; wait states get new images with each task, all others keep theirs: variant features.
 
-    What was learned of decisions stays right, so only waiting has to be learned anew.
+    What was learned of decisions stays right. Only the new wait images have to be learned.
 
     Args:
         configuration: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
         num_frames: frames per task.
         image_seed: seed of the image set that all tasks share.
     """
-    tasks = axes.new_images(configured(configuration, image_seed), NUM_VARIATIONS, ("wait",))
-    return _curriculum(f"{configuration}_new_waits", tasks, num_frames)
+    tasks = axes.new_images(one_goal(configuration, image_seed), NUM_VARIATIONS, ("wait",))
+    version = _version(configuration, has_one_goal=True)
+    return _curriculum(f"{configuration}_new_waits", tasks, num_frames, version)
+
+
+def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
+    """Surjective graphs whose goals share their first decisions: are the waiting and these decisions reused?
+
+    Section 3.4.1 of the paper, "surjective graph with similar reward locations".
+
+    Args:
+        name: of the curriculum.
+        depth: d of the graph, with b=2 and p=0.
+        num_shared: how many first decisions all goals share, below d; the goals are 2^(d - num_shared).
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+    """
+    task = axes.reshaped(ct_su_b1(image_seed=image_seed), CTGraph(2, depth), "surjective", DEEPEST_GOAL[:depth])
+    return _curriculum(name, axes.goals_sharing(task, num_shared), num_frames)
+
+
+def random_graphs(num_frames: int = 51_200, image_seed: int = 1, num_tasks: int = 100, seed: int = 2023) -> Curriculum:
+    """A large set of random surjective graphs that share their images: which features are invariant?
+
+    Section 3.5 of the paper: n graphs differ in branching factor (2 or 3), depth (2, 3 or 4), wait probability (0 or
+    0.5) and goal. What the images mean, and waiting at wait states, is common to all.
+
+    Args:
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+        num_tasks: n.
+        seed: draws the graphs, an integer >= 0.
+    """
+    tasks = axes.random_tasks(num_tasks, seed, kinds=("surjective",), image_seeds=(image_seed,))
+    return _curriculum("random_graphs", tasks, num_frames)
 
 
 def fo_b2_gradient(num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:
@@ -147,6 +247,20 @@ def fo_b1_noisy(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float
     return _curriculum("fo_b1_noisy", axes.all_goals(task), num_frames)
 
 
+def fo_b1_stochastic_rewards(num_frames: int = FRAMES, image_seed: int = 1, reward_std: float = 0.1) -> Curriculum:
+    """The four goals of CT-FO-B1 with stochastic rewards: normal around the gradient reward, standard deviation 0.1.
+
+    The reward c* of section 2.5 of the paper; Table 3 has 0.1 as a common standard deviation.
+
+    Args:
+        num_frames: frames per task.
+        image_seed: seed of the image set that all tasks share.
+        reward_std: standard deviation of what end states pay.
+    """
+    task = replace(ct_fo_b1(image_seed=image_seed), reward_fn=Gradient(), reward_std=reward_std)
+    return _curriculum("fo_b1_stochastic_rewards", axes.all_goals(task), num_frames)
+
+
 def stochastic_grouped(
     num_frames: int = FRAMES, image_seed: int = 1, group_size: int = 10, within: float = 0.1, between: float = 0.3
 ) -> Curriculum:
@@ -169,9 +283,10 @@ def stochastic_grouped(
 
 
 def co_hard_4tasks(num_frames: int = 1_024_000, image_seed: int = 1, num_wait_images: int = 500) -> Curriculum:
-    """The four goals of the hardest confounding graph that the paper compares learners on: p=0.9, 500 wait images.
+    """The four goals of a confounding graph with p=0.9 and 500 wait images, b=2 and d=2 as CT-CO-B1.
 
-    The comparison is that of Ladosz et al. 2021, whose configuration was not published; b=2 and d=2 as CT-CO-B1.
+    Section 4.2 of the paper says of Ladosz et al. 2021 that their most complex benchmark had p=0.9 and 500
+    observations. Their graph was not published: its other parameters are those of CT-CO-B1.
 
     Args:
         num_frames: frames per task; an episode without fail takes 33 frames in the mean.
@@ -187,14 +302,21 @@ def _seeds(first: int) -> range:
     return range(first, first + NUM_VARIATIONS)
 
 
-def _curriculum(name: str, tasks: axes.OneOrMore, num_frames: int) -> Curriculum:
-    return axes.sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, 1, PAPER)
+def _version(configuration: str, has_one_goal: bool = False) -> int:
+    """Return 2 for what changed: CT-POSR-B1 had noise in its rewards, and a single goal needed no memory."""
+    return 2 if configuration == "posr_b1" or (has_one_goal and KINDS[configuration] != "full") else 1
+
+
+def _curriculum(name: str, tasks: axes.OneOrMore, num_frames: int, version: int = 1) -> Curriculum:
+    return axes.sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, version, PAPER)
 
 
 WAYS = {
     "depth2to5": depth_growth,
     f"{NUM_VARIATIONS}images": input_variation,
+    "instances": instances,
     "uncorrelated": uncorrelated,
+    "dissimilar": dissimilar,
     "new_decisions": new_decisions,
     "new_waits": new_waits,
 }
@@ -204,6 +326,10 @@ NAMED = {
     **{f"{name}_{way}": partial(function, name) for way, function in WAYS.items() for name in KINDS},
     "fo_b2_gradient": fo_b2_gradient,
     "fo_b1_noisy": fo_b1_noisy,
+    "fo_b1_stochastic_rewards": fo_b1_stochastic_rewards,
+    "su_b1_similar_goals": partial(similar_goals, "su_b1_similar_goals", 2, 1),
+    "su_b1_d4_similar_goals": partial(similar_goals, "su_b1_d4_similar_goals", 4, 2),
+    "random_graphs": random_graphs,
     "stochastic_grouped": stochastic_grouped,
     "co_hard_4tasks": co_hard_4tasks,
 }

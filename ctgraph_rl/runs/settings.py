@@ -8,7 +8,10 @@ from collections.abc import Iterator, Mapping
 from inspect import Parameter, signature
 from typing import Any
 
-ADDED: dict[str, dict[str, Any]] = {"run": {"portable": False}}
+ADDED: dict[str, dict[str, Any]] = {
+    "run": {"portable": False},
+    "curricula.from_axes": {"read_noise": 0, "read_rotation": 0, "random_graphs": None},
+}
 """Settings that were added after runs had been stored, each with the value for "as before".
 
 They are listed by the ``_target_`` that takes them, as ``{"baselines.rl2.RL2": {"cell": "lstm"}}``; those of no target

@@ -101,6 +101,8 @@ def ct_fo_b2(goal: tuple[int, ...] = (1, 1, 1), image_seed: int = 1) -> Task:
 def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
     """CT-SU-B1: surjective, b=2, d=2, p=0; one image for all decision states, one for all wait states.
 
+    The paper's D_IDs=[2,2] and W_IDs=[3,3].
+
     Args:
         goal: two decisions in 1..2.
         image_seed: seed of the image set.
@@ -111,8 +113,7 @@ def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
 def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
     """CT-CO-B1: confounding, b=2, d=2, p=0; wait states draw one of a hundred images at every observation.
 
-    The paper leaves ids and numbers of images open. This package chose: a hundred images for wait states, one for
-    decision states and one for end states.
+    Decision states show image 2 and wait states the images 3 to 102: the paper's D_IDs=[2,2] and W_IDs=[3,102].
 
     Args:
         goal: two decisions in 1..2.
@@ -123,16 +124,15 @@ def ct_co_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
 
 
 def ct_posr_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
-    """CT-POSR-B1: partially observable with stochastic rewards, b=2, d=2, p=0.5; the images of CT-SU-B1.
+    """CT-POSR-B1: partially observable sparse reward, b=2, d=2, p=0.5; the images of CT-SU-B1.
 
-    End states pay a draw from N(c, 0.1), with c = 1 at the goal and 0 at the others. The paper leaves ids and the
-    standard deviation open: they are choices of this package.
+    The paper's D_IDs=[2,2] and W_IDs=[3,3]. Episodes have a variable length, and rewards have no noise.
 
     Args:
         goal: two decisions in 1..2.
         image_seed: seed of the image set.
     """
-    return replace(ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed), reward_std=0.1)
+    return ct_graph(2, 2, 0.5, goal, fully_observable=False, image_seed=image_seed)
 
 
 CONFIGURATIONS: dict[str, Callable[..., Task]] = {

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from fractions import Fraction
 from itertools import permutations, product
 
@@ -185,10 +186,9 @@ def test_wait_states_of_the_confounding_configuration_share_a_hundred_images():
     assert x.draws_ids
 
 
-def test_rewards_of_the_stochastic_configuration_are_normal():
-    task = ct_posr_b1()
-
-    assert (task.reward_std, task.reward_noise, task.observations) == (0.1, "additive", ct_su_b1().observations)
+def test_sparse_rewards_of_the_partially_observable_configuration_have_no_noise():
+    assert ct_posr_b1() == replace(ct_su_b1(), graph=CTGraph(2, 2, 0.5))
+    assert ct_posr_b1().reward_std == 0
 
 
 def test_a_task_of_any_size_has_an_image_for_each_state_or_kind_of_state():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import hydra
 import pytest
 
@@ -55,6 +57,7 @@ def test_axes_are_set_on_the_command_line(compose):
         ({"order": "shuffle", "seed": 1}, ["22", "12", "21", "11"]),
         ({"goals": "random", "num_goals": 2, "repeats": 2}, ["22", "11", "22", "11"]),
         ({"branching_factor": 3, "depth": 1}, ["1", "2", "3"]),
+        ({"random_graphs": 3, "depth": [1, 2], "branching_factor": [2, 3]}, ["23", "1", "33"]),
     ],
 )
 def test_free_axes_give_the_goals_in_order(arguments, expected):
@@ -68,6 +71,23 @@ def test_free_axes_use_the_ids_of_the_deepest_graph():
 
     assert {task.observations for task in built.tasks} == {ct_graph(2, 4).observations}
     assert [(task.graph.wait_prob, task.graph.depth) for task in built.tasks] == [(0, 2), (0, 4), (0.5, 2), (0.5, 4)]
+
+
+def test_free_axes_read_images_with_noise_and_rotation():
+    built = curricula.from_axes("co_b1", read_noise=10, read_rotation=5)
+
+    assert built.tasks == curricula.load("co_b1_instances").tasks
+
+
+def test_random_graphs_of_free_axes_are_drawn_from_all_that_is_listed():
+    built = curricula.from_axes("su_b1", depth=[2, 3], wait_prob=[0, 0.5], image_seeds=[1, 2], random_graphs=44)
+
+    drawn = {(task.graph.depth, task.graph.wait_prob, task.image_seed) for task in built.tasks}
+    assert drawn == set(product((2, 3), (0, 0.5), (1, 2)))
+    assert (
+        built.tasks
+        == curricula.from_axes("su_b1", depth=[2, 3], wait_prob=[0, 0.5], image_seeds=[1, 2], random_graphs=44).tasks
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,6 +120,10 @@ def test_a_switch_makes_one_block_of_all_tasks(switch, expected):
         ({"num_frames": 0}, "num_frames must be an integer >= 1, got 0"),
         ({"switch": "slow"}, "switch must be one of by_episode, at_random, drift, or null, got 'slow'"),
         ({"switch": "drift", "switch_episodes": 0}, "switch_episodes must be an integer >= 1, got 0"),
+        ({"read_noise": 256}, r"read_noise must be an integer in 0..255, got 256"),
+        ({"read_rotation": 2.5}, r"read_rotation must be whole degrees in 0..359, got 2.5"),
+        ({"random_graphs": 0}, r"num_tasks must be in 1..4, as many as differ, got 0"),
+        ({"random_graphs": 2, "goals": "random"}, "random_graphs draws goals and order: leave both out, got goals='ra"),
         ({"configuration": "fo_b1", "depth": 30, "goals": "nested"}, "num_images must be in 1..43046721"),
     ],
 )

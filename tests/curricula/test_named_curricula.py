@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import hydra
@@ -20,6 +20,7 @@ from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_posr_b1, ct_su_b1
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
+from curricula import axes
 from curricula.paper import KINDS, configured
 
 NAMES, FOLDER = curricula.names(), Path(conf_dir(), "curriculum")
@@ -44,7 +45,7 @@ def test_the_oldest_fingerprint_is_what_it_was_when_published():
 def test_no_two_names_are_the_same_curriculum():
     fingerprints = [entry["fingerprint"] for entry in TABLE.values()]
 
-    assert len(set(fingerprints)) == len(fingerprints) == 61
+    assert len(set(fingerprints)) == len(fingerprints) == 75
 
 
 def test_a_fingerprint_is_the_same_in_another_process(checkout):
@@ -156,7 +157,7 @@ def test_goal_location_goes_through_all_goals_of_a_configuration_in_order(name, 
     assert goals == sorted(goals)
     assert len(goals) == 2**depth
     assert {replace(other, goal=task.goal) for other in curriculum.tasks} == {task}
-    assert (curriculum.num_frames, curriculum.version) == (204_800 * 2**depth, 1)
+    assert (curriculum.num_frames, curriculum.version) == (204_800 * 2**depth, 2 if name == "posr_b1_4tasks" else 1)
     assert (curriculum.protocol, curriculum.evaluation) == (Protocol(), Evaluation())
 
 
@@ -185,6 +186,53 @@ def test_input_variation_changes_nothing_but_the_images(configuration):
 
     assert [task.image_seed for task in tasks] == [5, 6, 7, 8]
     assert len({replace(task, images=tasks[0].images) for task in tasks}) == 1
+
+
+@BY_CONFIGURATION
+@pytest.mark.parametrize("way", ["4images", "new_decisions", "new_waits"])
+def test_one_goal_needs_memory_where_all_decision_states_look_alike(configuration, way):
+    curriculum = curricula.load(f"{configuration}_{way}")
+    ceilings = {task.memoryless_ceiling(deterministic=True) for task in curriculum.tasks}
+
+    assert (ceilings, curriculum.version) == (({1.0}, 1) if configuration.startswith("fo") else ({0.0}, 2))
+
+
+@BY_CONFIGURATION
+def test_instances_are_the_goals_of_a_configuration_with_noise_and_rotation_on_read(configuration):
+    number = 8 if configuration == "fo_b2" else 4
+    tasks, constant = (curricula.load(f"{configuration}_{way}").tasks for way in ("instances", f"{number}tasks"))
+
+    assert {(task.observations.read_noise, task.observations.read_rotation) for task in tasks} == {(10, 5)}
+    assert tuple(axes.read_variation(tasks, 0)) == constant
+    assert curricula.load(f"{configuration}_instances", read_noise=3, read_rotation=0) != constant
+
+
+@BY_CONFIGURATION
+def test_dissimilar_tasks_share_neither_shape_nor_goal_nor_images(configuration):
+    tasks = curricula.load(f"{configuration}_dissimilar").tasks
+
+    assert [(task.graph.branching_factor, task.graph.depth) for task in tasks] == [(2, 2), (3, 2), (2, 3), (3, 3)]
+    assert [task.goal for task in tasks] == [(1, 2), (3, 1), (2, 1, 2), (2, 3, 1)]
+    assert [task.image_seed for task in tasks] == [1, 2, 3, 4]
+    assert {task.graph.wait_prob for task in tasks} == {configured(configuration).graph.wait_prob}
+    assert {task.observations.unique_decisions for task in tasks} == {configuration.startswith("fo")}
+
+
+def test_similar_goals_share_their_first_decisions():
+    shallow, deep = (curricula.load(name).tasks for name in ("su_b1_similar_goals", "su_b1_d4_similar_goals"))
+
+    assert [task.goal for task in shallow] == [(1, 1), (1, 2)]
+    assert [task.goal for task in deep] == [(1, 2, 1, 1), (1, 2, 1, 2), (1, 2, 2, 1), (1, 2, 2, 2)]
+    assert {replace(task, goal=(1, 1)) for task in shallow} == {ct_su_b1()}
+
+
+def test_random_graphs_differ_in_shape_and_share_what_images_mean():
+    tasks = curricula.load("random_graphs").tasks
+
+    shapes = {(task.graph.branching_factor, task.graph.depth, task.graph.wait_prob) for task in tasks}
+    assert len(tasks) == len(set(tasks)) == 100
+    assert shapes == set(product((2, 3), (2, 3, 4), (0.0, 0.5)))
+    assert len({(task.images, task.observations) for task in tasks}) == 1
 
 
 @BY_CONFIGURATION
@@ -228,6 +276,14 @@ def test_fo_b1_noisy_has_a_noise_that_can_be_set():
     assert {task.reward_std for task in tasks} == {0.5}
     assert {task.reward_std for task in curricula.load("fo_b1_noisy", reward_std=0.25).tasks} == {0.25}
     assert {replace(task, reward_std=0) for task in tasks} == set(curricula.load("fo_b1_4tasks").tasks)
+
+
+def test_stochastic_rewards_are_normal_around_the_gradient_reward():
+    tasks = curricula.load("fo_b1_stochastic_rewards").tasks
+
+    assert {(task.reward_fn, task.reward_std, task.reward_noise) for task in tasks} == {(Gradient(), 0.1, "additive")}
+    constant = {replace(task, reward_fn=Needle(), reward_std=0) for task in tasks}
+    assert constant == set(curricula.load("fo_b1_4tasks").tasks)
 
 
 def test_all_states_of_the_stochastic_graph_draw_from_groups_of_images():

@@ -93,9 +93,14 @@ def test_every_id_makes_a_single_and_a_vector_environment_without_a_warning(name
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_an_id_names_the_configuration_of_the_paper(name):
-    env = gymnasium.make(f"ctgraph/{name}-v0").unwrapped
+    env = gymnasium.make(f"ctgraph/{name}-v{1 if name == 'CT-POSR-B1' else 0}").unwrapped
 
     assert env.task_pool == (CONFIGURATIONS[name](),)
+
+
+def test_an_id_of_an_earlier_version_is_refused():
+    with pytest.raises(gymnasium.error.DeprecatedEnv, match=r"v0 .*deprecated.*v1"):
+        gymnasium.make("ctgraph/CT-POSR-B1-v0")
 
 
 def test_an_id_after_its_module_needs_no_import_and_no_torchrl(checkout, tmp_path):

@@ -31,7 +31,7 @@ from ctgraph_rl.tasks import configurations as paper
             paper.ct_graph(3, 1, goal=(3,), one_hot=True),
         ),
         ({"task": "CT-SU-B1", "goal": (2, 2), "image_seed": 3}, paper.ct_su_b1((2, 2), 3)),
-        ({"task": "CT-SU-B1", "wait_prob": 0.5, "reward_std": 0.1}, paper.ct_posr_b1()),
+        ({"task": "CT-SU-B1", "wait_prob": 0.5}, paper.ct_posr_b1()),
         ({"task": paper.ct_co_b1(), "fail_reward": -1}, replace(paper.ct_co_b1(), fail_reward=-1)),
         ({"task": surjective(), "read_noise": 9}, surjective(read_noise=9)),
     ],

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 from ctgraph_rl.gym import CONFIGURATIONS
 
 MODES = tuple(AutoresetMode)
-IDS = ["ctgraph/CTGraph-v0", *(f"ctgraph/{name}-v0" for name in CONFIGURATIONS)]
+IDS = ["ctgraph/CTGraph-v0", *(f"ctgraph/{name}-v{int(name == 'CT-POSR-B1')}" for name in CONFIGURATIONS)]
 
 
 def act(rng, num_envs, num_actions=3):
