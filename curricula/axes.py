@@ -11,6 +11,7 @@ import itertools
 import random
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from math import prod
 from typing import Any
 
@@ -166,8 +167,8 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
         read_noise: largest addition to each pixel, in 0..255.
         read_rotation: largest rotation in whole degrees, in 0..359.
     """
-    varied = {"read_noise": read_noise, "read_rotation": read_rotation}
-    return each(tasks, lambda task: [replace(task, observations=replace(task.observations, **varied))])
+    changed = partial(replace, read_noise=read_noise, read_rotation=read_rotation)
+    return each(tasks, lambda task: [replace(task, observations=changed(task.observations))])
 
 
 # shape

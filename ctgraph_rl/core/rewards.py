@@ -46,7 +46,7 @@ class RewardFn(Protocol):
 
 @dataclass(frozen=True)
 class Needle:
-    """1 at the goal and 0 at every other end state: the needle in a haystack of the paper, section 2.4."""
+    """1 at the goal and 0 at every other end state: the needle in a haystack of the paper, section 2.5."""
 
     def __call__(self, arrival: Arrival) -> Tensor:
         """See `RewardFn`."""
@@ -62,7 +62,7 @@ class Gradient:
     """Reward that shrinks with the weighted distance between the decisions taken and the goal's, in [0, 1].
 
     1 - sum_k b^(d-k) |D_k - G_k| / (b^d - 1), k = 1..d: an early wrong decision costs more than a late one. The
-    paper's equation "gradient" with its weights corrected to b^(d-1)..b^0.
+    paper's reward gradient (section 2.5) with its weights corrected to b^(d-1)..b^0.
     """
 
     def __call__(self, arrival: Arrival) -> Tensor:

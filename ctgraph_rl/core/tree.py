@@ -1,4 +1,4 @@
-"""The tree's own dynamics, sections 2.1 and 2.2 of the paper: which state an action leads to.
+"""The tree's own dynamics, section 2 of the paper: which state an action leads to.
 
 A state is two integers per row, ``state_type`` and ``node``: the heap index of the position in the tree (the root is 0,
 branch a of node n is b * n + a). A wait state carries the node that it leads to.
@@ -84,7 +84,7 @@ def tree_params(
 
 
 def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list:
-    """Where an action leads, sections 2.1 and 2.2 of the paper: [stays, before an end state, state type, action]."""
+    """Where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
 
     def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
         waits, decides = action == WAIT_ACTION, WAIT_ACTION < action <= branching_factor

@@ -1,6 +1,6 @@
 """X: which observation id a state shows. The images behind the ids are in `ctgraph_rl.tasks.images`.
 
-Section 2.3 of the paper. The id ranges are inclusive, as in the paper's JSON (W_IDs, D_IDs, graph_ends).
+Section 2.4 of the paper. The id ranges are inclusive, as in the paper's JSON (W_IDs, D_IDs, graph_ends).
 """
 
 from __future__ import annotations

@@ -135,6 +135,29 @@ def return_bounds(task: Task) -> tuple[float, float]:
     return low, max(paid) if task.step_reward <= 0 else math.inf
 
 
+def open_loop_ceiling(task: Task) -> float:
+    """The best mean return of a sequence of actions that is fixed before the episode and ignores all observations.
+
+    Without waiting in place (p = 0) episodes of a sequence are all alike, so the best one is optimal (section 3.3 of
+    the paper). Else, for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0: an episode that is still
+    in a wait state when the sequence decides has failed, and so has one in a decision state when it waits. Each of the
+    d wait states before a decision must be left at a step fixed before, best the first one, with probability 1 - p. The
+    last wait state, before the end state, may take as long as it likes. So the goal is reached with probability
+    (1 - p)^d, and all other episodes fail.
+
+    Args:
+        task: a task as above.
+
+    Raises:
+        ValueError: for other rewards with p > 0, saying which.
+    """
+    if task.graph.wait_prob == 0:
+        return optimal_value(task, 1.0)
+    require(*_needle_rules(task, "open-loop"))
+    reaches = (1 - task.graph.wait_prob) ** task.graph.depth
+    return reaches * task.goal_reward + (1 - reaches) * task.fail_reward
+
+
 def random_episode_length(task: Task) -> float:
     """Return the mean steps of an episode of the uniformly random policy over the b + 1 actions of a task's graph.
 
@@ -330,14 +353,19 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
 
 
 def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
-    name, goal, fail = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward
-    step, b = task.step_reward, task.graph.branching_factor
+    b = task.graph.branching_factor
     shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
-    only = "the memoryless ceiling is exact only for"
+    own = f"ids of their own, not a legacy_index with branching_factor={b}, where states share ids"
+    return [*_needle_rules(task, "memoryless"), (not shares, f"the memoryless ceiling is exact only for {own}")]
+
+
+def _needle_rules(task: Task, ceiling: str) -> list[tuple[bool, str]]:
+    """Return the rules on rewards for which a ceiling is exact."""
+    name, goal, fail, step = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward, task.step_reward
+    only = f"the {ceiling} ceiling is exact only for"
     return [
         (is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
         (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
         (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
         (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),
-        (not shares, f"{only} ids of their own, not a legacy_index with branching_factor={b}, where states share ids"),
     ]

@@ -11,18 +11,21 @@ from ctgraph_rl.core.tree import State, transition
 from ctgraph_rl.core.tree import tree_params as make_tree
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_graph, ct_posr_b1, ct_su_b1
 
-TABLE = [
-    (2, 1, "0"),
-    (2, 2, "0"),
-    (2, 2, "1/2"),
-    (2, 2, "9/10"),
-    (2, 3, "1/2"),
-    (2, 4, "0"),
-    (2, 5, "0"),
-    (2, 16, "1/2"),
-    (3, 2, "99/100"),
-    (3, 10, "9/10"),
+PRINTED = [
+    ((2, 1, "0"), "3.70e-2", "7.40e-2", "1/2", 8, 2),
+    ((2, 2, "9/10"), "1.20e-5", "4.78e-5", "1/4", 16, 4),
+    ((3, 2, "9/10"), "2.10e-6", "1.89e-5", "1/9", 28, 9),
+    ((2, 4, "9/10"), "3.02e-9", "4.84e-8", "1/16", 64, 16),
+    ((3, 10, "9/10"), "3.75e-23", "2.22e-18", "1/59049", 177148, 59049),
+    ((2, 16, "1/2"), "3.04e-20", "1.99e-15", "1/65536", 262144, 65536),
 ]
+"""Table 2 of the paper as printed: b, d and p; P_R, P_E, P_RNP, states and end states."""
+
+CORRECTED = {"7.40e-2": "7.41e-2", "4.78e-5": "4.80e-5", "1.99e-15": "2.00e-15"}
+"""The numbers of Table 2 that are not those of the paper's own formulas, rounded to three digits."""
+
+TABLE = [shape for shape, *_ in PRINTED] + [(2, 2, "0"), (2, 2, "1/2"), (2, 3, "1/2"), (2, 4, "0"), (2, 5, "0")]
+TABLE += [(3, 2, "99/100")]
 """b, d and p of the paper's tables and configurations, and of graphs around them."""
 
 # place, printed, corrected, what the package says
@@ -34,16 +37,12 @@ MISPRINTS = [
     ("P_R of CT-CO-B1", 1 / 32, 1 / 243, CTGraph(2, 2, 0.0).reward_prob_random),
     ("E[rho] of CT-FO-B2", 11, 12, CTGraph(2, 3, 0.5).expected_episode_length),
     ("P_R of CT-POSR-B1", 8.8e-4, 1 / 1125, CTGraph(2, 2, 0.5).reward_prob_random),
-    ("P_E of b=2 d=2 p=.9", 4.78e-5, 4 / 83349, CTGraph(2, 2, 0.9).end_prob_random),
-    ("P_E of b=2 d=16 p=.5", 1.99e-15, 2**16 * 3 / 15**17, CTGraph(2, 16, 0.5).end_prob_random),
 ]
 
 # place, printed, what the package says
 PRINTED_RIGHT = [
     ("P_R of CT-FO-B2", 5.93e-5, CTGraph(2, 3, 0.5).reward_prob_random),
     ("P_R of b=2 d=5 p=0, 1 in 177,147", 5.6e-6, CTGraph(2, 5).reward_prob_random),
-    ("P_R of b=3 d=10 p=.9", 3.75e-23, CTGraph(3, 10, 0.9).reward_prob_random),
-    ("P_R of b=2 d=16 p=.5", 3.04e-20, CTGraph(2, 16, 0.5).reward_prob_random),
     ("E[rho] of CT-POSR-B1", 9, CTGraph(2, 2, 0.5).expected_episode_length),
     ("E[rho] of p=.99", 303, CTGraph(3, 2, 0.99).expected_episode_length),
 ]
@@ -87,6 +86,35 @@ def test_a_misprint_is_corrected(place, printed, corrected, ours):
 @pytest.mark.parametrize(("place", "printed", "ours"), PRINTED_RIGHT, ids=[row[0] for row in PRINTED_RIGHT])
 def test_a_correctly_printed_value_is_met_to_its_printed_digits(place, printed, ours):
     assert ours == pytest.approx(printed, rel=1e-2, abs=0)
+
+
+def as_printed(number: float) -> str:
+    mantissa, exponent = f"{number:.2e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+@pytest.mark.parametrize(("shape", "p_r", "p_e", "p_rnp", "states", "ends"), PRINTED)
+def test_a_row_of_table_2_is_met_to_every_printed_digit(shape, p_r, p_e, p_rnp, states, ends):
+    b, d, p = shape
+    graph = CTGraph(b, d, float(Fraction(p)))
+
+    assert as_printed(graph.reward_prob_random) == p_r
+    assert as_printed(graph.end_prob_random) == CORRECTED.get(p_e, p_e)
+    assert graph.reward_prob_navigation == float(Fraction(p_rnp))
+    assert (graph.num_states, graph.num_end_states) == (states, ends)
+
+
+def test_sizes_and_counts_printed_in_the_text_of_the_paper():
+    small, larger = ct_fo_b1().graph, ct_fo_b2().graph
+
+    assert (small.num_decision_states, small.num_wait_states, small.num_end_states) == (3, 7, 4)
+    assert (larger.num_decision_states, larger.num_wait_states, larger.num_end_states) == (7, 15, 8)
+    assert small.expected_search_episodes == (2**2 + 1) / 2
+    assert 1 / CTGraph(2, 2, 0.9).reward_prob_random == pytest.approx(83349, rel=1e-9)
+    assert 1 / larger.reward_prob_random == pytest.approx(16875, rel=1e-9)
+    assert 1 / CTGraph(2, 5).reward_prob_random == pytest.approx(177147, rel=1e-9)
+    assert CTGraph(3, 2, 0.99).expected_episode_length == pytest.approx(303)
+    assert 3 * 3**16 == 3**17 == 129_140_163
 
 
 @pytest.mark.parametrize(("b", "d", "p"), TABLE)
