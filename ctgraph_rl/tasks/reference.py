@@ -21,6 +21,7 @@ from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
 from ctgraph_rl.tasks.observations import MAX_READ_ROTATION, Observations
+from ctgraph_rl.tasks.paper_json import is_paper_json, read_paper_json
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
@@ -71,6 +72,8 @@ _LEGACY: dict[str, Any] = {"reward_cue": True, "cue_wraps": True, "legacy_index"
 def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
     """The arguments of `Task` for a configuration file; see `Task.from_json`."""
     source, content = _load(path_or_dict)
+    if is_paper_json(content):
+        return read_paper_json(source, content, goal)
     draws = "the authors' implementation draws one at random or sets it with set_high_reward_path, counting from 0"
     fix = "add 1 to each entry of its path, such as goal=(1, 2) for [0, 1]"
     require((goal is not None, f"goal is not in the file and must be given: {draws}; {fix}"))

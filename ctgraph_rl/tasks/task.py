@@ -95,11 +95,13 @@ class Task:
     def from_json(
         cls, path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None = None
     ) -> Self:
-        """The task of a configuration file of the authors' implementation, to behave as it does there.
+        """The task of a configuration file: of the paper's Table 3, or of the authors' implementation.
 
-        The keys may be those of 2019 (``delay_prob``), of 2021 (``wait_prob``) or of 2023 (``p``). Where a file has
-        ``stochastic_sampling``, the standard deviation of rewards counts only if that is true. The ``general_seed`` is
-        not of the task: give it to ``CTGraphEnv(seed=...)``, whose random numbers are other ones.
+        The parameters of Table 3 have the paper's meaning; see `ctgraph_rl.tasks.paper_json`. A file with a section
+        ``image_dataset`` is of the implementation, and the task behaves as it does there. Its keys may be those of 2019
+        (``delay_prob``), of 2021 (``wait_prob``) or of 2023 (``p``). Where such a file has ``stochastic_sampling``, the
+        standard deviation of rewards counts only if that is true. The ``general_seed`` or ``Seed`` is not of the task:
+        give it to ``CTGraphEnv(seed=...)``, whose random numbers are other ones.
 
         Args:
             path_or_dict: the file, or its content.

@@ -1,0 +1,139 @@
+"""The JSON parameters of Table 3 of the paper, with its names and its meaning.
+
+What such a file leaves out has a default: ``graph_shape`` alone is a file. Rewards are those of the paper, their noise
+is additive, and an episode ends in the end state. Files of the authors' implementation are of another kind: they have a
+section ``image_dataset``, and `ctgraph_rl.tasks.reference` reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
+
+SECTIONS: dict[str, dict[str, str]] = {
+    "graph_shape": {"d": "depth", "b": "branching_factor", "p": "wait_prob"},
+    "reward": {"high_r": "goal_reward", "fail_r": "fail_reward", "std_r": "reward_std"},
+    "observations": {
+        "MDP_D": "unique_decisions",
+        "MDP_W": "unique_waits",
+        "W_IDs": "wait_ids",
+        "D_IDs": "decision_ids",
+    },
+    "image_set": {
+        "seed": "image_seed",
+        "1D": "one_hot",
+        "nr_images": "num_images",
+        "noise_on_read": "read_noise",
+        "rotation_on_read": "read_rotation",
+    },
+}
+"""What each key means here, by section. A space in a name counts as an underscore."""
+
+SEED = "Seed"
+"""Seed of the environment's random numbers, which is no part of a task."""
+
+REQUIRED = ("depth", "branching_factor")
+
+DEFAULTS: dict[str, Any] = {
+    "wait_prob": 0.0,
+    "unique_decisions": False,
+    "unique_waits": False,
+    "image_seed": 1,
+    "one_hot": False,
+    "read_noise": 0,
+    "read_rotation": 0,
+}
+
+
+def is_paper_json(content: Mapping[str, Any]) -> bool:
+    """Return whether a file is one of Table 3, and not one of the authors' implementation."""
+    shape = content.get("graph_shape")
+    return "image_dataset" not in content and isinstance(shape, Mapping) and bool({"d", "b"} & shape.keys())
+
+
+def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
+    """Return the arguments of `Task` for the parameters of Table 3.
+
+    Ids that are left out are the next free ones after those of the home state, 0, and the fail state, 1: decision
+    states first where they share ids. End states, which Table 3 leaves out, have the ids after all others.
+
+    Args:
+        source: the file, for messages.
+        content: its content.
+        goal: d decisions in 1..b.
+
+    Raises:
+        ValueError: for a missing goal, unknown sections and keys, and a graph without d or b.
+    """
+    found = dict(_found(source, content))
+    require(
+        (goal is not None, "goal is not in Table 3 and must be given: d decisions in 1..b, such as goal=(1, 2)"),
+        *((name in found, f"{source}: graph_shape.{key} is missing") for key, name in _required()),
+    )
+    found = DEFAULTS | found
+    graph = CTGraph(found["branching_factor"], found["depth"], found["wait_prob"])
+    shown = _kept(found, "unique_waits", "unique_decisions", "read_noise", "read_rotation")
+    observations = Observations(**_ids(graph, found), **shown)
+    count = found.get("num_images", observations.last_id + 1)
+    one_hot = found["one_hot"]
+    require((isinstance(one_hot, bool), f"{source}: image_set.1D must be true or false, got {one_hot!r}"))
+    images = OneHot(count) if one_hot else PaperImages(count, found["image_seed"])
+    rewards = _kept(found, "goal_reward", "fail_reward", "reward_std")
+    return {"graph": graph, "goal": goal, "observations": observations, "images": images, **rewards}
+
+
+def _required() -> Iterator[tuple[str, str]]:
+    return ((key, name) for key, name in SECTIONS["graph_shape"].items() if name in REQUIRED)
+
+
+def _found(source: str, content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield what a file says, in our words."""
+    for written, section in content.items():
+        name = written.replace(" ", "_")
+        if name == SEED:
+            continue
+        known = SECTIONS.get(name)
+        require((known is not None, f"{source}: unknown section {written!r}{_choices(name, [*SECTIONS, SEED])}"))
+        require((isinstance(section, Mapping), f"{source}: section {written!r} must be an object, got {section!r}"))
+        for key, value in section.items():
+            meaning = known.get(key.replace(" ", "_"))  # type: ignore[union-attr]
+            unknown = f"{source}: Table 3 has no {written}.{key}{_choices(key, list(known))}"  # type: ignore[arg-type]
+            require((meaning is not None, unknown))
+            yield str(meaning), value
+
+
+def _choices(name: str, known: Sequence[str]) -> str:
+    close = get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
+
+
+def _ids(graph: CTGraph, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ids of wait, decision and end states: given ones, else the next that are free."""
+    sizes = {
+        "wait_ids": graph.num_wait_states if found["unique_waits"] else 1,
+        "decision_ids": graph.num_decision_states if found["unique_decisions"] else 1,
+    }
+    order = sizes if found["unique_decisions"] else dict(reversed(sizes.items()))
+    ids = _kept(found, *sizes)
+    for name in order:
+        if name not in ids:
+            first = _next(ids)
+            ids[name] = (first, first + sizes[name] - 1)
+    ends = graph.num_end_states if found["unique_waits"] or found["unique_decisions"] else 1
+    return {**ids, "end_ids": (_next(ids), _next(ids) + ends - 1)}
+
+
+def _next(ids: Mapping[str, Any]) -> int:
+    """Return the id after all that are in use; 2 after the home and the fail state."""
+    lasts = [last for each in ids.values() if isinstance(each, (list, tuple)) for last in each[-1:] if is_int(last)]
+    return max([1, *lasts]) + 1
+
+
+def _kept(found: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: found[name] for name in names if name in found}
