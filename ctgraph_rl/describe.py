@@ -17,13 +17,15 @@ from rich.table import Table
 from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
+from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_lines, terminal_text
 from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import bank_bytes
+from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.tasks.values import random_frames_to_goal
+from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
@@ -34,12 +36,43 @@ UNKNOWN = "-"
 
 LISTED = {"name": "l", "version": "r", "tasks": "r", "frames": "r", "fingerprint": "l", "source": "l"}
 
-DEFINITIONS = (
+SIZES = ("states", "ends")
+CLOSED_FORMS = ("P_R", "P_E", "P_RNP", "E[rho]", "E[kappa]", "random frames")
+CLOSED_FORM_NOTES = (
     "P_R: probability that a uniformly random policy over the b + 1 actions reaches the goal in an episode.",
+    "P_E: the same of any end state.",
+    "P_RNP: the same of the goal, for a policy that waits when it must and decides at random.",
     "E[rho]: mean steps of an episode that gets to an end state, of a policy that waits when it must.",
+    "E[kappa]: mean episodes until the goal is found when end states are tried one by one.",
     "random frames: mean frames of the uniformly random policy until it reaches the goal for the first time, failed "
     "episodes included.",
-    "ceiling: the best mean return of a policy without memory, deterministic and stochastic.",
+)
+
+CEILINGS: dict[str, Callable[[Task], float]] = {
+    "open loop": open_loop_ceiling,
+    "memoryless det.": lambda task: task.memoryless_ceiling(deterministic=True),
+    "memoryless stoch.": lambda task: task.memoryless_ceiling(),
+    "optimal": lambda task: task.optimal_value(1.0),
+}
+CEILING_NOTES = (
+    "A ceiling is the best mean return of a kind of policy. open loop: a fixed sequence of actions, which ignores all "
+    "observations.",
+    "memoryless: an action for each observation, deterministic or stochastic.",
+)
+SAME_DECISIONS = "although decision states look alike, as all decisions on the way to the goal are the same."
+
+OBSERVATION_NOTES = (
+    "states: how many wait, decision and end states may show one and the same observation.",
+    "H: entropy of the state given the observation, in bits, as a random, a navigating and the optimal policy meet "
+    "them; a navigating policy waits when it must and decides at random.",
+    "read noise, read rotation: what is added to each pixel, and the rotation, whenever an image is read.",
+)
+
+TABLE_2 = ((2, 1, 0.0), (2, 2, 0.9), (3, 2, 0.9), (2, 4, 0.9), (3, 10, 0.9), (2, 16, 0.5))
+"""b, d and p of the rows of the paper's Table 2."""
+
+MISPRINTS = (
+    "The paper prints P_E as 7.40e-2 (row 1) and 1.99e-15 (row 6), both cut, and as 4.78e-5 (row 2), a misprint."
 )
 
 
@@ -67,7 +100,7 @@ def memory(curriculum: Curriculum) -> tuple[int, int]:
 
 
 def describe(curriculum: Curriculum, frames_per_second: float = FRAMES_PER_SECOND) -> list[Sheet]:
-    """The curriculum at large, its blocks and its tasks.
+    """The curriculum at large, its blocks, and the difficulty, ceilings and observability of its tasks.
 
     Args:
         curriculum: any curriculum.
@@ -77,7 +110,8 @@ def describe(curriculum: Curriculum, frames_per_second: float = FRAMES_PER_SECON
         ValueError: for a rate that is not above 0.
     """
     require(*positive(frames_per_second=frames_per_second))
-    return [_overview(curriculum, frames_per_second), _blocks(curriculum), _task_numbers(curriculum)]
+    sheets = (_blocks, _difficulty, _ceilings, _observations)
+    return [_overview(curriculum, frames_per_second), *(sheet(curriculum) for sheet in sheets)]
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float) -> Sheet:
@@ -145,26 +179,82 @@ def _block_rows(number: int, block: Block, labels: Mapping[Task, str]) -> Iterat
         yield of_block[0], labels[task], *shape, ".".join(map(str, task.goal)), *of_block[1:]
 
 
-def _task_numbers(curriculum: Curriculum) -> Sheet:
-    columns = {"task": "l", "P_R": "r", "E[rho]": "r", "random frames": "r", "ceiling det.": "r", "ceiling stoch.": "r"}
-    rows = []
-    reasons: dict[str, None] = {}
-    for task, label in zip(curriculum.tasks, curriculum.labels, strict=True):
-        ceilings, reason = _ceilings(task)
-        reasons[reason] = None
-        graph = task.graph
-        closed = (graph.reward_prob_random, graph.expected_episode_length, random_frames_to_goal(task))
-        rows.append((label, *map(_number, closed), *ceilings))
-    unknown = tuple(f"{UNKNOWN}: {reason}" for reason in reasons if reason)
-    return Sheet("Tasks", columns, tuple(rows), (*DEFINITIONS, *unknown))
+def _difficulty(curriculum: Curriculum) -> Sheet:
+    """Closed forms of each task's graph: how large it is, how long its episodes, how sparse its reward."""
+    rows = [(label, *_sizes(task.graph), *_closed_forms(task)) for task, label in _labelled(curriculum)]
+    sides = dict.fromkeys((*SIZES, *CLOSED_FORMS), "r")
+    return Sheet("Tasks", {"task": "l", **sides}, tuple(rows), CLOSED_FORM_NOTES)
 
 
-def _ceilings(task: Task) -> tuple[list[str], str]:
-    """The ceilings of deterministic and of stochastic policies, or why they are not known."""
+def _sizes(graph: CTGraph) -> tuple[str, str]:
+    return _number(graph.num_states), _number(graph.num_end_states)
+
+
+def _closed_forms(task: Task) -> tuple[str, ...]:
+    graph = task.graph
+    probs = (graph.reward_prob_random, graph.end_prob_random, graph.reward_prob_navigation)
+    lengths = (graph.expected_episode_length, graph.expected_search_episodes, random_frames_to_goal(task))
+    return tuple(map(_number, (*probs, *lengths)))
+
+
+def _ceilings(curriculum: Curriculum) -> Sheet:
+    """The best mean returns of policies that see less than all, or why they are not known."""
+    rows, reasons, easy = [], [], []
+    for task, label in _labelled(curriculum):
+        found = [_ceiling(task, ceiling) for ceiling in CEILINGS.values()]
+        rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
+        reasons += [f"{UNKNOWN}: {reason}" for _, reason in found if reason]
+        (memoryless, _), (optimal, _) = found[1], found[3]
+        if not task.observations.unique_decisions and None not in (memoryless, optimal) and memoryless == optimal:
+            easy.append(label)
+    no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
+    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *([f"{no_memory}{SAME_DECISIONS}"] if easy else []))
+    return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
+
+
+def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None, str]:
     try:
-        return [_number(task.memoryless_ceiling(deterministic)) for deterministic in (True, False)], ""
+        return ceiling(task), ""
     except ValueError as error:
-        return [UNKNOWN, UNKNOWN], str(error)
+        return None, str(error)
+
+
+def _observations(curriculum: Curriculum) -> Sheet:
+    """What an observation leaves open about the state, and what varies where it is read."""
+    rows, reasons = [], []
+    for task, label in _labelled(curriculum):
+        try:
+            counts = "/".join(map(_number, states_per_observation(task).values()))
+            known = [counts, *(_number(state_entropy(task, policy)) for policy in POLICIES)]
+        except ValueError as error:
+            known = [UNKNOWN] * (1 + len(POLICIES))
+            reasons.append(f"{UNKNOWN}: {error}")
+        x = task.observations
+        varied = (_up_to(x.read_noise), f"{_up_to(x.read_rotation)} deg", f"{task.reward_std:g}")
+        rows.append((label, *known, *varied))
+    columns = ("states", *(f"H {policy}" for policy in POLICIES), "read noise", "read rotation", "reward std")
+    notes = (*OBSERVATION_NOTES, *dict.fromkeys(reasons))
+    return Sheet("Observations", {"task": "l", **dict.fromkeys(columns, "r")}, tuple(rows), notes)
+
+
+def _up_to(most: int) -> str:
+    return f"0..{most}" if most else "0"
+
+
+def _labelled(curriculum: Curriculum) -> Iterator[tuple[Task, str]]:
+    return zip(curriculum.tasks, curriculum.labels, strict=True)
+
+
+def probabilities() -> Sheet:
+    """Return Table 2 of the paper as the formulas give it, and which printed numbers are others."""
+    rows = []
+    for b, d, p in TABLE_2:
+        graph = CTGraph(b, d, p)
+        of_ends = f"1/{graph.num_end_states}"
+        probs = (f"{graph.reward_prob_random:.2e}", f"{graph.end_prob_random:.2e}", of_ends)
+        rows.append((f"b={b}, d={d}, p={p:g}", *probs, str(graph.num_states), str(graph.num_end_states)))
+    columns = dict.fromkeys(("P_R", "P_E", "P_RNP", "states", "end states"), "r")
+    return Sheet("Table 2", {"CT-graph": "l", **columns}, tuple(rows), (*CLOSED_FORM_NOTES[:3], MISPRINTS))
 
 
 def _number(value: float) -> str:
@@ -214,7 +304,16 @@ def to_markdown(sheet: Sheet) -> str:
     )
 
 
-MATHS = {"P_R": "$P_R$", "E[rho]": r"$E[\rho]$", "b": "$b$", "d": "$d$", "p": "$p$"}
+MATHS = {
+    "P_R": "$P_R$",
+    "P_E": "$P_E$",
+    "P_RNP": r"$P_\mathrm{RNP}$",
+    "E[rho]": r"$E[\rho]$",
+    "E[kappa]": r"$E[\kappa]$",
+    "b": "$b$",
+    "d": "$d$",
+    "p": "$p$",
+}
 WIDE = 60
 """Characters from which on a column of a LaTeX table is broken into lines."""
 
@@ -261,6 +360,8 @@ def main(
         if arguments.command is None:
             own = [curriculum_of(name, arguments.config_dir) for name in curriculum_names(arguments.config_dir)]
             _show([listing([*map(load, names()), *own])], arguments.format)
+        elif arguments.command == "probabilities":
+            _show([probabilities()], arguments.format)
         else:
             is_file = arguments.name.endswith(".json") or Path(arguments.name).is_file()
             named = load if arguments.config_dir is None else partial(curriculum_of, config_dir=arguments.config_dir)
@@ -276,7 +377,9 @@ def _parser(prog: str | None) -> argparse.ArgumentParser:
     form.add_argument("--format", choices=("text", "markdown", "latex"), help="default: text")
     form.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     parser = argparse.ArgumentParser(prog=prog, description="List all curricula, or describe one.", parents=[form])
-    one = parser.add_subparsers(dest="command").add_parser("describe", help="describe one", parents=[form])
+    commands = parser.add_subparsers(dest="command")
+    commands.add_parser("probabilities", help="print the paper's Table 2, with its misprints corrected", parents=[form])
+    one = commands.add_parser("describe", help="describe one", parents=[form])
     one.add_argument("name", help="a name of the list, or a curriculum as a JSON file")
     one.add_argument("--frames-per-second", type=float, default=FRAMES_PER_SECOND, help="for the estimated time")
     one.add_argument("--figure", type=Path, help="draw graphs and goals into this file (.png, .pdf, .svg)")

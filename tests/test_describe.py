@@ -5,7 +5,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from helpers.oracles import confounding, one_hot, surjective
+from helpers.oracles import confounding, fully_observable, one_hot, surjective
 from rich.console import Console
 
 import curricula
@@ -111,20 +111,62 @@ def test_a_switch_has_a_column():
 
 
 def test_tasks_have_their_closed_forms_and_ceilings():
-    sheet = describe(make())[2]
+    _, _, sizes, ceilings, _ = describe(make())
 
-    assert sheet.rows == (
-        ("goal1.1", "0.004115", "6", "651", "1", "1"),
-        ("goal1.2", "0.004115", "6", "651", "0", "0.25"),
-    )
+    closed = ("16", "4", "0.004115", "0.01646", "0.25", "6", "2.5", "651")
+    assert sizes.rows == (("goal1.1", *closed), ("goal1.2", *closed))
+    assert ceilings.rows == (("goal1.1", "1", "1", "1", "1"), ("goal1.2", "1", "0", "0.25", "1"))
+    assert ceilings.notes[-1].startswith("No memory is needed for goal1.1: a deterministic policy without memory is")
+
+
+def test_fully_observable_tasks_are_not_said_to_need_no_memory():
+    ceilings = describe(make(Block(fully_observable(), 1)))[3]
+
+    assert ceilings.rows[0][1:] == ("1",) * 4
+    assert not [note for note in ceilings.notes if note.startswith("No memory")]
+
+
+def test_observations_have_what_they_leave_open_and_what_varies():
+    noisy = replace(confounding(read_rotation=5, read_noise=10), reward_std=0.1)
+
+    rows = describe(make(Block((A, noisy, fully_observable()), 1)))[4].rows
+
+    assert rows[0][1:] == ("7/3/4", "0.5012", "1.97", "0.9651", "0", "0 deg", "0")
+    assert rows[1][1] == "7/3/4"
+    assert rows[1][5:] == ("0..10", "0..5 deg", "0.1")
+    assert rows[2][1:5] == ("1/1/1", "0", "0", "0")
+
+
+def test_observations_of_shared_unique_ids_are_not_known_and_say_why():
+    full = fully_observable(3)
+    legacy = replace(full, observations=replace(full.observations, legacy_index=True))
+
+    sheet = describe(make(Block(legacy, 1)))[4]
+
+    assert sheet.rows[0][1:5] == ("-",) * 4
+    assert "not a legacy_index with branching_factor=3" in sheet.notes[-1]
+
+
+def test_table_2_of_the_paper_has_all_its_rows_in_one_command(capsys):
+    module.main(curricula.names, curricula.load, argv=["probabilities", "--format", "markdown"])
+
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("| b=")] == [
+        "| b=2, d=1, p=0 | 3.70e-02 | 7.41e-02 | 1/2 | 8 | 2 |",
+        "| b=2, d=2, p=0.9 | 1.20e-05 | 4.80e-05 | 1/4 | 16 | 4 |",
+        "| b=3, d=2, p=0.9 | 2.10e-06 | 1.89e-05 | 1/9 | 28 | 9 |",
+        "| b=2, d=4, p=0.9 | 3.02e-09 | 4.84e-08 | 1/16 | 64 | 16 |",
+        "| b=3, d=10, p=0.9 | 3.75e-23 | 2.22e-18 | 1/59049 | 177148 | 59049 |",
+        "| b=2, d=16, p=0.5 | 3.04e-20 | 2.00e-15 | 1/65536 | 262144 | 65536 |",
+    ]
 
 
 def test_a_ceiling_that_is_not_known_says_why_once():
     tasks = (replace(A, step_reward=-0.1), replace(B, step_reward=-0.1))
 
-    sheet = describe(make(*(Block(task, 1) for task in tasks)))[2]
+    sheet = describe(make(*(Block(task, 1) for task in tasks)))[3]
 
-    assert [row[-2:] for row in sheet.rows] == [("-", "-")] * 2
+    assert [row[1:4] for row in sheet.rows] == [("0.4", "-", "-")] * 2
     reasons = [note for note in sheet.notes if note.startswith("-: ")]
     assert reasons == [
         "-: the memoryless ceiling is exact only for step_reward = 0, where a longer episode is worth no more, got -0.1"
@@ -181,12 +223,12 @@ def test_the_terminal_shows_every_cell_and_note_without_markup():
 def test_every_named_curriculum_can_be_described(name):
     curriculum = curricula.load(name)
 
-    overview, blocks, tasks = describe(curriculum)
+    overview, blocks, *of_tasks = sheets = describe(curriculum)
 
     assert overview.title == name
     assert len(blocks.rows) == sum(map(len, curriculum.trained))
-    assert len(tasks.rows) == len(curriculum.tasks)
-    assert all(len(row) == len(sheet.columns) for sheet in (overview, blocks, tasks) for row in sheet.rows)
+    assert [len(sheet.rows) for sheet in of_tasks] == [len(curriculum.tasks)] * 3
+    assert all(len(row) == len(sheet.columns) for sheet in sheets for row in sheet.rows)
 
 
 def test_the_listing_has_a_row_for_each():
