@@ -131,7 +131,7 @@ def test_observations_have_what_they_leave_open_and_what_varies():
 
     rows = describe(make(Block((A, noisy, fully_observable()), 1)))[4].rows
 
-    assert rows[0][1:] == ("7/3/4", "0.5012", "1.97", "0.9651", "0", "0 deg", "0")
+    assert rows[0][1:] == ("7/3/4", "0.5012", "1.822", "0.965", "0", "0 deg", "0")
     assert rows[1][1] == "7/3/4"
     assert rows[1][5:] == ("0..10", "0..5 deg", "0.1")
     assert rows[2][1:5] == ("1/1/1", "0", "0", "0")
