@@ -24,7 +24,7 @@ from ctgraph_rl import RunLog, describe
 from ctgraph_rl.log import escape
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.report import results
-from ctgraph_rl.report.gallery import Gallery
+from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.style import short
 from ctgraph_rl.report.terminal import print_summary

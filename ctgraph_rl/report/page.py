@@ -12,14 +12,14 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
 from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 from ctgraph_rl.report import results
-from ctgraph_rl.report.gallery import CaptionedFigure, Gallery, Written
-from ctgraph_rl.report.heatmaps import MOST_NAMES, transfer_maps
-from ctgraph_rl.report.learning_curves import learning_curves, training_curves
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
+from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
+from ctgraph_rl.report.figures.learning_curves import learning_curves, training_curves
+from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
 from ctgraph_rl.report.terminal import code_notes, mixed_code
-from ctgraph_rl.report.trees import Trees, find_trees, task_trees
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
 

@@ -104,6 +104,7 @@ def cell(lines: Raw, column: str, bounds: tuple[float, float] = (0.0, 1.0)) -> s
 def by_goal(raw: Raw, configuration: str) -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
     from baselines.catalogue import catalogue
+    from ctgraph_rl.tasks.values import open_loop_ceiling
 
     kinds = {agent.name: agent.kind for agent in catalogue("agent")}
     of = groups([line for line in raw if line["configuration"] == configuration], "agent", "task")
@@ -116,6 +117,8 @@ def by_goal(raw: Raw, configuration: str) -> str:
         if not remembers and rows:
             exact = (", ".join(ceilings(configuration, goal)) for goal in goals)
             rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
+            blind = (open_loop_ceiling(task_of(configuration, goal)) for goal in goals)
+            rows.append(["*ceiling without observations*", *(f"*{value:.2f}*" for value in blind)])
     return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
 
 

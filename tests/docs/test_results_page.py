@@ -146,13 +146,17 @@ def test_no_policy_without_memory_is_above_its_exact_ceiling(make):
             assert float(line[f"{way}_return"]) <= ceiling + 5 * spread, line
 
 
-def test_memory_solves_every_goal_of_every_small_configuration(make):
-    cells = make.groups(make.read("baselines_b1"), "agent", "configuration", "task")
+def test_memory_solves_every_goal_of_every_small_configuration_in_every_seed_but_one(make):
+    raw = make.read("baselines_b1")
 
-    for (agent, configuration, _), lines in cells.items():
-        if agent == "lstm_ppo" or (configuration == "fo_b1" and agent != "reinforce"):
-            mean = sum(float(line["greedy_success"]) for line in lines) / len(lines)
-            assert mean >= 0.99, (agent, configuration)
+    failed = {
+        (line["agent"], line["configuration"], line["task"], line["seed"])
+        for line in raw
+        if line["agent"] == "lstm_ppo" or (line["configuration"] == "fo_b1" and line["agent"] != "reinforce")
+        if float(line["greedy_success"]) < 0.95
+    }
+    assert failed == {("lstm_ppo", "posr_b1", "2.1", "4")}
+    assert "on goal 2.1 of CT-POSR-B1 one seed of five did not" in " ".join(make.page().split())
 
 
 def test_at_least_two_agents_solve_ct_fo_b2(make):

@@ -13,10 +13,10 @@ from helpers.made_runs import write_run
 import curricula
 from ctgraph_rl import RunLog
 from ctgraph_rl.report import __main__ as command
-from ctgraph_rl.report.gallery import Gallery
+from ctgraph_rl.report.figures.gallery import Gallery
+from ctgraph_rl.report.figures.trees import Trees, draw_trees
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.sections import evaluation_curve, over_seeds, sections, training_curve
-from ctgraph_rl.report.trees import Trees, draw_trees
 from ctgraph_rl.run import run, show
 from ctgraph_rl.runs.load import Trained
 from ctgraph_rl.runs.read import find_runs
@@ -169,7 +169,7 @@ def test_on_the_trees_each_task_is_played_with_what_acts_in_it(monkeypatch):
         played.append((task, policy))
         return Visits({}, {})
 
-    monkeypatch.setattr("ctgraph_rl.report.trees.visits", play)
+    monkeypatch.setattr("ctgraph_rl.report.figures.trees.visits", play)
     agent = SimpleNamespace(policy="the present one", policy_for=lambda number: number, initial_state=None)
     draw_trees(Trees(learned, Trained(agent, learned, 0, 0, RunLog()), ""), 0)
 

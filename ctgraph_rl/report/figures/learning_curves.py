@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
-from ctgraph_rl.report.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import FEWEST_FOR_BANDS, Point, Result, Section, evaluation_curve, training_curve
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
 

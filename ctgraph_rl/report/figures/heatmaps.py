@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ctgraph_rl.report.gallery import INTERVAL, CaptionedFigure
+from ctgraph_rl.report.figures.gallery import INTERVAL, CaptionedFigure
+from ctgraph_rl.report.figures.trees import Trees
 from ctgraph_rl.report.sections import Matrix, Result, Section
 from ctgraph_rl.report.style import WIDTH, new_figure, short
-from ctgraph_rl.report.trees import Trees
 
 MOST_NUMBERS = 10
 """Tasks up to which cells have numbers."""

@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 from ctgraph_rl.log.files import AGENT, CURRICULUM
-from ctgraph_rl.report.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Result, Section
 from ctgraph_rl.report.style import WIDTH, new_figure, short
 from ctgraph_rl.runs.load import Trained, load
