@@ -305,11 +305,6 @@ def middle(run):
     (run / "run.jsonl").write_text("\n".join(lines) + "\n")
 
 
-def without_label(run):
-    log = (run / "run.jsonl").read_text()
-    (run / "run.jsonl").write_text(log.replace('"label": ', '"name": '))
-
-
 def torn(run):
     (run / "metrics.json").unlink()
     with open(run / "run.jsonl", "a") as file:
@@ -318,7 +313,6 @@ def torn(run):
 
 FAULTS = [
     (middle, "run.jsonl: line 4 is no measurement"),
-    (without_label, "run.jsonl: "),
     (torn, "unfinished, with a torn last line"),
     (lambda run: (run / "metrics.json").write_text('{"a": 1'), "metrics.json cannot be read: "),
     (lambda run: (run / "metrics.json").write_text('{"a": 1}'), "metrics.json does not hold metrics of ours"),
