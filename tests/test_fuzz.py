@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import pytest
 import torch
 from helpers.reference_files import SHIPPED_2023
 
-from baselines.catalogue import catalogue
+from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import (
     Block,
     CTGraph,
@@ -139,21 +139,27 @@ def gym_steps(make: Callable[..., Any], **arguments: Any) -> None:
     env.step(env.action_space.sample())
 
 
+@cache
+def entries(group: str) -> tuple[Entry, ...]:
+    """All agents, or all methods."""
+    return tuple(catalogue(group))
+
+
 def tiny(name: str) -> dict[str, Any]:
     """The settings of an agent's yaml, made small."""
-    settings = dict(next(entry for entry in catalogue("agent") if entry.name == name).settings)
+    settings = dict(next(entry for entry in entries("agent") if entry.name == name).settings)
     small = {"num_envs": 2, "num_steps": 8, "hidden_size": 4, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
     small |= {"num_epochs": 1, "num_updates": 1, "compile": False}
     return settings | {key: value for key, value in small.items() if key in settings}
 
 
 def built(group: str, name: str, **settings: Any) -> Any:
-    kind = next(entry for entry in catalogue(group) if entry.name == name).kind
+    kind = next(entry for entry in entries(group) if entry.name == name).kind
     return partial(kind, **settings)
 
 
 def agents() -> Iterator[tuple[str, Any]]:
-    for entry in catalogue("agent"):
+    for entry in entries("agent"):
 
         def make(name: str = entry.name, **settings: Any) -> object:
             return new_agent(SMALL_CURRICULUM, built("agent", name, **settings), 0)
@@ -163,7 +169,7 @@ def agents() -> Iterator[tuple[str, Any]]:
 
 def methods() -> Iterator[tuple[str, Any]]:
     one_hot = replace(SMALL_CURRICULUM, protocol=Protocol("at_boundaries"))
-    for entry in catalogue("method"):
+    for entry in entries("method"):
 
         def make(entry: Any = entry, **settings: Any) -> object:
             method = built("method", entry.name, **settings)
@@ -232,14 +238,17 @@ def any_curriculum(draw: random.Random) -> Curriculum:
     every = draw.choice((0, 16, 8, 12))
     how = Evaluation(2, draw.random() < 0.5, 1, draw.random() < 0.8, every, draw.random() < 0.7, "all", held_out)
     how = replace(how, tasks=draw.choice(("all", "seen")))
-    protocol = Protocol(draw.choice(("hidden", "one_hot", "at_boundaries")), draw.choice(("announced", "hidden")))
+    boundaries = draw.choice(("announced", "announced", "announced", "hidden"))
+    protocol = Protocol(draw.choice(("hidden", "one_hot", "one_hot", "one_hot")), boundaries)
+    if draw.random() < 0.2:
+        protocol = Protocol("at_boundaries", draw.choice(("announced", "announced", "hidden")))
     return Curriculum("any", 1, "a test", tuple(blocks), how, protocol)
 
 
 def run_case(draw: random.Random, folder: Path, _: Any) -> tuple[str, str | None]:
     """Any curriculum, agent and method; a short run in memory or in a directory, whose files are then read."""
-    agent, method = draw.choice([name for name, _ in agents()]), draw.choice([e.name for e in catalogue("method")])
-    settings, of_method = tiny(agent), next(e.settings for e in catalogue("method") if e.name == method)
+    agent, method = (draw.choice(entries(group)).name for group in ("agent", "method"))
+    settings, of_method = tiny(agent), next(e.settings for e in entries("method") if e.name == method)
     odd = draw.choice([None, *settings])
     if odd is not None and draw.random() < 0.5:
         settings[odd] = draw.choice((1, 2, 3, 0.5, 1e-5, 1.0))

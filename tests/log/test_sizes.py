@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import random
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,6 +20,7 @@ import torch
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, Task, metrics
 from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.lifelong import check_rows
+from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
@@ -127,6 +130,32 @@ def test_scores_grow_as_the_log(tmp_path):
 
     assert exponent(lambda each: scores(*each), (short, few), (long, many), growth) < 1.05
     assert exponent(lambda log: write_tables(log, tmp_path, parquet=False), short, long, growth) < 1.05
+
+
+def peak(work: Callable[[], object]) -> int:
+    """The most bytes that Python has allocated at once."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_grows_as_the_files_that_are_read_and_written(tmp_path):
+    def shares(count: int) -> list[float]:
+        log, each = logged(curriculum(count)), curriculum(count)
+        path, metrics_path = tmp_path / f"{count}.jsonl", tmp_path / f"{count}.json"
+        path.write_text("".join(json.dumps(line) + "\n" for line in log.measurements), encoding="utf-8")
+        found = scores(log, each)
+        read, scored = peak(lambda: RunLog.read(path)), peak(lambda: scores(log, each))
+        written = peak(lambda: write_metrics(metrics_path, found))
+        size = path.stat().st_size
+        return [read / size, scored / size, written / metrics_path.stat().st_size]
+
+    few, many = shares(16), shares(48)
+
+    assert all(large < 1.1 * small for small, large in zip(few, many, strict=True)), (few, many)
 
 
 def a_run(draw: random.Random) -> list[Regime]:
