@@ -144,7 +144,7 @@ def _weights(one: Path, other: Path) -> str:
     missing = [str(file.parent) for file in files if not file.exists()]
     if missing:
         return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
-    states = [dict(flat(read_plain(file.read_bytes()))) for file in files]
+    states = [_state(file) for file in files]
     if list(states[0]) != list(states[1]):
         return "different: the agents have other parts"
     pairs = {key: (states[0][key], states[1][key]) for key in states[0]}
@@ -153,6 +153,14 @@ def _weights(one: Path, other: Path) -> str:
         return "equal, bit for bit"
     shown = terminal_text(", ".join(unequal[:3]) + (f" and {len(unequal) - 3} more" if len(unequal) > 3 else ""))
     return f"different in {len(unequal)} of {len(pairs)} parts: {shown}"
+
+
+def _state(file: Path) -> dict[str, Any]:
+    """Return the parts of an agent's state by their dotted names."""
+    try:
+        return dict(flat(read_plain(file.read_bytes())))
+    except ValueError as error:
+        raise ValueError(f"{file} {error}") from None
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -35,6 +35,9 @@ STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 SCRIPT = "__main__"
 
+SCRIPTS = (SCRIPT, "__mp_main__")
+"""The script that runs, and its name in processes that ``multiprocessing`` starts."""
+
 NOT_CODE = ("kind", "type_comment", "type_ignores")
 """Fields of syntax nodes that change nothing; ``kind`` is the u of a text."""
 
@@ -42,7 +45,7 @@ NOT_CODE = ("kind", "type_comment", "type_ignores")
 class Module(NamedTuple):
     """A module of the user."""
 
-    digest: str
+    digest: str | None  # None if its file cannot be read
     imports: frozenset[str]  # modules that it imports, and names that may be modules
 
 
@@ -64,7 +67,7 @@ def sources_of(names: Iterable[str]) -> dict[str, str | None]:
     waiting: list[str] = []
     for name in names:
         package = name.partition(".")[0]
-        if package == SCRIPT:
+        if package in SCRIPTS:
             module = _of_script(name.split(".")[1])
             found[SCRIPT] = module and module.digest
             waiting += module.imports if module else ()
@@ -90,8 +93,10 @@ def _specs(name: str) -> Iterator[tuple[str, ModuleSpec]]:
         yield package, spec
         if not rest or spec.submodule_search_locations is None or _is_installed(spec):
             return
-        package = f"{package}.{rest.pop(0)}"
-        spec = PathFinder.find_spec(package, list(spec.submodule_search_locations))
+        name = rest.pop(0)
+        package = f"{package}.{name}"
+        # by its last name, as a dotted one needs its parent imported
+        spec = PathFinder.find_spec(name, list(spec.submodule_search_locations))
 
 
 def _top(package: str) -> ModuleSpec | None:
@@ -112,9 +117,11 @@ def _is_installed(spec: ModuleSpec) -> bool:
 
 
 def _installed(package: str) -> dict[str, str | None]:
-    """Return an installed package with its version; empty for any other."""
+    """Return an installed package with its version, and None for what is nowhere; empty for any other."""
     spec = _top(package)
-    if spec is None or not _is_installed(spec):
+    if spec is None:
+        return {package: None}
+    if not _is_installed(spec):
         return {}
     try:
         return {package: f"version {metadata.version(package)}"}
@@ -128,7 +135,11 @@ def _module(name: str, spec: ModuleSpec) -> Module:
     imported = getattr(sys.modules.get(name), "__spec__", None)
     if imported is not None and name in _READ and _READ[name][0] is imported:
         return _READ[name][1]
-    module = read_module(name, Path(str(spec.origin)).read_bytes(), spec.submodule_search_locations is not None)
+    try:
+        source = Path(str(spec.origin)).read_bytes()
+    except OSError:  # it was removed, or is in an archive
+        return Module(None, frozenset())
+    module = read_module(name, source, spec.submodule_search_locations is not None)
     if imported is not None:
         _READ[name] = imported, module
     return module
@@ -144,20 +155,23 @@ def read_module(name: str, source: bytes, is_package: bool = False) -> Module:
     """
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError):
+        digest = _hash(syntax(tree))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
         return Module(_hash([source.hex()]), frozenset())
     package = name if is_package else name.rpartition(".")[0]
-    return Module(_hash(syntax(tree)), frozenset(_imports(tree, package)))
+    return Module(digest, frozenset(_imports(tree, package)))
 
 
 def _of_script(name: str) -> Module | None:
-    """Return what a class or function of the script that runs needs of it; None without a file."""
+    """Return what a class or function of the script that runs needs of it; None without a file that defines it."""
     path = getattr(sys.modules.get(SCRIPT), "__file__", None)
     if path is None or not Path(path).is_file():
         return None
     tree = ast.parse(Path(path).read_bytes())
     package = getattr(sys.modules[SCRIPT], "__package__", None) or ""
     tree.body = _needed(tree.body, name)
+    if not tree.body:
+        return None
     return Module(_hash(syntax(tree)), frozenset(_imports(tree, package)))
 
 
@@ -173,17 +187,26 @@ def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
 
 
 def _defined(statement: ast.stmt) -> Iterator[str]:
-    """Yield the names that a statement of a module defines, or may define."""
+    """Yield the names that a statement of a module defines, or may define, and of what it sets an attribute or item."""
     if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
         yield statement.name
         return
     for node in ast.walk(statement):
+        if isinstance(node, (ast.Attribute, ast.Subscript)) and isinstance(node.ctx, ast.Store):
+            yield from (each.id for each in [_root(node)] if isinstance(each, ast.Name))
         if isinstance(node, ast.alias):
             yield (node.asname or node.name).partition(".")[0]
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id
         elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             yield node.name
+
+
+def _root(node: ast.expr) -> ast.expr:
+    """Return what an attribute or item is of, at any depth."""
+    while isinstance(node, (ast.Attribute, ast.Subscript)):
+        node = node.value
+    return node
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:
@@ -196,8 +219,9 @@ def _imports(tree: ast.AST, package: str) -> Iterator[str]:
             start = [*filter(None, parents), *filter(None, [node.module])]
             yield from (".".join([*start, alias.name]) for alias in node.names if parents or not node.level)
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-            names = [each.value for each in node.args[:1] if isinstance(each, ast.Constant)]
-            yield from (name for name in names if isinstance(name, str))
+            given = [*node.args[:1], *(each.value for each in node.keywords if each.arg == "name")]
+            names = [each.value for each in given if isinstance(each, ast.Constant) and isinstance(each.value, str)]
+            yield from (f"{package}{name}" if name.startswith(".") else name for name in names)
 
 
 def syntax(tree: ast.AST) -> Iterator[str]:

@@ -235,6 +235,8 @@ def code_of(cfg: DictConfig, known: dict[str, dict[str, Any]]) -> dict[str, Any]
     deciding = {key: settings.get(key) for key in ("curriculum", "method", *config.PARTS)}
     key = json.dumps([deciding, learners(settings, None)], sort_keys=True)
     if key not in known:
+        with suppress(Exception):  # of the code of a user; once imported it may find more modules
+            config.target(cfg, "agent")
         known[key] = _code(curriculum_of(cfg, config.target(cfg, "method")()), settings)
     return known[key]
 

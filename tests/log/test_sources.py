@@ -8,6 +8,8 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from zipfile import ZipFile
 
 import pytest
 
@@ -47,7 +49,7 @@ def write(tmp_path, monkeypatch):
     def write(**texts: str) -> None:
         for name, text in texts.items():
             path = tmp_path / f"{name.replace('__in__', '/')}.py"
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(exist_ok=True, parents=True)
             path.write_text(text)
         for name in set(sys.modules) - before:
             if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
@@ -167,6 +169,46 @@ def test_what_cannot_be_read_is_unknown(monkeypatch):
     assert sources_of(["__main__.Agent"]) == {"__main__": None}
 
 
+@pytest.mark.parametrize("name", ["made_by_hand.Agent", "removed.Agent", "archived.Agent", "__mp_main__.NoSuchClass"])
+def test_what_has_no_file_is_unknown(name, write, tmp_path, monkeypatch):
+    write(removed="x = 1")
+    import removed  # type: ignore[import-not-found]
+
+    Path(removed.__file__).unlink()
+    monkeypatch.setitem(sys.modules, "made_by_hand", ModuleType("made_by_hand"))
+    with ZipFile(tmp_path / "archive.zip", "w") as archive:
+        archive.writestr("archived.py", "x = 1")
+    monkeypatch.syspath_prepend(tmp_path / "archive.zip")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", __file__, raising=False)
+
+    assert list(sources_of([name]).values()) == [None]
+
+
+def test_packages_without_init_within_others_are_found_without_their_import(write):
+    write(mine__in__deep__in__agent="def f():\n    import mine.other.part", mine__in__other__in__part="")
+
+    assert list(sources_of(["mine.deep.agent.Agent"])) == ["mine.deep.agent", "mine.other.part"]
+
+
+def test_modules_that_are_imported_by_a_relative_name_or_a_keyword_count(write):
+    imports = "from importlib import import_module as i\nimport importlib as l\nl.import_module('.a', 'mine')"
+    write(mine__in____init__=f"{imports}\nl.import_module(name='mine_b')", mine__in__a="", mine_b="")
+
+    assert list(sources_of(["mine.Agent"])) == ["mine", "mine.a", "mine_b"]
+
+
+@pytest.mark.parametrize("change", ["Agent.size = 2", "WIDTHS['x'] = 2", "Agent.net.sizes[0] = 2"])
+def test_attributes_and_items_that_a_script_sets_count(change, tmp_path, monkeypatch):
+    script = tmp_path / "script.py"
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(script), raising=False)
+    found = []
+    for more in ("", "Other.size = 2\n", change):
+        script.write_text(f"WIDTHS = {{}}\nclass Agent:\n    net = WIDTHS\nclass Other: ...\n{more}")
+        found.append(sources_of(["__main__.Agent"]))
+
+    assert found[0] == found[1] != found[2]
+
+
 def test_of_a_script_what_a_class_needs_counts(tmp_path, write):
     write(helper="x = 1", other="x = 1")
     script = """
@@ -207,4 +249,6 @@ def test_characters_that_only_some_versions_can_print_do_not_count():
 
 def test_what_is_no_python_counts_byte_by_byte():
     assert read_module("mine", b"x = (").digest != read_module("mine", b"x = ((").digest
+    for much in (f"0x{'f' * 5000}", f"{'-' * 5000}1"):
+        assert digest(f"x = {much}") != digest(f"y = {much}")
     assert Path(ctgraph_rl.log.sources.__file__).read_text().count("import ctgraph_rl") == 0

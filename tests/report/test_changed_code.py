@@ -164,6 +164,14 @@ def test_a_comment_a_docstring_or_another_curriculum_in_the_file_is_no_change(mi
     assert ran == [20]
 
 
+def test_modules_that_an_agent_finds_only_once_it_is_imported_are_no_change(mine, ran, monkeypatch):
+    mine.write("lib/my_part.py", "x = 1\n")
+    mine.write("my_network.py", "import sys\nsys.path.insert(0, 'lib')\nimport my_part\nSIZE = my_part.x\n")
+    sweep(monkeypatch, *MINE, "seed=20")
+    log = next(mine.folder.rglob("run.jsonl"))
+    assert list(json.loads(log.read_text().splitlines()[0])["sources"]) == ["my_agent", "my_network", "my_part"]
+
+
 def test_another_numbers_version_of_the_package_makes_its_own_runs_stale(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20")
     monkeypatch.setattr(provenance, "NUMBERS", 2)
