@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import torch
 
 from ctgraph_rl.checks import is_real, positive, require
-from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.runs.checkpoints import read_plain
+from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
 
 BOUND = 1e-4
@@ -52,7 +52,7 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
         bound: see `BOUND`.
 
     Raises:
-        ValueError: for a directory without a run, and a log that cannot be read.
+        ValueError: for a directory without a run, and a log or weights that cannot be read.
     """
     logs = [_log(path) for path in (one, other)]
     first = [log[0] for log in logs]
@@ -76,8 +76,13 @@ def _measured(line: Line) -> dict[str, Any]:
     """Return a measurement without its time, and without where the runs of experts are."""
     kept = {key: value for key, value in line.items() if key != "seconds"}
     if isinstance(kept.get("experts"), list):
-        kept["experts"] = [{k: v for k, v in dict(each).items() if k != "run"} for each in kept["experts"]]
+        kept["experts"] = [_without_place(each) for each in kept["experts"]]
     return kept
+
+
+def _without_place(expert: Any) -> Any:
+    """Return what the log says of an expert, but for its directory."""
+    return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
 
 
 def _verdict(found: Sequence[Sequence[Line]], bound: float) -> tuple[int, str]:
@@ -144,7 +149,7 @@ def _weights(one: Path, other: Path) -> str:
     missing = [str(file.parent) for file in files if not file.exists()]
     if missing:
         return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
-    states = [_state(file) for file in files]
+    states = [dict(flat(_state(file))) for file in files]
     if list(states[0]) != list(states[1]):
         return "different: the agents have other parts"
     pairs = {key: (states[0][key], states[1][key]) for key in states[0]}
@@ -155,12 +160,15 @@ def _weights(one: Path, other: Path) -> str:
     return f"different in {len(unequal)} of {len(pairs)} parts: {shown}"
 
 
-def _state(file: Path) -> dict[str, Any]:
-    """Return the parts of an agent's state by their dotted names."""
+def _state(path: Path) -> Mapping[str, Any]:
+    """Return what an agent saved."""
+    content = content_of(path)
     try:
-        return dict(flat(read_plain(file.read_bytes())))
+        state = read_plain(content)
+        require((isinstance(state, Mapping), "holds no state of an agent"))
     except ValueError as error:
-        raise ValueError(f"{file} {error}") from None
+        raise ValueError(f"{path} {error}: restore it") from error
+    return state
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -172,7 +180,7 @@ def _same(one: Any, other: Any) -> bool:
         return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return list(one) == list(other) and all(_same(one[key], other[key]) for key in one)
-    return bool(one == other)
+    return type(one) is type(other) and bool(one == other)
 
 
 def _bits(tensor: torch.Tensor) -> torch.Tensor:
@@ -204,8 +212,8 @@ def main() -> None:
         require(*positive(bound=arguments.bound))
         found = compare(arguments.one, arguments.other, arguments.bound)
     except (OSError, ValueError) as error:
-        parser.error(str(error))
-    print("\n".join(found.lines))
+        parser.error(terminal_lines(error))
+    print(terminal_lines("\n".join(found.lines)))
     sys.exit(found.code)
 
 

@@ -19,10 +19,11 @@ from helpers.stopped_runs import with_header
 import curricula
 from ctgraph_rl import Curriculum, RunLog, Task
 from ctgraph_rl.log.saved import read_plain
+from ctgraph_rl.log.sums import damaged, write_sums
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs
-from ctgraph_rl.runs.status import FAILED, lock_holder, status_of
+from ctgraph_rl.runs.status import FAILED, MISSING, lock_holder, status_of
 from ctgraph_rl.tasks import curriculum_json
 from ctgraph_rl.tasks.images import GroupedImages, PaperImages, ReferenceImages
 
@@ -208,6 +209,33 @@ def test_no_reader_opens_a_pipe_or_a_device(tmp_path, make):
     assert [problem.reason for problem in find_runs([tmp_path])[1]] != []
     assert lock_holder(tmp_path / "run") is None
     assert status_of(tmp_path / "run").state in ("done", FAILED)
+
+
+@pytest.mark.parametrize("make", SPECIAL.values(), ids=SPECIAL)
+@pytest.mark.parametrize("name", ["sums.json", "curriculum.json", "agent.pt", "performance.csv", "metrics.json"])
+def test_no_pipe_or_device_is_opened_to_see_whether_a_run_is_whole(tmp_path, make, name):
+    log_of(tmp_path / "run", ABOUT, LINE)
+    (tmp_path / "run" / name).unlink(missing_ok=True)
+    make(tmp_path / "run" / name)
+
+    assert damaged(tmp_path / "run") == [name]
+    assert status_of(tmp_path / "run").state in ("done", MISSING)
+
+
+@pytest.mark.parametrize("make", SPECIAL.values(), ids=SPECIAL)
+def test_a_log_that_is_a_pipe_or_a_device_is_not_blank(tmp_path, make):
+    make(tmp_path / "run.jsonl")
+
+    assert not RunLog.is_blank(tmp_path / "run.jsonl")
+
+
+def test_a_file_of_another_length_is_not_read_for_its_sum(tmp_path):
+    log_of(tmp_path / "run", ABOUT, LINE)
+    write_sums(tmp_path / "run", b"{}")
+    with (tmp_path / "run" / "metrics.json").open("wb") as file:
+        file.truncate(2**40)  # on the disk it has no bytes
+
+    assert damaged(tmp_path / "run") == ["metrics.json"]
 
 
 @pytest.mark.parametrize("text", ["process x on HOST", "process -9999999999999999999999 on HOST"])

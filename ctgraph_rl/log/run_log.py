@@ -182,7 +182,10 @@ class RunLog:
     @classmethod
     def is_blank(cls, path: Path | str) -> bool:
         """Return whether a log holds no more than a part of its first line, as where the machine stopped early."""
-        content = Path(path).read_bytes().strip(b"\0")
+        try:
+            content = read_regular(path, MOST_BYTES).strip(b"\0")
+        except ValueError:
+            return False
         return b"\n" not in content and BEGINNING.startswith(content[: len(BEGINNING)])
 
     def of_kind(self, kind: str) -> list[dict[str, Any]]:

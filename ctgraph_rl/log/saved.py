@@ -7,7 +7,7 @@ import pickletools
 import re
 import struct
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,34 @@ def read_plain(content: bytes) -> Any:
     """
     require_records(content)
     try:
-        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        value = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # what a pickle that others made may raise is without end
         raise ValueError("holds more than tensors and plain values, or is torn") from error
+    _require_small(value, len(content))
+    return value
+
+
+def _require_small(value: Any, num_bytes: int) -> None:
+    """Refuse what is small in the file and large where it is used: parts that stand in many places, and long strides.
+
+    Raises:
+        ValueError: for more parts than the file has bytes, and for tensors that would not fit this machine.
+    """
+    parts, count, total = [value], 0, 0
+    while parts and count <= num_bytes:
+        part = parts.pop()
+        count += 1
+        if isinstance(part, torch.Tensor):
+            total += part.numel() * part.element_size()
+        elif isinstance(part, Mapping):
+            parts.extend(part.values())
+        elif isinstance(part, (list, tuple)):
+            parts.extend(part)
+    most = memory_bytes() // SHARE_OF_MEMORY
+    require(
+        (count <= num_bytes, f"has more parts than its {num_bytes:,} bytes, as some stand in many places"),
+        (total <= most, f"has tensors of {total:,} bytes, the limit is {most:,}"),
+    )
 
 
 def require_records(content: bytes) -> None:

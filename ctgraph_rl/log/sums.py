@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog
 
 SUMS = "sums.json"
 """The file with the sums."""
+
+MOST_BYTES_OF_SUMS = 2**16
+"""Largest `SUMS` that is read."""
 
 TABLES = ("evaluations.csv", "training.csv", "performance.csv")
 
@@ -59,7 +62,7 @@ def is_complete(run_dir: Path) -> bool:
 def _stored(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
     """Return the stored sum of each file, none where they cannot be read."""
     try:
-        files = json.loads((run_dir / SUMS).read_bytes())["files"]
+        files = json.loads(read_regular(run_dir / SUMS, MOST_BYTES_OF_SUMS))["files"]
         ours = METRICS in files and all(name in RESULTS and isinstance(files[name], dict) for name in files)
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
@@ -71,7 +74,8 @@ def _sum(content: bytes) -> dict[str, Any]:
 
 
 def _is_same(path: Path, stored: Mapping[str, Any]) -> bool:
-    return path.is_file() and _sum(path.read_bytes()) == stored
+    there = path.is_file() and path.stat().st_size == stored.get("bytes")
+    return there and _sum(path.read_bytes()) == stored
 
 
 def _is_log(path: Path) -> bool:
@@ -97,6 +101,6 @@ _CHECKS: dict[str, Callable[[Path], bool]] = {
 def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
     """Return whether a file passes a check; all but the log may be missing, as others than a run of ours write none."""
     try:
-        return check(path) if path.exists() or path.name == LOG else True
+        return path.is_file() and check(path) if path.exists() or path.name == LOG else True
     except (OSError, ValueError, RecursionError):
         return False

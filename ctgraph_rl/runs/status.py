@@ -17,10 +17,10 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from ctgraph_rl.disk import read_text
+from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
-from ctgraph_rl.log.sums import SUMS, is_complete
+from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
 
 DONE, STALE, FAILED, IN_USE, MISSING = "done", "stale", "failed", "in use", "missing"
 
@@ -63,8 +63,8 @@ def holds_results(folder: Path) -> bool:
 
 def _content(path: Path) -> bytes:
     try:
-        return path.read_bytes()
-    except OSError:
+        return read_regular(path, MOST_BYTES_OF_SUMS)
+    except (OSError, ValueError):
         return b""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -12,6 +13,10 @@ from helpers.made_runs import write_run
 
 from ctgraph_rl import cli
 from ctgraph_rl.log.files import AGENT, LOG
+
+DOUBLED_LIST: list = []
+for _ in range(60):
+    DOUBLED_LIST = [DOUBLED_LIST, DOUBLED_LIST]
 
 
 @pytest.fixture
@@ -139,3 +144,49 @@ def test_what_is_no_run_is_an_error(pair, said, tmp_path):
 
     assert code == 2 and f"{tmp_path / 'none'} holds no run: there is no run.jsonl" in error
     assert said(*pair, "--bound", "0")[0] == 2
+
+
+ODD_WEIGHTS = {
+    "no state": (torch.ones(2), "holds no state of an agent: restore it"),
+    "torn": (b"xx", "or is torn: restore it"),
+    "a list in many places": ({"a": DOUBLED_LIST}, "has more parts than its"),
+    "a tensor of strides 0": ({"a": torch.ones(1).expand(2**40)}, "has tensors of 4,398,046,511,104 bytes, the limit"),
+}
+
+
+@pytest.mark.parametrize("case", ODD_WEIGHTS)
+def test_weights_that_no_agent_saved_are_one_message(pair, said, case):
+    weights, message = ODD_WEIGHTS[case]
+    for run in pair:
+        (run / AGENT).write_bytes(weights) if isinstance(weights, bytes) else torch.save(weights, run / AGENT)
+
+    code, _, error = said(*pair)
+
+    assert code == 2 and str(pair[0] / AGENT) in error and message in error
+
+
+def test_weights_are_read_from_a_regular_file(pair, said):
+    (pair[0] / AGENT).unlink()
+    os.mkfifo(pair[0] / AGENT)
+
+    assert "agent.pt must be a regular file" in said(*pair)[2]
+
+
+def test_parts_of_other_types_are_different(pair, said):
+    torch.save({"weight": 1.0, "steps": torch.ones(2)}, pair[0] / AGENT)
+
+    assert said(*pair)[1][1] == "weights: different in 2 of 2 parts: weight, steps"
+
+
+def test_an_odd_list_of_experts_is_compared_as_it_is(pair, said):
+    change(pair[0], 1, experts=[1])
+
+    assert "experts [1] and None" in said(*pair)[1][0]
+
+
+def test_no_path_is_obeyed_by_a_terminal(pair, said, tmp_path):
+    run = pair[0].rename(tmp_path / "\x1b[2J")
+    (run / AGENT).unlink()
+
+    assert "\x1b" not in "\n".join(said(run, pair[1])[1])
+    assert "\x1b" not in said(run / "no", pair[1])[2]
