@@ -35,6 +35,7 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
+    ("ctgraph_rl.benchmark.sizes", "TemporaryDirectory"): "a folder of its own",
     ("ctgraph_rl.cli", "os.open"): "the null device, in place of a broken pipe",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",
