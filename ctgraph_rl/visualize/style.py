@@ -37,9 +37,9 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def picture(figure: Any, form: str, dpi: float | None = None) -> bytes:
-    """Return a figure in a format, such as ``png``."""
+    """Return a figure in a format, such as ``png``; without ``dpi`` with that of its style."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=form, dpi="figure" if dpi is None else dpi)
+    figure.savefig(buffer, format=form, **({} if dpi is None else {"dpi": dpi}))
     return buffer.getvalue()
 
 

@@ -239,8 +239,6 @@ def test_what_a_required_kernel_cannot_run_is_refused_with_the_fix():
     with pytest.raises(ValueError, match="knows the rewards"):
         rollout(rows, scripts(2, 1), Steps.empty(rows, 2), kernel="required")
     with pytest.raises(ValueError, match='runs on a CPU, got meta; use kernel="auto"'):
-        Rows([surjective()], device="meta", kernel="required")
-    with pytest.raises(ValueError, match='runs on a CPU, got meta; use kernel="auto"'):
         Rows([surjective()], kernel="required").to("meta")
     for make in (partial(Rows, [surjective()]), partial(CTGraphEnv, [surjective()]), partial(CTGraphVectorEnv, 2)):
         with pytest.raises(ValueError, match="kernel must be one of auto, off, required, got True"):

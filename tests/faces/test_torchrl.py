@@ -41,7 +41,7 @@ from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_su_b1
 
 TASKS = [surjective(p=0.3), confounding(read_noise=9), surjective(2, 1)]
 ACTIONS = scripts(20, len(TASKS))
-IDS = [f"ctgraph/{name}-v0" for name in ("CTGraph", *CONFIGURATIONS)]
+IDS = [f"ctgraph/{name}-v{int(name == 'CT-POSR-B1')}" for name in ("CTGraph", *CONFIGURATIONS)]
 
 
 def make_env(seed=3, **options):
@@ -255,7 +255,7 @@ def test_slices_of_a_buffer_are_of_one_episode():
 
 
 def test_a_prioritised_buffer_takes_errors_of_samples():
-    pytest.importorskip("torchrl._torchrl")
+    pytest.importorskip("torchrl._torchrl", exc_type=ImportError)
     try:
         buffer = TensorDictPrioritizedReplayBuffer(alpha=0.7, beta=0.9, storage=LazyTensorStorage(60), batch_size=16)
     except RuntimeError as error:

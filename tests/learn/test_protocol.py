@@ -57,12 +57,12 @@ def test_without_ids_there_are_none_in_the_data():
     ("arguments", "message"),
     [
         ({"num_task_ids": 3}, "num_task_ids=3 needs task_ids"),
-        ({"task_ids": {}}, r"task_ids must be integers >= 0, got \[\]"),
-        ({"task_ids": {ONE: -1}}, r"task_ids must be integers >= 0, got \[-1\]"),
-        ({"task_ids": {ONE: True}}, r"task_ids must be integers >= 0, got \[True\]"),
-        ({"task_ids": [0]}, r"task_ids must be integers >= 0, got \[\[0\]\]"),
-        ({"task_ids": {ONE: 2}, "num_task_ids": 2}, r"num_task_ids must be an integer >= 3, .*got 2"),
-        ({"task_ids": {ONE: 2}, "num_task_ids": 3.0}, r"num_task_ids must be an integer >= 3, .*got 3.0"),
+        ({"task_ids": {}}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[\]"),
+        ({"task_ids": {ONE: -1}}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[-1\]"),
+        ({"task_ids": {ONE: True}}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[True\]"),
+        ({"task_ids": [0]}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[\[0\]\]"),
+        ({"task_ids": {ONE: 2}, "num_task_ids": 2}, r"num_task_ids must be an integer in 3..1048576, .*got 2"),
+        ({"task_ids": {ONE: 2}, "num_task_ids": 3.0}, r"num_task_ids must be an integer in 3..1048576, .*got 3.0"),
     ],
 )
 def test_wrong_task_ids_are_refused(arguments, message):

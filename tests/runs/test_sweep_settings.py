@@ -143,7 +143,7 @@ def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, 
 
     sweep(monkeypatch, f"seed={UNLUCKY}", "hydra.sweeper.status=true")
 
-    assert "line 1 is no measurement" in (learned[0] / "failed.txt").read_text()
+    assert "holds run.jsonl, which are of no run" in (learned[0] / "failed.txt").read_text()
     assert "sweep of 1 cells: 0 done, 1 failed, 0 in use, 0 missing" in capsys.readouterr().out
 
 
