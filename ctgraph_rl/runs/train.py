@@ -83,7 +83,7 @@ def _agent_rule(agent: object) -> tuple[bool, str]:
 
 
 def _part_rules(
-    curriculum: Any, experts: object, checkpoints: object, listeners: object, console: object
+    curriculum: Any, experts: Any, checkpoints: object, listeners: object, console: object
 ) -> list[tuple[bool, str]]:
     """The rules of what `train` is given beside the curriculum and the agent."""
     count = len(curriculum.tasks) if isinstance(curriculum, Curriculum) else 0
