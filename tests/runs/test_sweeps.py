@@ -189,7 +189,7 @@ def test_a_launcher_that_gives_up_is_reported(learned, monkeypatch, capsys):
     assert shown.startswith("sweep of 2 cells: 0 done, 0 failed, 0 in use, 2 missing\n")
 
 
-def test_sigterm_ends_a_sweep_between_cells_unless_it_is_ignored():
+def test_sigterm_ends_a_sweep_between_cells_unless_it_is_ignored(default_sigterm):
     with pytest.raises(SystemExit) as end, sigterm_exits():
         os.kill(os.getpid(), signal.SIGTERM)
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
