@@ -288,7 +288,9 @@ class CTGraphEnv(EnvBase):
         is_init = torch.zeros_like(done)
         if mask is not None:
             is_init, reward = (~mask & (self.rows.step_count == 0)).unsqueeze(-1), reward * mask
-        return self._data(shown.observation, done, is_init, shown) | {"reward": reward.unsqueeze(-1)}
+        data = self._data(shown.observation, done, is_init, shown)
+        data["reward"] = reward.unsqueeze(-1)
+        return data
 
     def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.

@@ -84,7 +84,7 @@ class Sweeper(Base):
         is run then.
 
         Raises:
-            ValueError: for a value of ``overwrite`` that is none.
+            ValueError: if ``overwrite`` is not true, false or stale.
             SystemExit: with code 1 if some are not done.
         """
         assert self.config is not None

@@ -39,7 +39,7 @@ def _(t):
 
 @reads("masks_ct8_md")
 def _(t):
-    """It goes on to learn both tasks of depth 4 in every seed, the second at the price of `0000` and `00000`, and
+    """It learns both tasks of depth 4, too, in every seed, the second at the price of `0000` and `00000`, and
     both of depth 5 in three of five."""
     return (
         t.own("finetune")[:, 4:6].all()
@@ -234,7 +234,7 @@ def _(t):
 
 @reads("masks_ct12")
 def _(t):
-    """A goal of depth 3 goes on from one of depth 2, and these two alone agree on all images that they share:
+    """A goal of depth 3 extends one of depth 2, and these two alone agree on all images that they share:
     fine-tuning ends the block of each goal of depth 3 with both, in one block of 40 with a third task, and so
     all five seeds with `11` and `111`."""
     return (
