@@ -17,7 +17,7 @@ from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.__main__ import main as curricula_main
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "curricula.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "curricula.md"
 MARK = "<!-- python -m curricula --format markdown -->\n"
 
 

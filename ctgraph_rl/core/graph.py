@@ -1,6 +1,6 @@
 """The shape of a CT-graph and what is known about it in closed form.
 
-Soltoggio et al. 2023 (arXiv 2302.10887), section 2, with its misprints corrected: see ``docs/errata.md``.
+Soltoggio et al. 2023 (arXiv 2302.10887), section 2, with its misprints corrected: see ``docs/explanation/errata.md``.
 """
 
 from __future__ import annotations

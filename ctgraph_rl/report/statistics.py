@@ -1,6 +1,6 @@
 """Statistics over seeds: what n runs of one agent say, and what they leave open.
 
-There is one rule for each kind of number, and ``docs/statistics.md`` has their coverage by simulation:
+There is one rule for each kind of number, and ``docs/explanation/statistics.md`` has their coverage by simulation:
 
 - A share, and a mean of values with known bounds: Gaffke's interval. It assumes no distribution, stays within the
   bounds, has a width where all seeds agree, and is that of Clopper and Pearson for two outcomes at the bounds.

@@ -1,4 +1,4 @@
-"""How often intervals cover what they are of, by simulation: the tables of docs/statistics.md.
+"""How often intervals cover what they are of, by simulation: the tables of docs/explanation/statistics.md.
 
 Each cell has draws of its own, so that one alone can be computed again. A mean of two outcomes is not simulated: its
 coverage is the sum of the binomial probabilities of the samples whose interval covers.
@@ -18,7 +18,7 @@ from raw import HERE, table
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.intervals import scipy
 
-PAGE = HERE.parent / "statistics.md"
+PAGE = HERE.parent / "explanation" / "statistics.md"
 SEEDS = (3, 5, 10, 20)
 DRAWS = 2000
 RATE = 0.9

@@ -1,4 +1,4 @@
-"""Makes docs/results.md, docs/lifelong.md and figures from the raw results beside this file; and raw results from runs.
+"""Makes baselines.md, lifelong.md and figures from the raw results beside this file; and raw results from runs.
 
 ``python docs/results/make.py`` makes the pages. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
 each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes; for
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
     from ctgraph_rl.runs.load import Trained
 
-PAGE = HERE.parent / "results.md"
-LIFELONG = HERE.parent / "lifelong.md"
+PAGE = HERE / "baselines.md"
+LIFELONG = HERE / "lifelong.md"
 AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
 """Tables of agents that each learned one task."""
 

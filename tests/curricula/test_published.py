@@ -331,7 +331,7 @@ def test_what_is_missing_is_listed_with_reasons_and_not_loaded():
     assert all(entry.name and entry.what and entry.why for entry in MISSING)
     assert {entry.name for entry in MISSING}.isdisjoint(curricula.names())
     assert curricula.MISSING is MISSING
-    page = (CHECKOUT / "docs" / "curricula.md").read_text(encoding="utf-8")
+    page = (CHECKOUT / "docs" / "reference" / "curricula.md").read_text(encoding="utf-8")
     rows = "".join(f"| **{entry.name}**: {entry.what} | {entry.why} |\n" for entry in MISSING)
     assert rows in page
 

@@ -18,7 +18,7 @@ from baselines.catalogue import catalogue
 from ctgraph_rl import RunLog, agent
 from curricula.paper import ct_su_b1
 
-TEXT = (CHECKOUT / "docs" / "agents.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "reference" / "agents.md").read_text(encoding="utf-8")
 
 
 def blocks(language: str) -> list[str]:

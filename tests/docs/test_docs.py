@@ -15,7 +15,7 @@ from ctgraph_rl import CTGraphEnv, Needle, Observations, PaperImages, Task
 from ctgraph_rl.gym import CTGraphGymEnv
 from ctgraph_rl.tasks.configurations import ct_su_b1
 
-TEXT = (CHECKOUT / "docs" / "coming_from_ct_graph.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "how-to" / "migrate.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 PROSE = re.sub(r"```python\n.*?```", "", TEXT, flags=re.DOTALL)
 
@@ -114,7 +114,7 @@ def test_the_python_of_the_page_runs_and_prints_what_it_says_and_writes_nothing_
     handlers = list(logging.getLogger().handlers)
     monkeypatch.chdir(tmp_path)
 
-    exec(compile("".join(BLOCKS), "coming_from_ct_graph.md", "exec"), {})
+    exec(compile("".join(BLOCKS), "migrate.md", "exec"), {})
 
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["0.0 False 0"] * 5 + ["1.0 False 0", "0.0 True 3", "True 16"]

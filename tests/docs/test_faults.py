@@ -1,4 +1,4 @@
-"""The table of docs/faults.md: every fault has its tests, and messages are the real ones. And files of strangers."""
+"""The table of docs/how-to/resume.md: every fault has its tests, and messages are the real ones; files of strangers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from ctgraph_rl.runs.config import run_name
 from ctgraph_rl.runs.read import find_runs
 from curricula.paper import ct_su_b1
 
-ROWS = re.findall(r"^\| (F\d+) \| (.*) \| (.*) \| (.*) \|$", (TESTS.parent / "docs" / "faults.md").read_text(), re.M)
+ROWS = re.findall(
+    r"^\| (F\d+) \| (.*) \| (.*) \| (.*) \|$", (TESTS.parent / "docs" / "how-to" / "resume.md").read_text(), re.M
+)
 
 
 def test_the_table_has_every_fault_of_the_catalogue():

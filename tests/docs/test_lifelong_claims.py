@@ -1,4 +1,4 @@
-"""docs/lifelong.md: each sentence that reads the tables holds of the raw results, and none is without such a test."""
+"""docs/results/lifelong.md: each sentence that reads the tables holds of the raw results, and has a test."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from helpers.paths import CHECKOUT
 
 from ctgraph_rl.metrics import MASTERED
 
-PAGE = CHECKOUT / "docs" / "lifelong.md"
+PAGE = CHECKOUT / "docs" / "results" / "lifelong.md"
 MASKS = ("mask_lc", "mask_ri", "mask_blc")
 METHODS = ("finetune", "ewc_published", *MASKS)
 CLAIMS: dict[str, dict[str, Callable[[Any], Any]]] = {}

@@ -33,7 +33,7 @@ from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent
 from curricula.paper import ct_su_b1
 
-TEXT = (CHECKOUT / "docs" / "methods.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "reference" / "methods.md").read_text(encoding="utf-8")
 YAML = {path.stem: path for path in sorted(Path(conf_dir(), "method").glob("*.yaml"))}
 
 
@@ -191,7 +191,12 @@ def test_the_page_says_what_each_member_is_and_a_learner_has_them():
 def test_an_agent_that_is_no_learner_learns_with_the_gradient_step_of_the_page():
     """Plain gradient descent on the losses of the page about agents and the penalty of L2, against it by hand."""
     names: dict = {}
-    exec(re.findall(r"```python\n(.*?)```", (CHECKOUT / "docs" / "agents.md").read_text("utf-8"), re.DOTALL)[0], names)
+    exec(
+        re.findall(
+            r"```python\n(.*?)```", (CHECKOUT / "docs" / "reference" / "agents.md").read_text("utf-8"), re.DOTALL
+        )[0],
+        names,
+    )
     exec(blocks("python")[-1], names)
     specs = CTGraphEnv([ct_su_b1()])
     agent = names["MyAgent"](specs.observation_spec_unbatched, specs.action_spec_unbatched, 4, 3, learning_rate=0.1)

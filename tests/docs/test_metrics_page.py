@@ -1,4 +1,4 @@
-"""docs/metrics.md: its tables are those of the code, and its Python runs."""
+"""docs/reference/metrics.md: its tables are those of the code, and its Python runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ctgraph_rl.metrics.lifetime import ROUNDING
 from ctgraph_rl.runs.experts import Expert
 from ctgraph_rl.runs.recorder import Recorder
 
-TEXT = (CHECKOUT / "docs" / "metrics.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 

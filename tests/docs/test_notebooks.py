@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from helpers.paths import CHECKOUT
 
-FOLDER = CHECKOUT / "docs" / "notebooks"
+FOLDER = CHECKOUT / "docs" / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 300_000
 PATHS = re.compile(r"/(?:home|root|tmp|usr|work|opt|mnt|Users|var|content)/|[A-Z]:\\")

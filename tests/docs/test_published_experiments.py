@@ -1,4 +1,4 @@
-"""docs/published_experiments.md: its table has every curriculum that cites a source, and what is missing."""
+"""docs/reference/published_experiments.md: its table has every curriculum that cites a source, and what is missing."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from helpers.paths import CHECKOUT
 
 import curricula
 
-PAGE = CHECKOUT / "docs" / "published_experiments.md"
-RESULTS = CHECKOUT / "docs" / "results"
+DOCS = CHECKOUT / "docs"
+PAGE = DOCS / "reference" / "published_experiments.md"
+RESULTS = DOCS / "results"
 
 
 class Row(NamedTuple):
@@ -70,6 +71,8 @@ def test_every_row_says_what_is_missing_and_links_pages_that_exist():
         assert all((PAGE.parent / link).exists() for link in re.findall(r"\]\(([\w/.]+)", row.rerun))
 
 
-@pytest.mark.parametrize("page", ["results.md", "lifelong.md", "curricula.md"])
+@pytest.mark.parametrize("page", ["results/baselines.md", "results/lifelong.md", "reference/curricula.md"])
 def test_the_pages_of_results_and_curricula_link_the_table(page):
-    assert "[published_experiments.md](published_experiments.md)" in (PAGE.parent / page).read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([\w/.-]*)published_experiments\.md\)", (DOCS / page).read_text(encoding="utf-8"))
+
+    assert [((DOCS / page).parent / link).resolve() for link in links] == [PAGE.parent]

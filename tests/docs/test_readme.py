@@ -26,7 +26,7 @@ def test_the_python_in_readme_runs_and_prints_what_it_says(capsys):
 
 def test_every_example_with_stable_baselines3_sets_one_thread():
     """With all threads of a busy machine the same steps take ten times as long."""
-    pages = [README, *(CHECKOUT / "docs").glob("*.md")]
+    pages = [README, *(CHECKOUT / "docs").rglob("*.md")]
     blocks = [code for page in pages for code in re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)]
     with_sb3 = [code for code in blocks if "from stable_baselines3 import" in code]
 

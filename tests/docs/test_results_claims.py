@@ -1,4 +1,4 @@
-"""What docs/results.md and README say of results in words holds of the raw results, and is computed from them."""
+"""What docs/results/baselines.md and README say of results holds of the raw results, and is computed from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def words(path: str) -> str:
     return " ".join((CHECKOUT / path).read_text(encoding="utf-8").split())
 
 
-RESULTS, LIFELONG, README = words("docs/results.md"), words("docs/lifelong.md"), words("README.md")
+RESULTS, LIFELONG, README = words("docs/results/baselines.md"), words("docs/results/lifelong.md"), words("README.md")
 
 
 @pytest.fixture(scope="module")

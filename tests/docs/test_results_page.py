@@ -1,4 +1,4 @@
-"""docs/results.md: made from the raw results beside it, and the raw results say what theory says."""
+"""docs/results/baselines.md: made from the raw results beside it, and the raw results say what theory says."""
 
 from __future__ import annotations
 

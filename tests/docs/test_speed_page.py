@@ -12,7 +12,7 @@ from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, rollout
 from ctgraph_rl.core import reading
 from ctgraph_rl.tasks.configurations import ct_co_b1
 
-PAGE = CHECKOUT / "docs" / "speed.md"
+PAGE = CHECKOUT / "docs" / "explanation" / "speed.md"
 
 
 def test_the_example_of_the_fast_path_learns_the_task(capsys):

@@ -1,4 +1,4 @@
-"""docs/statistics.md: its tables are those of the script, which covers as the page says."""
+"""docs/explanation/statistics.md: its tables are those of the script, which covers as the page says."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from helpers.paths import CHECKOUT
 from ctgraph_rl.report import statistics
 
 pytest.importorskip("scipy")
-PAGE = CHECKOUT / "docs" / "statistics.md"
+PAGE = CHECKOUT / "docs" / "explanation" / "statistics.md"
 
 
 @pytest.fixture(scope="module")

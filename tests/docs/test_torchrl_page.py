@@ -5,7 +5,7 @@ import re
 import pytest
 from helpers.paths import CHECKOUT
 
-TEXT = (CHECKOUT / "docs" / "torchrl.md").read_text(encoding="utf-8")
+TEXT = (CHECKOUT / "docs" / "how-to" / "torchrl.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

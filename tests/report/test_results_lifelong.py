@@ -1,4 +1,4 @@
-"""docs/lifelong.md: made from raw results, whose numbers are those of a calculation by hand."""
+"""docs/results/lifelong.md: made from raw results, whose numbers are those of a calculation by hand."""
 
 from __future__ import annotations
 

@@ -382,7 +382,7 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
 
 def test_the_search_of_the_page_finds_the_best_trial_and_goes_on(checkout, console_script, tmp_path):
     pytest.importorskip("optuna")
-    code = (checkout / "docs" / "sweeps.md").read_text().split("<!-- search -->\n```python\n")[1].split("```")[0]
+    code = (checkout / "docs/how-to/sweeps.md").read_text().split("<!-- search -->\n```python\n")[1].split("```")[0]
     short = ", ".join(f'"{setting}"' for setting in SHORT)
     for old, new in {"30, 3": "1, 1", '"curriculum=su_b1_4tasks"': short}.items():
         assert old in code

@@ -265,7 +265,7 @@ def test_an_installed_tracker_writes_into_the_run_directory_and_nowhere_else(nam
 
 
 def test_the_page_names_every_tracker_and_every_key(checkout):
-    page = (checkout / "docs" / "logging.md").read_text(encoding="utf-8")
+    page = (checkout / "docs" / "how-to" / "loggers.md").read_text(encoding="utf-8")
 
     for path in (checkout / "conf" / "logger").iterdir():
         assert f"`logger={path.stem}`" in page

@@ -209,7 +209,7 @@ def test_a_run_is_as_large_as_the_docs_say(stopped, whole):
     lines = RunLog.read(whole / "run.jsonl").of_kind("training")
     size = max(len(json.dumps(line)) for line in lines)
 
-    assert size < 500, "bytes of a training line, docs/faults.md"
+    assert size < 500, "bytes of a training line, docs/how-to/resume.md"
 
 
 @pytest.mark.parametrize("size", [{"num_envs": 2**40}, {"num_steps": 2**40}])

@@ -133,7 +133,7 @@ def test_a_nested_goal_agrees_with_its_deeper_version_in_the_whole_common_tree()
 
 
 def test_goals_of_ct8_multi_depth_agree_where_one_policy_solves_all_of_them():
-    """One policy per group, though depths differ: what docs/lifelong.md explains PPO's transfer by."""
+    """One policy per group, though depths differ: what docs/results/lifelong.md explains PPO's transfer by."""
     agree = observation_agreement(curricula.ct8_md().tasks) == 1
 
     for group in ((0, 2, 4, 6), (0, 2, 4, 7)):  # 00, 000, 0000, then 00000 or 00001

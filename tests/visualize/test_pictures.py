@@ -28,7 +28,7 @@ from ctgraph_rl.visualize.visits import visits
 HOME, WAIT, DECISION, END, FAIL = StateType
 
 DOCS = CHECKOUT / "docs"
-PAGE = (DOCS / "pictures.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "how-to" / "draw_and_play.md").read_text(encoding="utf-8")
 COMMANDS = [line for block in re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
 
 
@@ -313,7 +313,7 @@ def test_the_commands_of_the_page_run_and_make_its_pictures(command, tmp_path, m
 
 
 def test_the_pages_pictures_are_made_by_its_commands_and_small():
-    shown = re.findall(r"!\[.*?\]\(pictures/(.*?)\)", PAGE)
+    shown = re.findall(r"!\[.*?\]\(\.\./pictures/(.*?)\)", PAGE)
 
     made = [command.split()[-1] for command in COMMANDS]
     stored = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}

@@ -1,0 +1,57 @@
+"""Pages of the documentation: links and the paths of pages that code and pages name lead to files."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from helpers.paths import CHECKOUT
+
+TEXTS = (".md", ".ipynb", ".py", ".yaml", ".toml", ".cff")
+TEMPLATES = {"template.md": "results", "lifelong_template.md": "results", "statistics_template.md": "explanation"}
+"""Templates of pages, and the folder of docs that their pages are in."""
+
+
+def tracked() -> list[Path]:
+    """Files of the checkout that hold text, without what builds and caches leave."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=CHECKOUT, capture_output=True, text=True
+    )
+    paths = [CHECKOUT / line for line in listed.stdout.splitlines()] or list(CHECKOUT.rglob("*"))
+    return [path for path in paths if path.suffix in TEXTS and path.is_file()]
+
+
+def prose(path: Path) -> str:
+    """The Markdown of a page or notebook without its code blocks."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        text = "\n\n".join(
+            "".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"
+        )
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+FILES = tracked()
+PAGES = [path for path in FILES if path.suffix in (".md", ".ipynb") and "tests" not in path.parts]
+
+
+def test_every_page_of_docs_that_a_file_names_exists():
+    named = {
+        (path.relative_to(CHECKOUT).as_posix(), name)
+        for path in FILES
+        for name in re.findall(r"\bdocs/[\w/.-]+\.(?:md|ipynb|py|png|csv)\b", path.read_text(encoding="utf-8"))
+    }
+
+    assert len(named) > 50
+    assert [pair for pair in sorted(named) if not (CHECKOUT / pair[1]).is_file()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(CHECKOUT).as_posix() for path in PAGES])
+def test_every_link_of_a_page_leads_to_a_file(page):
+    folder = CHECKOUT / "docs" / TEMPLATES[page.name] if page.name in TEMPLATES else page.parent
+    links = re.findall(r"\]\((?!\w+:)([^)\s#]+)", prose(page))
+
+    assert [link for link in links if not (folder / link).exists()] == []
