@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from ctgraph_rl.checks import is_int
+from ctgraph_rl.checks import as_path, is_int, not_negative, require, true_or_false
 from ctgraph_rl.disk import PART, made_folder, require_no_link, sync_folder, write_whole
 from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.interrupt import Interrupt
@@ -47,15 +47,19 @@ class Checkpoints:
 
     Args:
         folder: where they are.
-        seconds: time between two checkpoints within a block.
+        seconds: time between two checkpoints within a block, >= 0.
         strict: refuse to resume from an older checkpoint where the newest is broken, instead of warning.
         interrupt: notices that the process was asked to stop: a checkpoint is then saved, and the process exits.
+
+    Raises:
+        ValueError: for values out of range.
     """
 
     def __init__(
         self, folder: Path | str, seconds: float = 300.0, strict: bool = False, interrupt: Interrupt | None = None
     ) -> None:
-        self.folder, self.seconds, self.strict = Path(folder), seconds, strict
+        require(*not_negative(seconds=seconds), *true_or_false(strict=strict))
+        self.folder, self.seconds, self.strict = as_path("folder", folder), seconds, strict
         self.interrupt = Interrupt() if interrupt is None else interrupt
         self._last: float | None = None
 

@@ -191,6 +191,9 @@ def _canonical(value: Any) -> Any:
         return {"type": _type_name(type(value)), **{name: _canonical(item) for name, item in given.items()}}
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]
+    plain = value is None or isinstance(value, (bool, int, float, str))
+    fix = "put @dataclass(frozen=True) above its class, whose fields then are part of the fingerprint"
+    require((plain, f"a curriculum's parts must be dataclasses or plain values, got {value!r:.80}: {fix}"))
     return value
 
 

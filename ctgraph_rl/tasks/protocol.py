@@ -149,7 +149,7 @@ class Protocol:
         boundaries: ``announced``: at the start of a block all episodes end and the agent is told; ``hidden``: each row
             goes over to the next block's task when its episode ends, without notice to the agent.
         num_task_ids: length of the one-hot id; None: just enough.
-        task_ids: the id of each of the curriculum's ``tasks``; None: their positions, from 0.
+        task_ids: the id of each of the curriculum's ``tasks``, all different; None: their positions, from 0.
 
     Raises:
         ValueError: for values out of range, and ids given at boundaries that are hidden.
@@ -166,11 +166,13 @@ class Protocol:
         object.__setattr__(self, "task_ids", ids)
         is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0, MOST_IDS) for i in ids))
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
+        differ = not isinstance(ids, tuple) or not is_ids or len(set(ids)) == len(ids)
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
         is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
             (is_length, f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}"),
             (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
+            (differ, f"task_ids must differ from each other, got {ids!r}"),
             (names_ids, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
             (not hidden_gift, "task_id cannot be given at_boundaries that are hidden; use one_hot, or announced ones"),
         )

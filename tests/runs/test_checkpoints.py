@@ -205,6 +205,12 @@ def test_they_are_saved_after_the_first_update_at_block_ends_and_when_time_has_p
     assert kept == [0, 2, 4]
 
 
+@pytest.mark.parametrize("seconds", [float("nan"), -1, "60", True])
+def test_a_time_between_checkpoints_that_is_no_time_is_refused(tmp_path, seconds):
+    with pytest.raises(ValueError, match=f"seconds must be a number >= 0, got {seconds!r}"):
+        Checkpoints(tmp_path, seconds)
+
+
 def full(file: Path, *_) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -161,6 +161,20 @@ def test_a_fingerprint_changes_with_everything_that_changes_results(change):
     assert replace(base, **change).fingerprint != base.fingerprint
 
 
+class Half:
+    """A reward that is no dataclass."""
+
+    def __call__(self, leaf, goal_leaf, graph):
+        return 0.5 * (leaf == goal_leaf)
+
+
+def test_a_fingerprint_of_a_part_that_is_no_dataclass_is_refused_with_what_to_write():
+    own = curriculum(Block(replace(A, reward_fn=Half()), 64))
+
+    with pytest.raises(ValueError, match=r"must be dataclasses or plain values, got .*Half.*: put @dataclass\(frozen="):
+        _ = own.fingerprint
+
+
 def test_a_value_written_out_that_is_the_default_leaves_the_fingerprint():
     base = curriculum()
 

@@ -28,6 +28,7 @@ THREE = replace(ONE, goal_reward=3.0)
         ({"task_id": "one_hot", "task_ids": (0, -1)}, r"task_ids must be integers in 0..1048576, .*got \(0, -1\)"),
         ({"task_id": "one_hot", "task_ids": (True,)}, r"task_ids must be integers in 0..1048576, .*got \(True,\)"),
         ({"task_id": "one_hot", "task_ids": 3}, "task_ids must be integers in 0..1048576, one for each task, got 3"),
+        ({"task_id": "one_hot", "task_ids": (1, 0, 1)}, r"task_ids must differ from each other, got \(1, 0, 1\)"),
         ({"task_ids": (0, 1)}, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
         ({"num_task_ids": 4}, "num_task_ids and task_ids say nothing where task_id is hidden: leave them out"),
         (
@@ -69,7 +70,7 @@ def test_ids_given_at_boundaries_need_blocks_of_one_task():
 
 def test_ids_are_positions_unless_they_are_given():
     assert sequence(protocol=Protocol("one_hot")).task_ids == {ONE: 0, TWO: 1}
-    assert sequence(protocol=Protocol("one_hot", task_ids=[3, 3])).task_ids == {ONE: 3, TWO: 3}
+    assert sequence(protocol=Protocol("one_hot", task_ids=[3, 1])).task_ids == {ONE: 3, TWO: 1}
     lengths = [Protocol("one_hot", num_task_ids=n, task_ids=ids).length(2) for n, ids in ((None, None), (7, (1, 4)))]
     assert lengths == [2, 7]
     assert Protocol("one_hot", task_ids=(1, 4)).length(2) == 5
