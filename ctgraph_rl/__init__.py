@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from ctgraph_rl.learn.evaluate import evaluate as evaluate
     from ctgraph_rl.learn.lifelong import learn_curriculum as learn_curriculum
     from ctgraph_rl.log.run_log import RunLog as RunLog
+    from ctgraph_rl.log.scores import scores as scores
+    from ctgraph_rl.runs.job import make_agent as make_agent
     from ctgraph_rl.runs.load import Trained as Trained
     from ctgraph_rl.runs.load import load as load
     from ctgraph_rl.runs.recorder import Recorder as Recorder
@@ -55,6 +57,8 @@ _EXPORTS = {
     "learn.evaluate": ("evaluate",),
     "learn.lifelong": ("learn_curriculum",),
     "log.run_log": ("RunLog",),
+    "log.scores": ("scores",),
+    "runs.job": ("make_agent",),
     "runs.load": ("Trained", "load"),
     "runs.recorder": ("Recorder",),
     "tasks.curriculum": ("Curriculum",),

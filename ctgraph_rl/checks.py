@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 LARGEST_INT = 2**63 - 1
@@ -28,6 +29,27 @@ def require(*rules: tuple[bool, str]) -> None:
     broken = [message for holds, message in rules if not holds]
     if broken:
         raise ValueError("; ".join(broken))
+
+
+def nearest(word: str, choices: Iterable[str]) -> str | None:
+    """Return the choice that a misspelt word probably stands for, ignoring case; None if none is near.
+
+    Initials count as a name, such as ``lr`` for ``learning_rate``, and so does a part of one name alone.
+    """
+    known = {choice.lower().replace("-", "_"): choice for choice in choices}
+    word = word.lower().replace("-", "_")
+    initials = [name for name in known if word == "".join(part[:1] for part in name.split("_")) and len(word) > 1]
+    parts = [name for name in known if word in name.split("_")]
+    close = get_close_matches(word, known, 1)
+    found = [word] if word in known else close or initials[:1] or (parts if len(parts) == 1 else [])
+    return known[found[0]] if found else None
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """Return the end of a message on a word that is none of the choices: the nearest one, or else all of them."""
+    choices = list(choices)
+    near = nearest(word, choices)
+    return f"did you mean {near!r}?" if near is not None else f"choices: {', '.join(choices) or 'none'}"
 
 
 def memory_bytes() -> int:

@@ -277,7 +277,7 @@ def test_a_curriculum_of_a_configuration_directory_is_known_to_the_commands(call
         ),
         ("draw my-own --config-dir there --dot task.dot", "--config-dir must be a directory, got there"),
         ("draw my-own --config-dir my_conf --depth 3 --dot task.dot", "my-own takes no depth"),
-        ("curricula describe broken --config-dir my_conf", "curriculum has no frames. Choices: num_frames"),
+        ("curricula describe broken --config-dir my_conf", "curriculum has no frames: did you mean 'num_frames'?"),
         (
             "curricula describe plain --config-dir my_conf",
             "my_own_tasks.nothing must make a Curriculum, it made a dict",

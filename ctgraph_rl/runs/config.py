@@ -7,12 +7,13 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
@@ -20,7 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import is_int, positive, require
+from ctgraph_rl.checks import did_you_mean, is_int, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
 from ctgraph_rl.portable import check_portable
@@ -135,7 +136,7 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     """Return what builds a group of the configuration, with its arguments bound.
 
     Raises:
-        ValueError: for an argument that the target does not take; lists the choices.
+        ValueError: for an argument that the target does not take, with the one that was probably meant or the choices.
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
     parameters = parameters_of(hydra.utils.get_object(cfg[group]["_target_"]))
@@ -143,7 +144,7 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     unknown = [name for name in given if name not in choices]
     missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
     require(
-        (not unknown, f"{group} has no {', '.join(unknown)}. Choices: {', '.join(choices)}"),
+        *((False, f"{group} has no {name}: {did_you_mean(name, choices)}") for name in unknown),
         (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
     )
     return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
@@ -170,16 +171,30 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
             raise ValueError(f"{error}{there}") from None
     check_packages()
     sys.path.append(os.getcwd())  # where a user's own function may be, as in a run
-    settings = [f"curriculum={name}", f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
     try:
-        with hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
-            cfg = hydra.compose("config", settings)
+        cfg = composed([f"curriculum={name}"], config_dir)
         made = target(cfg, "curriculum")()
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(explain(error)) from None
     kind = type(made).__name__
     require((isinstance(made, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {kind}"))
     return made
+
+
+def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictConfig:
+    """Return the configuration of a command line, within a program that uses Hydra itself, too.
+
+    Args:
+        settings: such as ``agent=ppo``.
+        config_dir: is searched after ``conf``.
+    """
+    searched = [] if config_dir is None else [f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
+    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
+    try:
+        with hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+            return hydra.compose("config", [*settings, *searched])
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 def curriculum_names(config_dir: Path | None) -> list[str]:
@@ -191,7 +206,33 @@ def curriculum_names(config_dir: Path | None) -> list[str]:
     if config_dir is None:
         return []
     require((config_dir.is_dir(), f"--config-dir must be a directory, got {config_dir}"))
-    return sorted(path.stem for path in (config_dir / "curriculum").glob("*.yaml"))
+    return names_in(config_dir, "curriculum")
+
+
+def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) -> DictConfig:
+    """Return the configuration with other choices of some groups, such as ``{"agent": "dqn"}``; None: the default.
+
+    Raises:
+        ValueError: for an unknown name, with the one that was probably meant, and a directory that is none.
+    """
+    is_folder = config_dir is None or config_dir.is_dir()
+    require((is_folder, f"config_dir must be a directory, got {config_dir}"))
+    check_packages()
+    given = {group: name for group, name in names.items() if name is not None}
+    for group, name in given.items():
+        choices = [
+            each for folder in (conf_dir(), config_dir) if folder is not None for each in names_in(folder, group)
+        ]
+        require((name in choices, f"unknown {group} {name!r}: {did_you_mean(str(name), choices)}"))
+    try:
+        return composed([f"{group}={name}" for group, name in given.items()], config_dir)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(explain(error)) from None
+
+
+def names_in(folder: Path | str, group: str) -> list[str]:
+    """Return the names of a group's yaml files in a configuration directory."""
+    return sorted(path.stem for path in Path(folder, group).glob("*.yaml"))
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:

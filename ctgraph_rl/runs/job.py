@@ -69,10 +69,7 @@ class Job:
             ValueError: for values out of range, and parts that do not go together.
         """
         device = checked_device(cfg.device)
-        if cfg.portable:
-            hold()
-        torch.set_num_threads(cfg.num_threads)
-        torch.set_flush_denormal(True)
+        prepare_torch(cfg)
         make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
         curriculum = curriculum_of(cfg, make_method())
         if cfg.experts:
@@ -135,6 +132,61 @@ class Job:
         settings = dict(flat(config.plain(self.cfg)))
         with Tracker(config.target(self.cfg, "logger"), run_dir, settings) as tracker:
             yield [tracker]
+
+
+def make_agent(
+    name: str,
+    curriculum: Curriculum,
+    seed: int | None = None,
+    *,
+    method: str | None = None,
+    method_settings: Mapping[str, Any] | None = None,
+    device: torch.device | str | None = None,
+    config_dir: Path | str | None = None,
+    **settings: Any,
+) -> Agent:
+    """Build an agent for a curriculum from the yaml files that the command line reads, with the same weights.
+
+    ``log = learn_curriculum(curriculum, agent, seed)`` then gives the measurements of ``ctgraph-rl agent=NAME``, with the
+    same bits, and ``scores(log, curriculum)`` its metrics. As a run does, this seeds torch's global generator, sets the
+    number of torch's threads to ``num_threads`` of ``conf/config.yaml``, and flushes denormal numbers to zero.
+
+    Args:
+        name: of a file in ``conf/agent``, such as ``"ppo"``.
+        curriculum: what the agent will learn.
+        seed: decides the weights and torch's global generator, in [0, 2**63); None: as on the command line.
+        method: name of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
+        method_settings: values that replace those of the method's file, such as ``{"coeff": 50.0}``.
+        device: where the agent lives; None: as on the command line.
+        config_dir: a directory with files of the user, ``agent/NAME.yaml`` and ``method/NAME.yaml``.
+        settings: values that replace those of the agent's file, such as ``learning_rate=0.001``.
+
+    Raises:
+        ValueError: for unknown names and settings, with the one that was probably meant; for values out of range, an
+            agent that cannot learn the curriculum, and a method that learns another curriculum in its place.
+    """
+    require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
+    cfg = config.with_names({"agent": name, "method": method}, None if config_dir is None else Path(config_dir))
+    cfg.seed, cfg.device = cfg.seed if seed is None else seed, cfg.device if device is None else str(device)
+    for group, values in (("agent", settings), ("method", method_settings or {})):
+        cfg[group] = {**cfg[group], **values}
+    config.check_values(cfg)
+    prepare_torch(cfg)
+    make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
+    kind = type(make_method()).__name__
+    other = (
+        f"{kind} learns another curriculum: replace yours by {kind}(...).prepare(curriculum), here and where it is used"
+    )
+    require((make_method().prepare(curriculum) == curriculum, other))
+    return new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, checked_device(cfg.device))
+
+
+def prepare_torch(cfg: DictConfig) -> None:
+    """Set how torch computes, which a run's bits depend on."""
+    if cfg.portable:
+        hold()
+    torch.set_num_threads(cfg.num_threads)
+    torch.set_flush_denormal(True)
 
 
 def run_job(cfg: DictConfig, run_dir: Path) -> None:
