@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,14 +11,27 @@ import yaml
 
 from ctgraph_rl.packages import class_named, conf_dir
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 class Entry(NamedTuple):
-    """A yaml file with the class that it names."""
+    """A yaml file and the class that it names."""
 
     name: str
-    kind: Any
+    target: str  # dotted name of the class
     settings: dict[str, Any]
     comment: str  # its first line
+
+    @property
+    def kind(self) -> Any:
+        """The class; to import it loads torch, which takes seconds."""
+        module, _, name = self.target.rpartition(".")
+        return class_named(module, name)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The constants among the attributes of the class, read from its source without importing it."""
+        return constants(self.target)
 
 
 def catalogue(group: str) -> Iterator[Entry]:
@@ -26,5 +40,32 @@ def catalogue(group: str) -> Iterator[Entry]:
         text = path.read_text(encoding="utf-8")
         settings = yaml.safe_load(text)
         if "_target_" in settings:
-            module, _, name = settings.pop("_target_").rpartition(".")
-            yield Entry(path.stem, class_named(module, name), settings, text.splitlines()[0].removeprefix("# "))
+            target = settings.pop("_target_")
+            yield Entry(path.stem, target, settings, text.splitlines()[0].removeprefix("# "))
+
+
+def constants(target: str) -> dict[str, Any]:
+    """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
+    module, _, name = target.rpartition(".")
+    tree = ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
+    bases = [ast.unparse(base) for base in reversed(classes[name].bases)]
+    ours = [f"{homes[base]}.{base}" for base in bases if homes.get(base, "").startswith("baselines.")]
+    inherited = {key: value for base in ours for key, value in constants(base).items()}
+    return inherited | dict(_assigned(classes[name]))
+
+
+def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield names that a module imports, each with the module that it is of."""
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom):
+            yield from ((alias.name, node.module or "") for alias in node.names)
+
+
+def _assigned(node: ast.ClassDef) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of the constants in the body of a class."""
+    for line in node.body:
+        if isinstance(line, (ast.Assign, ast.AnnAssign)) and isinstance(line.value, ast.Constant):
+            targets = line.targets if isinstance(line, ast.Assign) else [line.target]
+            yield from ((ast.unparse(target), line.value.value) for target in targets)

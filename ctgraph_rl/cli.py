@@ -4,26 +4,73 @@ from __future__ import annotations
 
 import os
 import sys
-from difflib import get_close_matches
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
 
-from ctgraph_rl.packages import command
+from ctgraph_rl import __version__
+from ctgraph_rl.checks import nearest
+from ctgraph_rl.log.escape import terminal_lines
+from ctgraph_rl.packages import command, conf_dir
+
+
+class Command(NamedTuple):
+    """A command: the module whose ``main`` it is, which is imported when it is called, and a line about it."""
+
+    module: str
+    about: str
+
+
+RUN = "ctgraph_rl.run"
 
 COMMANDS = {
-    "agents": "baselines.__main__",
-    "compare": "ctgraph_rl.compare",
-    "curricula": "curricula.__main__",
-    "draw": "ctgraph_rl.visualize.draw",
-    "export": "ctgraph_rl.log.export",
-    "methods": "baselines.methods.__main__",
-    "play": "ctgraph_rl.visualize.play",
-    "report": "ctgraph_rl.report.__main__",
-    "results": "ctgraph_rl.report.results",
+    "run": Command(RUN, "train an agent on a curriculum; settings alone do so, too"),
+    "agents": Command("baselines.__main__", "list the agents"),
+    "compare": Command("ctgraph_rl.compare", "say whether two runs are equal, and what they differ in"),
+    "curricula": Command("curricula.__main__", "list the curricula, or describe one"),
+    "draw": Command("ctgraph_rl.visualize.draw", "draw a task, and what a policy does there"),
+    "export": Command("ctgraph_rl.log.export", "write a run in the format of another program"),
+    "methods": Command("baselines.methods.__main__", "list the lifelong-learning methods"),
+    "play": Command("ctgraph_rl.visualize.play", "play a CT-graph, or watch a policy play it"),
+    "report": Command("ctgraph_rl.report.__main__", "make a page of figures and tables of runs"),
+    "results": Command("ctgraph_rl.report.results", "print a table of runs over seeds"),
 }
-"""Commands and the modules whose ``main`` they are; each is imported when it is called."""
+"""Commands by name, each with its module and a line about it."""
+
+SETTINGS = {
+    "curriculum=NAME": "what is learned; ctgraph-rl curricula lists them",
+    "agent=NAME": "who learns; ctgraph-rl agents lists them",
+    "method=NAME": "a lifelong-learning method; ctgraph-rl methods lists them",
+    "seed=0": "decides weights, exploration and environments",
+    "curriculum.num_frames=1e5": "environment steps of each task",
+    "agent.learning_rate=1e-3": "a hyperparameter of the agent",
+}
+"""Settings of a run that are often changed, each with a line about it."""
+
+PARTS = {part: f"curricula {part}" for part in ("describe", "list", "probabilities")}
+"""Words that follow a command."""
+
+USAGE = """usage: ctgraph-rl COMMAND ...         each command has --help
+       ctgraph-rl SETTING=VALUE ...    one run, such as ctgraph-rl curriculum=su_b1_4tasks agent=dqn
+       ctgraph-rl -m SETTING=A,B ...   a run for each combination
+
+An agent learns a curriculum of CT-graph tasks, and its transfer and forgetting are measured.
+
+commands:
+{commands}
+
+settings of a run:
+{settings}
+
+options:
+  -h, --help     show this text; ctgraph-rl run --help shows all settings
+  --version      show the versions of ctgraph_rl and what it is built on
+  --hydra-help   show the options that Hydra adds to a run"""
 
 
 def main() -> None:
-    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; anything else is for `ctgraph_rl.run`.
+    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; settings alone are for `ctgraph_rl.run`.
 
     Ends quietly where nobody reads its output any more, as in ``ctgraph-rl results | head``.
     """
@@ -48,18 +95,55 @@ def _has_reader() -> bool:
 
 
 def _call() -> None:
-    """Go to what the first word names."""
-    word = sys.argv[1] if len(sys.argv) > 1 else ""
-    if word in COMMANDS:
-        sys.argv = [f"ctgraph-rl {word}", *sys.argv[2:]]
-        try:
-            main = command(COMMANDS[word])
-        except ValueError as error:
-            sys.exit(f"error: {error}")
-        main()
-    elif word.isidentifier():  # settings have a sign: seed=1, ~logger, -m
-        near = [f"; did you mean {match!r}?" for match in get_close_matches(word, COMMANDS, 1)]
-        choices = f"Commands: {', '.join(COMMANDS)}; or settings of a run, such as seed=1"
-        sys.exit(f"error: unknown command {word!r}{''.join(near)} {choices}")
+    """Do what the first word names."""
+    words = sys.argv[1:]
+    word = words[0] if words else "--help"
+    if word in ("-h", "--help"):
+        print(usage())
+    elif word == "--version":
+        print(versions())
+    elif word in COMMANDS:
+        sys.argv = [f"ctgraph-rl {word}".removesuffix(" run"), *words[1:]]
+        _start(COMMANDS[word].module)
+    elif word[:1].isalpha() and word.replace("-", "_").isidentifier():  # settings have a sign: seed=1, ~logger, -m
+        print(f"error: {terminal_lines(_unknown(word))}", file=sys.stderr)
+        sys.exit(2)
     else:
-        command("ctgraph_rl.run")()
+        _start(RUN)
+
+
+def _start(module: str) -> None:
+    """Call the ``main`` of a module."""
+    try:
+        main = command(module)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    main()
+
+
+def usage() -> str:
+    """Return what ``ctgraph-rl`` without arguments prints."""
+    commands = {name: each.about for name, each in COMMANDS.items()}
+    return USAGE.format(commands=_table(commands), settings=_table(SETTINGS))
+
+
+def _table(lines: Mapping[str, str]) -> str:
+    width = max(map(len, lines))
+    return "\n".join(f"  {name:{width}}  {about}" for name, about in lines.items())
+
+
+def versions() -> str:
+    """Return the version of this package and of what decides the numbers of a run; none of them is imported."""
+    others = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "hydra-core"))
+    return f"ctgraph_rl {__version__} ({others})"
+
+
+def _unknown(word: str) -> str:
+    """Return why a word is no command, and what may have been meant."""
+    conf = Path(conf_dir())
+    groups = {path.name: f"{path.name}=NAME" for path in conf.iterdir() if path.is_dir()}
+    files = {path.stem: f"{path.parent.name}={path.stem}" for path in conf.glob("*/*.yaml")}
+    meant = {**files, **PARTS, **dict(zip(COMMANDS, COMMANDS, strict=True))}
+    near = groups.get(word) or meant.get(nearest(word, meant) or "")
+    hint = "" if near is None else f"; did you mean ctgraph-rl {near}?"
+    return f"unknown command {word!r}{hint}\nCommands: {', '.join(COMMANDS)}; settings of a run are written as seed=1"

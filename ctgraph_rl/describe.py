@@ -1,24 +1,17 @@
-"""Descriptions of curricula before any run, as tables for the terminal, Markdown and LaTeX.
-
-``python -m curricula`` lists all, ``python -m curricula describe NAME`` describes one.
-"""
+"""Descriptions of curricula before any run, as tables; ``ctgraph-rl curricula`` prints them."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.core.graph import CTGraph
-from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_lines, terminal_text
+from ctgraph_rl.log.sheets import LISTED, Sheet
+from ctgraph_rl.log.sheets import print_sheet as print_sheet
+from ctgraph_rl.log.sheets import to_latex as to_latex
+from ctgraph_rl.log.sheets import to_markdown as to_markdown
 from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.memory import bank_bytes
@@ -29,12 +22,10 @@ from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
 
-FRAMES_PER_SECOND = 18_000
-"""Rough speed of the LSTM-PPO agent of this package on one core, for estimates of time."""
+AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
+"""An agent of this package and its rough speed on one core, for estimates of time."""
 
 UNKNOWN = "-"
-
-LISTED = {"name": "l", "version": "r", "tasks": "r", "frames": "r", "fingerprint": "l", "source": "l"}
 
 SIZES = ("states", "ends")
 CLOSED_FORMS = ("P_R", "P_E", "P_RNP", "E[rho]", "E[kappa]", "random frames")
@@ -76,47 +67,29 @@ MISPRINTS = (
 )
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A table in no particular format.
-
-    Args:
-        title: a line above it.
-        columns: the columns' names, each with ``l`` or ``r`` for its alignment.
-        rows: texts, one for each column.
-        notes: lines below it.
-    """
-
-    title: str
-    columns: Mapping[str, str]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...] = ()
-
-
 def memory(curriculum: Curriculum) -> tuple[int, int]:
     """Bytes of the image bank of a curriculum's tasks, and of each row: two observations, as a step holds."""
     one = max(math.prod(task.images.shape) for task in curriculum.tasks)
     return bank_bytes(curriculum.tasks), 2 * one
 
 
-def describe(curriculum: Curriculum, frames_per_second: float = FRAMES_PER_SECOND) -> list[Sheet]:
+def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> list[Sheet]:
     """The curriculum at large, its blocks, and the difficulty, ceilings and observability of its tasks.
 
     Args:
         curriculum: any curriculum.
-        frames_per_second: the rate that the estimated time is for.
+        frames_per_second: the rate that the estimated time is for; None: that of `AGENT`.
 
     Raises:
         ValueError: for a rate that is not above 0.
     """
-    require(*positive(frames_per_second=frames_per_second))
+    require(*(positive(frames_per_second=frames_per_second) if frames_per_second is not None else ()))
     sheets = (_blocks, _difficulty, _ceilings, _observations)
     return [_overview(curriculum, frames_per_second), *(sheet(curriculum) for sheet in sheets)]
 
 
-def _overview(curriculum: Curriculum, frames_per_second: float) -> Sheet:
+def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
     bank, per_row = memory(curriculum)
-    time = f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s, an estimate"
     rows = {
         "version": str(curriculum.version),
         "fingerprint": curriculum.fingerprint,
@@ -127,9 +100,16 @@ def _overview(curriculum: Curriculum, frames_per_second: float) -> Sheet:
         "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
         "evaluation": evaluation_in_words(curriculum.evaluation),
         "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
-        "time": f"{time} without evaluations",
+        "time": f"{_time(curriculum.num_frames, frames_per_second)}, an estimate without evaluations",
     }
     return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))
+
+
+def _time(num_frames: int, frames_per_second: float | None) -> str:
+    """Return how long the frames take at a rate; None: at the rate of `AGENT`, which is then named."""
+    rate = FRAMES_PER_SECOND if frames_per_second is None else frames_per_second
+    whose = f", the rate of agent={AGENT} on one core" if frames_per_second is None else ""
+    return f"{_duration(num_frames / rate)} at {rate:,.0f} frames/s{whose}"
 
 
 def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
@@ -275,124 +255,36 @@ def listing(curricula: Iterable[Curriculum]) -> Sheet:
     return Sheet("Curricula", LISTED, tuple(rows))
 
 
-def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
-    """Print a table on the terminal; into a pipe 200 characters wide."""
-    console = Console() if console is None else console
-    if not console.is_terminal:
-        console.width = 200
-    table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
-    for i, (name, side) in enumerate(sheet.columns.items()):
-        table.add_column(_shown(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
-    for row in sheet.rows:
-        table.add_row(*map(_shown, row))
-    console.print(table)
-    for note in sheet.notes:
-        console.print(_shown(note))
+def own_curricula(config_dir: Path) -> list[Curriculum]:
+    """Return the curricula of a configuration directory.
 
-
-def _shown(text: str) -> Text:
-    return Text(terminal_text(text))
-
-
-def to_markdown(sheet: Sheet) -> str:
-    """A table in Markdown, with its title as a heading."""
-    sides = ["--:" if side == "r" else ":--" for side in sheet.columns.values()]
-    lines = ["| " + " | ".join(map(markdown_text, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
-    notes = [line for note in sheet.notes for line in ("", f"{markdown_text(note)}")]
-    return "\n".join(
-        [f"## {markdown_text(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""]
-    )
-
-
-MATHS = {
-    "P_R": "$P_R$",
-    "P_E": "$P_E$",
-    "P_RNP": r"$P_\mathrm{RNP}$",
-    "E[rho]": r"$E[\rho]$",
-    "E[kappa]": r"$E[\kappa]$",
-    "b": "$b$",
-    "d": "$d$",
-    "p": "$p$",
-}
-WIDE = 60
-"""Characters from which on a column of a LaTeX table is broken into lines."""
-
-
-def to_latex(sheet: Sheet) -> str:
-    """A table in LaTeX, for the package booktabs; title and notes as comments."""
-    sides = [_latex_side(i, side, sheet.rows) for i, side in enumerate(sheet.columns.values())]
-    header = " & ".join(MATHS.get(name, latex_text(name)) for name in sheet.columns)
-    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in sheet.rows]
-    notes = [f"% {terminal_text(line)}" for line in (sheet.title, *sheet.notes)]
-    begin, end = rf"\begin{{tabular}}{{{''.join(sides)}}}", r"\end{tabular}"
-    return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
-
-
-def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
-    return r"p{0.6\linewidth}" if any(len(row[column]) > WIDE for row in rows) else side
-
-
-def _show(sheets: Sequence[Sheet], form: str) -> None:
-    if form == "text":
-        for sheet in sheets:
-            print_sheet(sheet)
-    else:
-        print("\n".join(map({"markdown": to_markdown, "latex": to_latex}[form], sheets)), end="")
-
-
-def main(
-    names: Callable[[], Sequence[str]],
-    load: Callable[[str], Curriculum],
-    prog: str | None = None,
-    argv: Sequence[str] | None = None,
-) -> None:
-    """The command line: list curricula, or describe one.
-
-    Args:
-        names: gives the names of all.
-        load: gives one by name.
-        prog: how the command is called; None: as the process is.
-        argv: its arguments; None: those of the process.
+    Raises:
+        ValueError: see `ctgraph_rl.runs.config.curriculum_of`.
     """
-    parser = _parser(prog)
-    arguments = parser.parse_args(argv, argparse.Namespace(format="text", config_dir=None))
-    try:
-        if arguments.command is None:
-            own = [curriculum_of(name, arguments.config_dir) for name in curriculum_names(arguments.config_dir)]
-            _show([listing([*map(load, names()), *own])], arguments.format)
-        elif arguments.command == "probabilities":
-            _show([probabilities()], arguments.format)
-        else:
-            is_file = arguments.name.endswith(".json") or Path(arguments.name).is_file()
-            named = load if arguments.config_dir is None else partial(curriculum_of, config_dir=arguments.config_dir)
-            _describe(Curriculum.from_json(arguments.name) if is_file else named(arguments.name), arguments)
-    except BrokenPipeError:
-        raise
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
+    return [curriculum_of(name, config_dir) for name in curriculum_names(config_dir)]
 
 
-def _parser(prog: str | None) -> argparse.ArgumentParser:
-    form = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
-    form.add_argument("--format", choices=("text", "markdown", "latex"), help="default: text")
-    form.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
-    parser = argparse.ArgumentParser(prog=prog, description="List all curricula, or describe one.", parents=[form])
-    commands = parser.add_subparsers(dest="command")
-    commands.add_parser("probabilities", help="print the paper's Table 2, with its misprints corrected", parents=[form])
-    one = commands.add_parser("describe", help="describe one", parents=[form])
-    one.add_argument("name", help="a name of the list, or a curriculum as a JSON file")
-    one.add_argument("--frames-per-second", type=float, default=FRAMES_PER_SECOND, help="for the estimated time")
-    one.add_argument("--figure", type=Path, help="draw graphs and goals into this file (.png, .pdf, .svg)")
-    one.add_argument("--similarity", type=Path, help="draw how alike the tasks are into this file")
-    one.add_argument("--json", type=Path, help="write the curriculum into this file, a new one")
-    return parser
+def chosen(name: str, config_dir: Path | None) -> Curriculum:
+    """Return the curriculum of a name or of a JSON file.
+
+    Raises:
+        ValueError: for an unknown name, and a file that holds no curriculum.
+    """
+    is_file = name.endswith(".json") or Path(name).is_file()
+    return Curriculum.from_json(name) if is_file else curriculum_of(name, config_dir)
 
 
-def _describe(curriculum: Curriculum, arguments: argparse.Namespace) -> None:
-    _show(describe(curriculum, arguments.frames_per_second), arguments.format)
-    if arguments.figure is not None:
-        draw_graphs(curriculum, arguments.figure)
-    if arguments.similarity is not None:
-        draw_similarity(curriculum, arguments.similarity)
-    if arguments.json is not None:
-        curriculum.to_json(arguments.json)
+def write(
+    curriculum: Curriculum, figure: Path | None = None, similarity: Path | None = None, json: Path | None = None
+) -> None:
+    """Write a figure of the graphs and goals, one of how alike the tasks are, and the curriculum as JSON, where named.
+
+    Raises:
+        ValueError: for a format that figures do not have, and a JSON file that exists.
+    """
+    if figure is not None:
+        draw_graphs(curriculum, figure)
+    if similarity is not None:
+        draw_similarity(curriculum, similarity)
+    if json is not None:
+        curriculum.to_json(json)

@@ -6,12 +6,15 @@ such as ``num_frames``. `names` lists all, and ``curricula.axes`` has the functi
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from inspect import getdoc, signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from ctgraph_rl.checks import nearest
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
@@ -43,6 +46,18 @@ def load(name: str, **arguments: Any) -> Curriculum:
     return function(**arguments)
 
 
+def listed() -> tuple[tuple[str, ...], ...]:
+    """Return name, version, number of tasks, frames, fingerprint and source of each curriculum, as stored texts.
+
+    None of them is loaded, as torch takes seconds.
+    """
+    stored = json.loads(Path(__file__).with_name("fingerprints.json").read_text(encoding="utf-8"))
+    return tuple(
+        (name, str(one["version"]), f"{one['tasks']:,}", f"{one['frames']:,}", one["fingerprint"], one["source"])
+        for name, one in stored.items()
+    )
+
+
 def summary(name: str) -> str:
     """Return a sentence on a curriculum.
 
@@ -55,9 +70,9 @@ def summary(name: str) -> str:
 
 def _function(name: str) -> Callable[..., Curriculum]:
     if name not in _named():
-        near = get_close_matches(str(name), names(), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"unknown curriculum {name!r}{hint} Choices: {', '.join(names())}")
+        near = nearest(str(name), names())
+        hint = "ctgraph-rl curricula lists all" if near is None else f"did you mean {near!r}?"
+        raise ValueError(f"unknown curriculum {name!r}; {hint}")
     return _named()[name]
 
 

@@ -166,6 +166,7 @@ def test_the_kernel_knows_every_reward_of_ours():
         ("import ctgraph_rl", ["torch", "torchrl", "tensordict", "hydra", "numpy"]),
         ("import curricula; curricula.load('su_b1_4tasks').fingerprint", ["torchrl", "tensordict", "hydra"]),
         ("import ctgraph_rl.run", ["torch", "torchrl"]),
+        ("import hydra_plugins.ctgraph_rl_sweeper", ["torch", "torchrl"]),
         ("import baselines.dqn, baselines.lstm_ppo", ["hydra", "omegaconf", "curricula"]),
     ],
 )

@@ -9,10 +9,8 @@ from helpers.oracles import confounding, fully_observable, one_hot, surjective
 from rich.console import Console
 
 import curricula
-from ctgraph_rl import describe as module
 from ctgraph_rl.batch.params import shared_bank
 from ctgraph_rl.describe import (
-    Sheet,
     describe,
     evaluation_in_words,
     listing,
@@ -22,10 +20,13 @@ from ctgraph_rl.describe import (
     to_latex,
     to_markdown,
 )
+from ctgraph_rl.log import sheets
+from ctgraph_rl.log.sheets import Sheet
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs, goals_by_graph
+from curricula.__main__ import main
 
 A, B = surjective(goal=(1, 1)), surjective(goal=(1, 2))
 
@@ -148,7 +149,7 @@ def test_observations_of_shared_unique_ids_are_not_known_and_say_why():
 
 
 def test_table_2_of_the_paper_has_all_its_rows_in_one_command(capsys):
-    module.main(curricula.names, curricula.load, argv=["probabilities", "--format", "markdown"])
+    main(["probabilities", "--format", "markdown"])
 
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("| b=")] == [
@@ -205,7 +206,7 @@ def test_latex_shows_texts_as_they_are():
 
 
 def test_a_long_column_is_broken_in_latex():
-    sheet = Sheet("t", {"a": "l", "b": "l"}, (("x", "y" * (module.WIDE + 1)),))
+    sheet = Sheet("t", {"a": "l", "b": "l"}, (("x", "y" * (sheets.WIDE + 1)),))
 
     assert r"\begin{tabular}{lp{0.6\linewidth}}" in to_latex(sheet)
 

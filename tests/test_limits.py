@@ -18,8 +18,9 @@ from helpers.stopped_runs import with_header
 
 import curricula
 from ctgraph_rl import Curriculum, RunLog, Task
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.saved import read_plain
-from ctgraph_rl.log.sums import damaged, write_sums
+from ctgraph_rl.log.sums import write_sums
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs

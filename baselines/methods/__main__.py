@@ -1,4 +1,4 @@
-"""``python -m baselines.methods``: the methods, and what each needs to know."""
+"""``ctgraph-rl methods``: the methods, and what each needs to know."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from baselines.catalogue import Entry, catalogue
 
 def needs_ids(method: Entry) -> str:
     """Return when a method needs task ids: ``yes``, ``no`` or with which setting."""
-    return "yes" if method.kind.needs_task_id else "heads=multi" if "heads" in method.settings else "no"
+    return "yes" if method.facts["needs_task_id"] else "heads=multi" if "heads" in method.settings else "no"
 
 
 def main() -> None:
@@ -17,7 +17,7 @@ def main() -> None:
     argparse.ArgumentParser(prog="ctgraph-rl methods", description=main.__doc__).parse_args()
     print("method=NAME  needs ids    boundaries  what it is")
     for method in catalogue("method"):
-        boundaries = "yes" if method.kind.needs_boundaries else "no"
+        boundaries = "yes" if method.facts["needs_boundaries"] else "no"
         print(f"{method.name:<12} {needs_ids(method):<12} {boundaries:<11} {method.comment}")
 
 

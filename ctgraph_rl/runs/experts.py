@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.sums import damaged
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
 from ctgraph_rl.tasks.task import Task
 

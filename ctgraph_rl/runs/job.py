@@ -20,10 +20,11 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.disk import is_writable, write_whole
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.sums import RESULTS, damaged
+from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints

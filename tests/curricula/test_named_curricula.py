@@ -31,15 +31,19 @@ BY_CONFIGURATION = pytest.mark.parametrize("configuration", KINDS)
 
 
 def test_no_curriculum_has_changed_without_a_new_version_and_all_are_in_the_table():
-    loaded = {name: curricula.load(name) for name in NAMES}
+    def facts(c):
+        sizes = {"tasks": len(c.tasks), "frames": c.num_frames}
+        return {"version": c.version, "fingerprint": c.fingerprint, **sizes, "source": c.source}
 
-    found = {name: {"version": c.version, "fingerprint": c.fingerprint} for name, c in loaded.items()}
+    found = {name: facts(curricula.load(name)) for name in NAMES}
 
     assert found == TABLE
 
 
 def test_the_oldest_fingerprint_is_what_it_was_when_published():
-    assert TABLE["su_b1_4tasks"] == {"version": 1, "fingerprint": "a78b6121f1224f71"}
+    oldest = TABLE["su_b1_4tasks"]
+
+    assert (oldest["version"], oldest["fingerprint"]) == (1, "a78b6121f1224f71")
 
 
 def test_no_two_names_are_the_same_curriculum():
@@ -113,10 +117,10 @@ def test_a_budget_of_no_frames_is_refused():
     assert {name for name in NAMES if "num_frames must be an integer >= 1, got 0" not in refusals[name]} == set()
 
 
-def test_an_unknown_curriculum_is_refused_with_the_choices():
+def test_an_unknown_curriculum_is_refused_with_what_may_be_meant_or_where_all_are_listed():
     with pytest.raises(ValueError, match=r"unknown curriculum 'su_b1_4task'.*did you mean 'su_b1_4tasks'"):
         curricula.load("su_b1_4task")
-    with pytest.raises(ValueError, match=r"unknown curriculum 'xyz' Choices: co_b1_4images, co_b1_4tasks, .*ct8, "):
+    with pytest.raises(ValueError, match=r"unknown curriculum 'xyz'; ctgraph-rl curricula lists all"):
         curricula.load("xyz")
     with pytest.raises(ValueError, match="unknown curriculum 'xyz'"):
         curricula.summary("xyz")

@@ -1,0 +1,101 @@
+"""Tables in no particular format, and what they are as text, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
+
+LISTED = {"name": "l", "version": "r", "tasks": "r", "frames": "r", "fingerprint": "l", "source": "l"}
+"""Columns of a list of curricula."""
+
+MATHS = {
+    "P_R": "$P_R$",
+    "P_E": "$P_E$",
+    "P_RNP": r"$P_\mathrm{RNP}$",
+    "E[rho]": r"$E[\rho]$",
+    "E[kappa]": r"$E[\kappa]$",
+    "b": "$b$",
+    "d": "$d$",
+    "p": "$p$",
+}
+WIDE = 60
+"""Characters from which on a column of a LaTeX table is broken into lines."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table in no particular format.
+
+    Args:
+        title: a line above it.
+        columns: the columns' names, each with ``l`` or ``r`` for its alignment.
+        rows: texts, one for each column.
+        notes: lines below it.
+    """
+
+    title: str
+    columns: Mapping[str, str]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
+    """Print a table on the terminal; into a pipe 200 characters wide."""
+    console = Console() if console is None else console
+    if not console.is_terminal:
+        console.width = 200
+    table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
+    for i, (name, side) in enumerate(sheet.columns.items()):
+        table.add_column(_shown(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
+    for row in sheet.rows:
+        table.add_row(*map(_shown, row))
+    console.print(table)
+    for note in sheet.notes:
+        console.print(_shown(note))
+
+
+def _shown(text: str) -> Text:
+    return Text(terminal_text(text))
+
+
+def to_markdown(sheet: Sheet) -> str:
+    """A table in Markdown, with its title as a heading."""
+    sides = ["--:" if side == "r" else ":--" for side in sheet.columns.values()]
+    lines = ["| " + " | ".join(map(markdown_text, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
+    notes = [line for note in sheet.notes for line in ("", f"{markdown_text(note)}")]
+    return "\n".join(
+        [f"## {markdown_text(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""]
+    )
+
+
+def to_latex(sheet: Sheet) -> str:
+    """A table in LaTeX, for the package booktabs; title and notes as comments."""
+    sides = [_latex_side(i, side, sheet.rows) for i, side in enumerate(sheet.columns.values())]
+    header = " & ".join(MATHS.get(name, latex_text(name)) for name in sheet.columns)
+    lines = [" & ".join(map(latex_text, row)) + r" \\" for row in sheet.rows]
+    notes = [f"% {terminal_text(line)}" for line in (sheet.title, *sheet.notes)]
+    begin, end = rf"\begin{{tabular}}{{{''.join(sides)}}}", r"\end{tabular}"
+    return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
+
+
+def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
+    return r"p{0.6\linewidth}" if any(len(row[column]) > WIDE for row in rows) else side
+
+
+FORMATS: dict[str, Callable[[Sheet], str]] = {"markdown": to_markdown, "latex": to_latex}
+"""What makes a text of a table, by the name of the format; ``text`` is the terminal's."""
+
+
+def show(sheets: Sequence[Sheet], form: str) -> None:
+    """Print tables as ``text``, or in one of `FORMATS`."""
+    if form == "text":
+        for sheet in sheets:
+            print_sheet(sheet)
+    else:
+        print("\n".join(map(FORMATS[form], sheets)), end="")

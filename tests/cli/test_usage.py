@@ -1,0 +1,132 @@
+"""``ctgraph-rl`` itself: its usage, its versions, the words it knows, and what it does not import to answer."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+import ctgraph_rl
+from baselines.catalogue import catalogue
+from ctgraph_rl import cli, run
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Calls ``ctgraph-rl WORDS``; gives its exit code, what it printed and its errors."""
+
+    def call_(*words: str) -> tuple[int | str | None, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *words])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call_
+
+
+@pytest.fixture
+def runs(monkeypatch) -> list[list[str]]:
+    """The settings of the runs that are started, which then do nothing."""
+    started: list[list[str]] = []
+    monkeypatch.setattr(run, "main", lambda: started.append(sys.argv[1:]))
+    return started
+
+
+def test_alone_it_shows_usage_each_command_with_a_line_and_six_settings(call, runs):
+    code, out, err = call()
+
+    assert (code, err, runs) == (0, "", [])
+    assert out.startswith("usage: ctgraph-rl ")
+    assert all(re.search(rf"^  {name} +\w.{{10}}", out, re.MULTILINE) for name in cli.COMMANDS)
+    assert len(re.findall(r"^  [\w.]+=\S+ +\w.{10}", out, re.MULTILINE)) == 6
+    assert max(map(len, out.splitlines())) <= 100
+    assert call("--help") == call("-h") == (0, out, "")
+
+
+def test_the_settings_that_it_shows_are_settings_of_a_run(compose):
+    names = [setting.partition("=")[0] for setting in cli.SETTINGS]
+
+    cfg = compose()
+
+    assert all(name in cfg or name.split(".")[1] in cfg[name.split(".")[0]] for name in names)
+
+
+@pytest.mark.parametrize(
+    ("words", "settings"),
+    [
+        (["run"], []),
+        (["run", "seed=1"], ["seed=1"]),
+        (["run", "--help"], ["--help"]),
+        *(
+            ([*words], [*words])
+            for words in (["seed=1"], ["-m", "seed=1,2"], ["~logger"], ["+new=1"], ["--hydra-help"])
+        ),
+    ],
+)
+def test_the_command_run_and_settings_alone_start_a_run(call, runs, words, settings):
+    assert call(*words)[0] == 0
+    assert runs == [settings]
+
+
+def test_the_version_is_its_own_with_those_of_what_it_is_built_on(call):
+    code, out, err = call("--version")
+
+    assert (code, err) == (0, "")
+    others = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "hydra-core"))
+    assert out == f"ctgraph_rl {ctgraph_rl.__version__} ({others})\n"
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("curiculum", "curricula"),
+        ("Curricula", "curricula"),
+        ("RUN", "run"),
+        ("describe", "curricula describe"),
+        ("curriculum", "curriculum=NAME"),
+        ("PPO", "agent=ppo"),
+        ("su-b1-4tasks", "curriculum=su_b1_4tasks"),
+    ],
+)
+def test_an_unknown_word_is_refused_with_what_may_have_been_meant(call, runs, word, meant):
+    code, out, err = call(word)
+
+    assert (code, out, runs) == (2, "", [])
+    first, second = err.splitlines()
+    assert first == f"error: unknown command {word!r}; did you mean ctgraph-rl {meant}?"
+    assert second.startswith("Commands: run, agents, compare, curricula, ")
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["", "--version", "curiculum", "agents", "methods", "curricula", "curricula list --format markdown", "agent=pp"],
+)
+def test_what_only_lists_imports_no_torch(checkout, tmp_path, words):
+    code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules, file=sys.stderr))"
+    code += "; from ctgraph_rl.cli import main; main()"
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+
+    result = subprocess.run(
+        [sys.executable, "-c", code, *words.split()], cwd=tmp_path, env=env, capture_output=True, text=True
+    )
+
+    assert result.stderr.splitlines()[-1] == "False"
+    assert result.stdout or result.returncode
+
+
+@pytest.mark.parametrize(
+    ("group", "names"), [("agent", ("memory", "solves")), ("method", ("needs_task_id", "needs_boundaries"))]
+)
+def test_the_facts_of_a_list_are_those_of_the_classes(group, names):
+    entries = list(catalogue(group))
+
+    assert len(entries) > 5
+    for entry in entries:
+        assert {name: entry.facts[name] for name in names} == {name: getattr(entry.kind, name) for name in names}
