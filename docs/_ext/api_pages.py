@@ -1,0 +1,169 @@
+"""The pages of the Python API: which names and modules stand on which page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import ctgraph_rl
+
+EXPORTED = {
+    "tasks": ("core", "tasks"),
+    "environments": ("env", "batch"),
+    "learning": ("agent", "learn", "log", "runs"),
+}
+"""For each page, the folders and modules of ``ctgraph_rl`` whose exported names it documents."""
+
+ELSEWHERE = "learning"
+"""The page of exported names from other modules."""
+
+PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "tasks": (
+        "Graphs, tasks and observations",
+        "What a task is made of, and the numbers that follow from it.",
+        (
+            "ctgraph_rl.tasks.configurations",
+            "ctgraph_rl.core.rewards",
+            "ctgraph_rl.tasks.memory",
+            "ctgraph_rl.tasks.images.image_set",
+            "ctgraph_rl.tasks.images.measures",
+            "ctgraph_rl.tasks.switch",
+            "ctgraph_rl.tasks.values",
+            "ctgraph_rl.tasks.similarity",
+            "ctgraph_rl.tasks.observability",
+        ),
+    ),
+    "environments": (
+        "Environments",
+        "The same tasks for TorchRL, Gymnasium and Stable-Baselines3, and the batch of rows behind them.",
+        (
+            "ctgraph_rl.gym",
+            "ctgraph_rl.sb3",
+            "ctgraph_rl.policies",
+        ),
+    ),
+    "learning": (
+        "Learning, logs and runs",
+        "Learn a curriculum, evaluate policies, record and load runs.",
+        (
+            "ctgraph_rl.agent",
+            "ctgraph_rl.learn.lifelong",
+            "ctgraph_rl.log.tables",
+            "ctgraph_rl.log.scores",
+            "ctgraph_rl.runs.read",
+            "ctgraph_rl.runs.trackers",
+            "ctgraph_rl.compare",
+        ),
+    ),
+    "curricula": (
+        "Curricula",
+        "Published sequences by name, and functions that make others.",
+        ("curricula", "curricula.axes", "curricula.order", "curricula.configured", "curricula.meta_json"),
+    ),
+    "metrics": (
+        "Metrics",
+        "Functions of performance matrices and curves; each metric also has a card.",
+        (
+            "ctgraph_rl.metrics",
+            "ctgraph_rl.metrics.record",
+            "ctgraph_rl.metrics.bounds",
+            "ctgraph_rl.metrics.matrix",
+            "ctgraph_rl.metrics.curves",
+            "ctgraph_rl.metrics.transfer",
+            "ctgraph_rl.metrics.lifetime",
+            "ctgraph_rl.metrics.optimum",
+            "ctgraph_rl.metrics.regimes",
+        ),
+    ),
+    "figures": (
+        "Figures and reports",
+        "Draw tasks, curricula and policies, and report runs.",
+        (
+            "ctgraph_rl.visualize.task_figure",
+            "ctgraph_rl.visualize.curriculum_figure",
+            "ctgraph_rl.visualize.similarity_figure",
+            "ctgraph_rl.visualize.image_figure",
+            "ctgraph_rl.visualize.visits",
+            "ctgraph_rl.visualize.player",
+            "ctgraph_rl.visualize.gif",
+            "ctgraph_rl.visualize.dot",
+            "ctgraph_rl.report.page:write_report,Report",
+            "ctgraph_rl.report.statistics",
+            "ctgraph_rl.report.intervals",
+        ),
+    ),
+    "engines": (
+        "Engines",
+        "The pure functions of tensors that make every step, and the two engines that call them for a batch of rows.",
+        (
+            "ctgraph_rl.core.dynamics",
+            "ctgraph_rl.core.row_params",
+            "ctgraph_rl.core.tree",
+            "ctgraph_rl.batch.params",
+            "ctgraph_rl.batch.assignment",
+            "ctgraph_rl.batch.tensor_engine",
+            "ctgraph_rl.batch.native",
+        ),
+    ),
+    "baselines": (
+        "Baselines",
+        "What agents and lifelong-learning methods are built from.",
+        (
+            "baselines.learner",
+            "baselines.hooks",
+            "baselines.policy_gradient",
+            "baselines.q_learning",
+            "baselines.recurrent_q",
+            "baselines.networks",
+            "baselines.optimisers",
+            "baselines.methods.method",
+            "baselines.methods.importance",
+            "baselines.methods.masks",
+            "baselines.methods.heads",
+            "baselines.methods.weights",
+        ),
+    ),
+}
+"""For each page its title, a sentence, and the modules that it documents: whole, or those names after a colon."""
+
+
+def exported(page: str) -> list[str]:
+    """Return the names that ``ctgraph_rl`` exports and a page documents."""
+    return [name for name in ctgraph_rl.__all__ if name != "metrics" and _page_of(name) == page]
+
+
+def _page_of(name: str) -> str:
+    wing = ctgraph_rl._HOMES[name].split(".")[0]
+    return next((page for page, wings in EXPORTED.items() if wing in wings), ELSEWHERE)
+
+
+def api_pages() -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each page, in reStructuredText."""
+    yield "api/index.rst", _index()
+    for page, (title, sentence, modules) in PAGES.items():
+        parts = [_title(title, "="), sentence, *map(_directive, exported(page))]
+        yield f"api/{page}.rst", "\n\n".join([*parts, *map(_module, modules)]) + "\n"
+
+
+def _index() -> str:
+    pages = "\n".join(f"   {page}" for page in PAGES)
+    words = "Everything that a script imports. ``import ctgraph_rl`` is cheap: names are imported when they are used."
+    return f"{_title('Python API', '=')}\n\n{words}\n\n.. toctree::\n   :maxdepth: 2\n\n{pages}\n"
+
+
+def _title(text: str, underline: str) -> str:
+    return f"{text}\n{underline * len(text)}"
+
+
+def _directive(name: str) -> str:
+    """Return the directive that documents an exported name."""
+    if isinstance(getattr(ctgraph_rl, name), type):
+        return f".. autoclass:: ctgraph_rl.{name}\n   :members:"
+    return f".. autofunction:: ctgraph_rl.{name}"
+
+
+def _module(entry: str) -> str:
+    """Return a section with what a module defines, without what ``ctgraph_rl`` exports of it."""
+    name, _, members = entry.partition(":")
+    left_out = [each for each in ctgraph_rl.__all__ if f"ctgraph_rl.{ctgraph_rl._HOMES.get(each)}" == name]
+    options = [f"   :members: {members}", *([f"   :exclude-members: {', '.join(left_out)}"] if left_out else [])]
+    return "\n".join([_title(f"``{name}``", "-"), "", f".. automodule:: {name}", *options])

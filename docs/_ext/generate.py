@@ -1,0 +1,42 @@
+"""Makes the generated pages of the site, before Sphinx reads anything, in ``docs/generated``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from api_pages import api_pages
+from links import OUTSIDE, relocated
+from sphinx.application import Sphinx
+
+FOLDER = "generated"
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page, unless it stands there already: Sphinx then reads it again only if it changed."""
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def generate(app: Sphinx) -> None:
+    """Write all generated pages, and remove those that are generated no more."""
+    folder = Path(app.srcdir) / FOLDER
+    pages = {folder / path: text for path, text in api_pages()}
+    pages |= {folder.parents[1] / page: _copy(app, name, page) for name, page in OUTSIDE.items() if FOLDER in page}
+    for path, text in pages.items():
+        write(path, text)
+    for path in folder.rglob("*.*"):
+        if path.suffix in (".md", ".rst") and path not in pages:
+            path.unlink()
+
+
+def _copy(app: Sphinx, name: str, page: str) -> str:
+    """Return the page that shows a file beside ``docs``."""
+    text = (Path(app.srcdir).parent / name).read_text(encoding="utf-8")
+    return relocated(text, name, page, app.config.repository)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Generate pages when a build starts."""
+    app.connect("builder-inited", generate)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,49 @@
+"""Sphinx configuration of the documentation; build it with ``sphinx-build -nW --keep-going docs docs/_build``.
+
+Pages are MyST Markdown and notebooks with their stored output. What ``docs/_ext`` generates goes to ``docs/generated``,
+which git ignores.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
+
+from ctgraph_rl import __version__  # noqa: E402
+
+PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+project = PROJECT["name"]
+author = copyright = "the ctgraph_rl developers"
+version = release = __version__
+repository = PROJECT.get("urls", {}).get("Repository", "")
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "generate"]
+exclude_patterns = ["_build", "results/*template.md"]
+templates_path: list[str] = []
+nitpicky = True
+
+myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 4
+nb_execution_mode = "off"
+nb_output_stderr = "remove"
+
+html_theme = "furo"
+html_title = f"{project} {version}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_theme_options = {"source_repository": repository, "source_branch": "main", "source_directory": "docs/"}
+html_copy_source = False
+
+default_role = "py:obj"
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 100
+napoleon_use_rtype = False
+OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
+nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", "Path|Sequence|Tensor|TensorDictBase")]
