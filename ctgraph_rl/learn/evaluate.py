@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from inspect import Parameter, signature
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import require, require_all
@@ -24,7 +27,7 @@ from ctgraph_rl.tasks.task import Task
 
 @torch.no_grad()
 def evaluate(
-    policy: Policy,
+    policy: Policy | nn.Module,
     tasks: Sequence[Task],
     num_episodes: int = Evaluation.num_episodes,
     *,
@@ -40,7 +43,8 @@ def evaluate(
     The environment is one of its own, and torch's global generator is left as it was found.
 
     Args:
-        policy: what plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment.
+        policy: what plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment, and a plain
+            module maps observations to logits, see `LogitsPolicy`.
         tasks: what is played.
         num_episodes: episodes per task.
         seed: decides the environment and, if not greedy, the policy's draws.
@@ -56,8 +60,8 @@ def evaluate(
         [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other.
 
     Raises:
-        ValueError: for values out of range, a task with changing goals and one episode a row, and a reference policy
-            that was built on another environment.
+        ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy that
+            was built on another environment, and a module that gives no logits.
     """
     tasks = require_all(Task, "tasks", tasks)
     Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
@@ -67,7 +71,7 @@ def evaluate(
     device = checked_device(device)
     rows = [task for task in tasks for _ in range(num_episodes // episodes_per_row)]
     env = CTGraphEnv(rows, seed, device=device) if curriculum is None else make_env(curriculum, rows, seed, device)
-    acts = policy(env) if isinstance(policy, type) else policy
+    acts = policy(env) if isinstance(policy, type) else as_policy(policy, env.action_spec_unbatched.n)
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
         torch.manual_seed(seed)
@@ -92,6 +96,67 @@ def _first_episodes(
             value[ends, played[ends]] = step["next", key][ends]
         played[ends] += 1
     return result
+
+
+class LogitsPolicy:
+    """A plain module that maps observations to logits, as a policy: greedy, or sampling where exploration is on.
+
+    The module is given observations with the values that the environment shows, 0 to 255 for images, in the type and on
+    the device of its first parameter: it scales and flattens them itself. Where the protocol shows task ids and its
+    ``forward`` takes two arguments, the one-hot task ids are the second.
+
+    Args:
+        module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
+        num_actions: logits of a row.
+    """
+
+    def __init__(self, module: nn.Module, num_actions: int) -> None:
+        self.module, self.num_actions = module, num_actions
+        self._takes_ids = _num_required(module.forward) == 2
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        """Write ``action``, int64 [n]."""
+        logits = self._logits(data)
+        greedy = exploration_type() == ExplorationType.DETERMINISTIC
+        action = logits.argmax(-1) if greedy else torch.distributions.Categorical(logits=logits).sample()
+        return data.set("action", action.to(data.device or "cpu"))
+
+    def _logits(self, data: TensorDictBase) -> Tensor:
+        """Return the logits of all rows.
+
+        Raises:
+            ValueError: if the module fails or gives anything else; says what to write.
+        """
+        name, shape = type(self.module).__name__, list(data["observation"].shape)
+        wanted = (
+            f"a plain module must map observations, float {shape}, to logits, float [{shape[0]}, {self.num_actions}]"
+        )
+        fix = "write one that does, or a function of a TensorDict that sets 'action', or a TensorDictModule"
+        like = next(self.module.parameters(), torch.zeros(()))
+        keys = ["observation", "task_id"] if self._takes_ids and "task_id" in data.keys() else ["observation"]  # noqa: SIM118
+        try:
+            logits = self.module(*(data[key].to(like.device, like.dtype) for key in keys))
+        except (RuntimeError, TypeError, IndexError, KeyError, AttributeError) as error:
+            raise ValueError(
+                f"{wanted}; {name} fails with {type(error).__name__}: {str(error)[:200]}. Fix: {fix}"
+            ) from error
+        is_tensor = isinstance(logits, Tensor)
+        fits = is_tensor and logits.is_floating_point() and list(logits.shape) == [shape[0], self.num_actions]
+        got = f"{str(logits.dtype).removeprefix('torch.')} {list(logits.shape)}" if is_tensor else type(logits).__name__
+        require((fits, f"{wanted}; {name} gives {got}. Fix: {fix}"))
+        return logits
+
+
+def _num_required(function: Any) -> int:
+    """Return how many positional arguments without a default a function takes."""
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in kinds and p.default is p.empty for p in signature(function).parameters.values())
+
+
+def as_policy(policy: Policy | nn.Module, num_actions: int) -> Policy:
+    """Return a plain module as a policy of TensorDicts; what is one already unchanged."""
+    plain = isinstance(policy, nn.Module) and not isinstance(policy, TensorDictModuleBase)
+    return LogitsPolicy(policy, num_actions) if plain else policy  # type: ignore[arg-type]
 
 
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
@@ -134,7 +199,8 @@ class Evaluator:
         """Evaluate an agent if the curriculum says so after ``frames`` frames of the run."""
         moment = self.curriculum.moment(frames)
         if moment is not None:
-            self.evaluate(self._policy(agent, self.tasks_at(frames)), frames, moment, agent.initial_state)
+            policy = self._policy(agent, self.tasks_at(frames))
+            self.evaluate(_of_data(policy), frames, moment, agent.initial_state)
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
         """Evaluate a policy after ``frames`` frames and append one line for each task."""
@@ -175,6 +241,11 @@ class Evaluator:
         ids = self.curriculum.task_ids
         policies = [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
         return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
+
+
+def _of_data(policy: Policy) -> Policy:
+    """Return an agent's policy, which reads TensorDicts whatever its class is."""
+    return policy.__call__ if isinstance(policy, nn.Module) else policy
 
 
 def by_slices(policies: Sequence[Policy]) -> Policy:

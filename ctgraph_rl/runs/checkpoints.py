@@ -31,6 +31,9 @@ FORMAT = 1
 KEPT = 2
 """Checkpoints that are kept, the newest."""
 
+SECONDS = 300.0
+"""Time between two checkpoints within a block, where nothing else is said."""
+
 State = Mapping[str, Any]
 """What is saved: tensors and plain Python values, nested; ``frames`` is the number of frames of the run so far."""
 
@@ -56,7 +59,7 @@ class Checkpoints:
     """
 
     def __init__(
-        self, folder: Path | str, seconds: float = 300.0, strict: bool = False, interrupt: Interrupt | None = None
+        self, folder: Path | str, seconds: float = SECONDS, strict: bool = False, interrupt: Interrupt | None = None
     ) -> None:
         require(*not_negative(seconds=seconds), *true_or_false(strict=strict))
         self.folder, self.seconds, self.strict = as_path("folder", folder), seconds, strict

@@ -230,6 +230,17 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
         raise ValueError(explain(error)) from None
 
 
+def logger_of(given: Any) -> Callable[..., Any] | None:
+    """Return what builds a logger in a folder: a function as it is, or that of a name in ``conf/logger``.
+
+    Raises:
+        ValueError: for an unknown name, with the one that was probably meant, and for what is neither.
+    """
+    fits = given is None or isinstance(given, str) or callable(given)
+    require((fits, f"logger must be a name such as 'csv', a function of a folder, or None, got {given!r:.80}"))
+    return target(with_names({"logger": given}), "logger") if isinstance(given, str) else given
+
+
 def names_in(folder: Path | str, group: str) -> list[str]:
     """Return the names of a group's yaml files in a configuration directory."""
     return sorted(path.stem for path in Path(folder, group).glob("*.yaml"))

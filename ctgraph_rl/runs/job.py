@@ -148,9 +148,9 @@ def make_agent(
 ) -> Agent:
     """Build an agent for a curriculum from the yaml files that the command line reads, with the same weights.
 
-    ``log = learn_curriculum(curriculum, agent, seed)`` then gives the measurements of ``ctgraph-rl agent=NAME``, with the
-    same bits, and ``scores(log, curriculum)`` its metrics. As a run does, this seeds torch's global generator, sets the
-    number of torch's threads to ``num_threads`` of ``conf/config.yaml``, and flushes denormal numbers to zero.
+    ``log = learn_curriculum(curriculum, agent, seed)`` then gives the measurements of ``ctgraph-rl agent=NAME``, with
+    the same bits, and ``scores(log, curriculum)`` its metrics. As a run does, this seeds torch's global generator, sets
+    the number of torch's threads to ``num_threads`` of ``conf/config.yaml``, and flushes denormal numbers to zero.
 
     Args:
         name: of a file in ``conf/agent``, such as ``"ppo"``.

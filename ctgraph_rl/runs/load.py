@@ -22,7 +22,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, read_plain, require_records
 from ctgraph_rl.packages import class_named
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.settings import with_added
+from ctgraph_rl.runs.settings import parameters_of, with_added
 from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -63,11 +63,13 @@ def load(
 
     Args:
         run_dir: the directory.
-        make_agent: builds the agent from the environment's unbatched observation and action specs; needed where its
-            class is not one of the baselines, such as ``partial(MyAgent, **settings)``.
+        make_agent: needed where the agent's class is none of the baselines: the class, which is built with the
+            settings that the run stored, or a function of the environment's unbatched observation and action specs,
+            such as ``partial(MyAgent, **settings)``.
         curriculum: what was learned; needed where it has parts of classes that are not this package's.
         device: where the agent shall live.
-        make_method: builds the agent's method; needed where its class is not one of the baselines'.
+        make_method: builds the agent's method; needed where its class is not one of the baselines': the class or a
+            function, in the same way.
 
     Raises:
         FileNotFoundError: if there is no run, or none that has been saved.
@@ -113,12 +115,21 @@ def _builder(
     curriculum: Curriculum,
 ) -> MakeAgent:
     """Return what builds the agent with its method, if it has one; the curriculum is already prepared for that."""
-    alone = _ours(run_dir, "agent", config.get("agent")) if make_agent is None else make_agent
-    if make_method is None and config.get("method") is not None:
-        make_method = _ours(run_dir, "method", config["method"])
-    if make_method is None:
+    stored = {part: config.get(part) for part in OURS}
+    alone = _ours(run_dir, "agent", stored["agent"]) if make_agent is None else _with(make_agent, stored["agent"])
+    if make_method is not None:
+        return with_method(alone, _with(make_method, stored["method"]), curriculum)
+    if stored["method"] is None:
         return alone
-    return with_method(alone, make_method, curriculum)
+    return with_method(alone, _ours(run_dir, "method", stored["method"]), curriculum)
+
+
+def _with(make: Callable[..., Any], stored: Any) -> Callable[..., Any]:
+    """Return a class with the settings that a run stored, as far as it takes them; another function as it is."""
+    if not (isinstance(make, type) and isinstance(stored, Mapping)):
+        return make
+    takes = parameters_of(make)
+    return partial(make, **{key: value for key, value in with_added(stored).items() if key in takes})
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:

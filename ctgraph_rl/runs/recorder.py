@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from pathlib import Path
@@ -12,17 +13,23 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.record.loggers.common import Logger
 
-from ctgraph_rl.checks import as_path, is_int, is_json_object, require
-from ctgraph_rl.disk import sync_folders
-from ctgraph_rl.learn.collect import Policy
-from ctgraph_rl.learn.evaluate import Evaluator, by_slices
-from ctgraph_rl.log.files import LOG
+from ctgraph_rl.checks import as_path, is_int, is_json_object, require, true_or_false
+from ctgraph_rl.disk import made_folder, sync_folders
+from ctgraph_rl.learn.collect import Policy, agent_specs
+from ctgraph_rl.learn.evaluate import Evaluator, as_policy, by_slices
+from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sources import full_name
-from ctgraph_rl.runs.train import write_curriculum, write_results
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.checkpoints import SECONDS, Checkpoints
+from ctgraph_rl.runs.settings import differences, flat
+from ctgraph_rl.runs.trackers import FOLDER, Tracker
+from ctgraph_rl.runs.train import remove_results, resumed_log, write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -35,6 +42,7 @@ class Recorder:
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
       is None, and ``episode_start``, bool [n], says which rows start an episode;
     - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol says so;
+    - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.evaluate.LogitsPolicy`;
     - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
 
     Observations are NumPy arrays. Where the protocol shows task ids with observations, they are a dict of
@@ -43,11 +51,17 @@ class Recorder:
 
     Use it as a context manager, or call `close`::
 
-        with Recorder(curriculum, "runs/mine") as recorder:
-            recorder.evaluate(policy, 0)
+        with Recorder(curriculum, "runs/mine", resume=True) as recorder:
+            if recorder.saved is None:
+                recorder.evaluate(policy, 0)
+            else:
+                policy.load_state_dict(recorder.saved)
             for block, frames in zip(curriculum.blocks, curriculum.ends):
+                if frames <= recorder.frames:
+                    continue  # learned before the run was stopped
                 ...  # learn block.tasks for block.num_frames
                 recorder.evaluate(policy, frames)
+                recorder.checkpoint(policy.state_dict, frames)
 
     Args:
         curriculum: what is learned.
@@ -56,10 +70,18 @@ class Recorder:
         about: what else the first line of the log should tell, such as the learner's name and settings, as JSON.
         code: classes and functions that learn; the log then says of which source they are, so that results of changed
             code are not averaged with those of before. None: it does not say.
+        overwrite: replace the run that the directory holds.
+        resume: resume the run that the directory holds from its last `checkpoint`; one that was stopped before its
+            first starts again. ``saved`` is what was saved, and ``frames`` after how many frames.
+        logger: where measurements go as they are made, too: the name of a file in ``conf/logger``, such as
+            ``"tensorboard"``, or a function that builds a logger of TorchRL in a folder.
+        checkpoint_seconds: time between two checkpoints within a block, >= 0.
 
     Raises:
-        ValueError: for values out of range, before anything is written.
-        FileExistsError: if the directory holds a log.
+        ValueError: for values out of range, before anything is written; and where a run of other settings or of code
+            that has changed would be resumed.
+        FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it;
+            or if the run to resume is finished.
     """
 
     def __init__(
@@ -69,30 +91,122 @@ class Recorder:
         seed: int = 0,
         about: Mapping[str, Any] | None = None,
         code: Sequence[type | FunctionType] | None = None,
+        *,
+        overwrite: bool = False,
+        resume: bool = False,
+        logger: str | Callable[[Path], Logger] | None = None,
+        checkpoint_seconds: float = SECONDS,
     ) -> None:
+        writes = run_dir is not None or not (overwrite or resume or logger is not None)
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
             ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
             (is_json_object(about), f"about must be plain JSON values by name, got {about!r}"),
             (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
+            *true_or_false(overwrite=overwrite, resume=resume),
+            (
+                not (overwrite is True and resume is True),
+                "give either overwrite or resume: a run is replaced or resumed",
+            ),
+            (writes, "overwrite, resume and logger need a run_dir"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else as_path("run_dir", run_dir)
-        path = None if self.run_dir is None else self.run_dir / LOG
-        if path is not None:
-            if path.exists() and not RunLog.is_blank(path):
-                raise FileExistsError(f"{path} exists: choose another run_dir, nothing is overwritten")
-            path.unlink(missing_ok=True)
-            path.parent.mkdir(parents=True, exist_ok=True)
-        self.log = RunLog(path)
+        self.saved: Mapping[str, Any] | None = None
+        self.frames = 0
+        self._evaluated, self._trained = -1, 0
+        self._tracker: Tracker | None = None
         names = None if code is None else [full_name(each) for each in code]
-        self.log.append("run", **provenance(curriculum, names), config={"seed": seed, **(about or {})})
-        if path is not None:
-            self.log.sync()
-            sync_folders(path.parent)
+        self._about = {**provenance(curriculum, names), "config": {"seed": seed, **(about or {})}}
+        if self.run_dir is None:
+            self.log = RunLog()
+            self.log.append("run", **self._about)
+        else:
+            make_logger = config.logger_of(logger)
+            self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
+            self.log = self._opened(self.run_dir, overwrite, resume)
+            self._track(make_logger, self.run_dir)
         self._evaluator = Evaluator(curriculum, seed, self.log)
-        self._frames, self._trained = -1, 0
+
+    def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
+        """Return the log of a run that begins, or of one that is resumed."""
+        path, begun = run_dir / LOG, RunLog.begun(run_dir / LOG)
+        stopped = begun is not None and not (run_dir / METRICS).exists()
+        if not overwrite and not (resume and stopped) and path.exists() and not RunLog.is_blank(path):
+            what = "a run that was stopped" if stopped else "no run" if begun is None else "a finished run"
+            fix = "choose another run_dir, or overwrite=True to replace it" + ", or resume=True" * stopped
+            raise FileExistsError(f"{path} exists and is of {what}: {fix}")
+        if resume and begun is not None:
+            self._check_same(begun)
+        self._checkpoints.tidy()
+        state = self._checkpoints.newest() if resume else None
+        if state is not None:
+            require(("learner" in state, f"{self._checkpoints.folder} holds no checkpoint of a Recorder"))
+            self.saved, self.frames = state["learner"], state["frames"]
+            self._evaluated, self._trained = state["evaluated"], state["trained"]
+            return resumed_log(run_dir, state, self._about, self._checkpoints.strict)
+        made_folder(run_dir)
+        self._checkpoints.clear()
+        if overwrite or stopped:
+            remove_results(run_dir)
+        path.unlink(missing_ok=True)
+        log = RunLog(path)
+        log.append("run", **self._about)
+        log.sync()
+        sync_folders(run_dir)
+        return log
+
+    def _check_same(self, begun: Mapping[str, Any]) -> None:
+        """Refuse to resume a run of another curriculum or of other settings; `resumed_log` knows of code."""
+        before, now = (each.get("fingerprint") for each in (begun, self._about))
+        other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
+        changed = differences(begun.get("config") or {}, self._about["config"])
+        fix = "give what it was begun with, choose another run_dir, or overwrite=True"
+        require(
+            (before == now, f"{other}: {fix}"),
+            (not changed, f"{self.run_dir} holds a run with {', '.join(changed)}: {fix}"),
+        )
+
+    def _track(self, make_logger: Callable[[Path], Logger] | None, run_dir: Path) -> None:
+        """Let a logger have all measurements; without one, remove what was tracked of a run that is replaced."""
+        if make_logger is not None:
+            self._tracker = Tracker(make_logger, run_dir, dict(flat(self._about["config"])))
+            self.log.listeners.append(self._tracker)
+        elif self.saved is None:
+            shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
+
+    def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
+        """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
+
+        A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
+        it are removed, as they are made again.
+
+        Args:
+            state: a function that makes what the learner needs to learn on, as tensors and plain Python values, such as
+                ``model.state_dict``; `saved` is what it returned.
+            frames: frames learned from so far, at least those of the last evaluation and training.
+
+        Raises:
+            ValueError: for frames out of order or beyond the curriculum, without a run_dir, and for a state that cannot
+                be read back.
+        """
+        least, last = max(self._evaluated, self._trained, self.frames), self.curriculum.num_frames
+        require(
+            (self.run_dir is not None, "a checkpoint needs a run_dir: Recorder(curriculum, run_dir)"),
+            (
+                callable(state),
+                f"state must be a function that makes the state, such as model.state_dict, got {state!r:.80}",
+            ),
+            (is_int(frames, least, last), f"frames must be an integer in {least}..{last}, got {frames!r}"),
+        )
+
+        def make() -> dict[str, Any]:
+            reached = {"frames": frames, "evaluated": self._evaluated, "trained": self._trained}
+            return {**reached, "learner": dict(state()), "log": self.log.position()}
+
+        self._checkpoints.offer(make, self.curriculum.is_end(frames))
+        self.frames = frames
 
     @property
     def moments(self) -> tuple[int, ...]:
@@ -126,13 +240,13 @@ class Recorder:
             (is_int(frames, 0, last), f"frames must be an integer in 0..{last}, the curriculum's, got {frames!r}"),
             ((policy is None) != (policy_for is None), "give either policy or policy_for"),
         )
-        require((frames > self._frames, f"frames must grow: {frames} comes after {self._frames}"))
+        require((frames > self._evaluated, f"frames must grow: {frames} comes after {self._evaluated}"))
         acts = self._adapted(policy, policy_for, frames)
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
         before = len(self.log.measurements)
         self._evaluator.evaluate(acts, frames, where)
         self.log.sync()
-        self._frames = frames
+        self._evaluated = frames
         return {m["label"]: m["return_mean"] for m in self.log.measurements[before:]}
 
     def training(self, frames: int, **values: Any) -> None:
@@ -166,11 +280,18 @@ class Recorder:
         return dict(scores(self.log, self.curriculum))
 
     def close(self) -> None:
-        """Write tables and metrics, and close the log."""
-        self.log.close()
+        """Write tables and metrics, close the log and the logger, and remove the checkpoints."""
+        self._end()
         if self.run_dir is not None:
             write_curriculum(self.curriculum, self.run_dir)
             write_results(self.log, self.curriculum, self.run_dir)
+            self._checkpoints.clear()
+
+    def _end(self) -> None:
+        """Close the log and the logger."""
+        self.log.close()
+        if self._tracker is not None:
+            self._tracker.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -181,18 +302,21 @@ class Recorder:
         if error is None:
             self.close()
         else:
-            self.log.close()
+            self._end()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
-        greedy = self.curriculum.evaluation.greedy
+        how = {"greedy": self.curriculum.evaluation.greedy, "num_actions": agent_specs(self.curriculum).action.n}
         ids, shown = self.curriculum.task_ids, self.curriculum.protocol.task_id
         if policy_for is None:
-            return adapt(policy, greedy, shown == "one_hot")
+            return adapt(policy, **how, shows_ids=shown == "one_hot")
         require((shown != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
         unknown = [task for task in self._evaluator.tasks_at(frames) if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
         return by_slices(
-            [adapt(policy_for(ids[task]), greedy, shown == "one_hot") for task in self._evaluator.tasks_at(frames)]
+            [
+                adapt(policy_for(ids[task]), **how, shows_ids=shown == "one_hot")
+                for task in self._evaluator.tasks_at(frames)
+            ]
         )
 
 
@@ -206,7 +330,7 @@ def _number(value: Any) -> Any:
     return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
 
 
-def adapt(policy: Any, greedy: bool, shows_ids: bool = False) -> Policy:
+def adapt(policy: Any, greedy: bool, num_actions: int, shows_ids: bool = False) -> Policy:
     """Any policy as a function of TensorDicts; see `Recorder`.
 
     Raises:
@@ -220,6 +344,8 @@ def adapt(policy: Any, greedy: bool, shows_ids: bool = False) -> Policy:
         fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
         require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))
         return _NumpyPolicy(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))
+    if isinstance(policy, nn.Module):
+        return as_policy(policy, num_actions)
     require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
     positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
     taken = [p for p in signature(policy).parameters.values() if p.kind in positional and p.default is p.empty]

@@ -91,6 +91,10 @@ class Tracker:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the logger."""
         self._send("close")
 
     def _send(self, method: str, *args: Any, **kwargs: Any) -> None:

@@ -168,7 +168,7 @@ def train(
     checkpoints.tidy()
     saved = checkpoints.newest()
     about = provenance(curriculum, learners(config, agent))
-    log = _new_log(run_dir) if saved is None else _resumed_log(run_dir, saved, about, checkpoints.strict)
+    log = _new_log(run_dir) if saved is None else resumed_log(run_dir, saved, about, checkpoints.strict)
     log.listeners.extend(listeners)
     if saved is None:
         log.append("run", **about, config=config)
@@ -227,7 +227,7 @@ def _reopen(run_dir: Path) -> None:
         sync_folder(run_dir)
 
 
-def _resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
+def resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
     """Return the log as it was at a checkpoint; warn of another machine or versions, or refuse them if ``strict``.
 
     Raises:

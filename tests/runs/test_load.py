@@ -169,6 +169,15 @@ def test_an_agent_that_is_no_baseline_must_be_given(copy, name):
     assert type(load(copy, partial(Outsiders, **OWN)).agent) is Outsiders
 
 
+def test_a_class_that_is_given_is_built_with_the_settings_that_the_run_stored(copy):
+    rewrite(copy, config={"agent": {**SETTINGS, "_target_": "mine.Outsiders", "unknown": 1}, "seed": 3})
+
+    agent = load(copy, Outsiders).agent
+
+    assert type(agent) is Outsiders
+    assert (agent.num_envs, agent.num_steps) == (SETTINGS["num_envs"], SETTINGS["num_steps"])
+
+
 @pytest.mark.parametrize(
     "name", ["baselines.sarsa.SARSA", "baselines.a2c.SARSA", "baselines.a2c.torch", "baselines.a2c.PolicyGradient"]
 )

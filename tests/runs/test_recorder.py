@@ -16,6 +16,7 @@ import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
 from ctgraph_rl.policies import NavigationPolicy
 from ctgraph_rl.runs.recorder import Recorder
+from ctgraph_rl.runs.trackers import csv_logger
 from ctgraph_rl.runs.train import RESULTS
 from ctgraph_rl.sb3 import SB3VecEnv
 
@@ -158,6 +159,118 @@ def test_frames_must_grow_and_a_log_is_not_overwritten(tmp_path):
         recorder.evaluate(table(1), 12)
     with pytest.raises(FileExistsError):
         Recorder(TASKS, tmp_path)
+
+
+class Learner:
+    """A table that takes more decisions the longer it has learned, in batches of 4 frames."""
+
+    def __init__(self) -> None:
+        self.batches = 0
+
+    def state_dict(self) -> dict:
+        return {"batches": self.batches}
+
+    def learn(self, recorder: Recorder, stop: int | None = None) -> None:
+        """Learn the rest of a curriculum; a stop is an error after so many frames."""
+        saved = recorder.saved
+        self.batches = 0 if saved is None else saved["batches"]
+        if saved is None:
+            recorder.evaluate(table(0), 0)
+        for frames in range(recorder.frames + 4, TASKS.num_frames + 1, 4):
+            self.batches += 1
+            recorder.training(frames, loss=1 / self.batches)
+            if frames in recorder.moments:
+                recorder.evaluate(table(1 + (self.batches > 3)), frames)
+            recorder.checkpoint(self.state_dict, frames)
+            if frames == stop:
+                recorder.training(frames + 4, loss=7.0)
+                raise InterruptedError
+
+
+@pytest.mark.parametrize("stop", [4, 12, 20])
+def test_a_run_that_was_stopped_is_resumed_and_ends_as_if_it_had_never_been(tmp_path, stop):
+    with Recorder(TASKS, tmp_path / "whole") as recorder:
+        Learner().learn(recorder)
+    with pytest.raises(InterruptedError), Recorder(TASKS, tmp_path / "run", checkpoint_seconds=0) as recorder:
+        Learner().learn(recorder, stop)
+
+    with Recorder(TASKS, tmp_path / "run", resume=True) as recorder:
+        reached = recorder.frames, recorder.saved
+        Learner().learn(recorder)
+
+    logs = [RunLog.read(tmp_path / name / "run.jsonl") for name in ("whole", "run")]
+    assert reached == (stop, {"batches": stop // 4})
+    assert without_time(logs[0].measurements) == without_time(logs[1].measurements)
+    assert (tmp_path / "run" / "performance.csv").read_bytes() == (tmp_path / "whole" / "performance.csv").read_bytes()
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({}, FileExistsError, r"is of a run that was stopped: choose .*, or overwrite=True .*, or resume=True"),
+        ({"resume": True, "seed": 1}, ValueError, "holds a run with seed=0 instead of 1: give what it was begun with"),
+        ({"resume": True, "curriculum": curriculum(Block(ONE, 12))}, ValueError, r"holds a run of .* \(fingerprint"),
+        ({"resume": True, "about": {"lr": 1}}, ValueError, "holds a run with lr=None instead of 1"),
+        ({"resume": True, "overwrite": True}, ValueError, "give either overwrite or resume"),
+        ({"resume": "yes"}, ValueError, "resume must be true or false, got 'yes'"),
+        ({"run_dir": None, "resume": True}, ValueError, "overwrite, resume and logger need a run_dir"),
+        ({"overwrite": True, "logger": "cvs"}, ValueError, "unknown logger 'cvs': did you mean 'csv'"),
+        ({"overwrite": True, "logger": 3}, ValueError, "logger must be a name such as 'csv', a function of a folder"),
+    ],
+)
+def test_a_directory_with_a_run_is_resumed_or_replaced_only_as_it_is_said(tmp_path, changes, error, message):
+    with pytest.raises(InterruptedError), Recorder(TASKS, tmp_path) as recorder:
+        Learner().learn(recorder, 4)
+    before = (tmp_path / "run.jsonl").read_bytes()
+
+    with pytest.raises(error, match=message):
+        Recorder(**{"curriculum": TASKS, "run_dir": tmp_path, **changes})
+
+    assert (tmp_path / "run.jsonl").read_bytes() == before
+
+
+def test_overwrite_replaces_a_finished_run_that_resume_does_not(tmp_path):
+    for _ in range(2):
+        with Recorder(TASKS, tmp_path, overwrite=True) as recorder:
+            assert (recorder.saved, recorder.frames) == (None, 0)
+            assert [path.name for path in tmp_path.iterdir()] == ["run.jsonl"]
+            Learner().learn(recorder)
+
+    with pytest.raises(FileExistsError, match="is of a finished run: choose another run_dir, or overwrite=True"):
+        Recorder(TASKS, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (({}, 4), "state must be a function that makes the state, such as model.state_dict"),
+        ((dict, 3), r"frames must be an integer in 4..36, got 3"),
+        ((lambda: {"path": object()}, 4), "holds tensors and plain Python values"),
+    ],
+)
+def test_a_checkpoint_that_could_not_be_resumed_from_is_refused(tmp_path, arguments, message):
+    recorder = Recorder(TASKS, tmp_path)
+    recorder.training(4)
+
+    with pytest.raises(ValueError, match=message):
+        recorder.checkpoint(*arguments)
+    with pytest.raises(ValueError, match="a checkpoint needs a run_dir"):
+        Recorder(TASKS).checkpoint(dict, 4)
+
+
+@pytest.mark.parametrize("logger", ["csv", csv_logger])
+def test_a_logger_has_measurements_as_they_are_made_and_all_of_a_resumed_run(tmp_path, logger):
+    values = tmp_path / "tracker" / "scalars" / "train" / "loss.csv"
+    with pytest.raises(InterruptedError), Recorder(TASKS, tmp_path, logger=logger) as recorder:
+        Learner().learn(recorder, 4)
+    first = values.read_text()
+
+    with Recorder(TASKS, tmp_path, logger=logger, resume=True) as recorder:
+        Learner().learn(recorder)
+
+    assert first.splitlines() == ["4,1.0", "8,7.0"]
+    assert [line.partition(",")[0] for line in values.read_text().splitlines()] == [str(4 * i) for i in range(1, 10)]
 
 
 def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path):
