@@ -55,9 +55,8 @@ def test_a_plain_module_samples_where_evaluation_is_not_greedy():
     result = evaluate(random, [ONE], 2000, greedy=False, seed=1)
 
     assert result["outcome"].unique().tolist() == [1, 2, 3]
-    assert (
-        abs((result["outcome"] == 3).double().mean().item() - 3**-4) < 0.01
-    )  # four actions that a third each are right
+    share = (result["outcome"] == 3).double().mean().item()
+    assert abs(share - ONE.graph.reward_prob_random) < 0.017  # four standard deviations of 2000 episodes
 
 
 def test_a_plain_module_of_two_arguments_is_given_task_ids():
