@@ -17,7 +17,9 @@ from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.__main__ import main as curricula_main
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "curricula.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = DOCS / "reference" / "curricula.md"
+OWN = DOCS / "how-to" / "own_curriculum.md"
 MARK = "<!-- python -m curricula --format markdown -->\n"
 
 
@@ -289,9 +291,10 @@ def test_the_page_lists_what_the_command_prints(checkout):
     assert result.stdout == to_markdown(listing(map(curricula.load, curricula.names())))
 
 
-def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
+def test_the_python_of_the_pages_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    text = PAGE.read_text(encoding="utf-8") + OWN.read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names = {}
 
     for code in blocks:

@@ -19,11 +19,12 @@ from ctgraph_rl import RunLog, agent
 from curricula.paper import ct_su_b1
 
 TEXT = (CHECKOUT / "docs" / "reference" / "agents.md").read_text(encoding="utf-8")
+OWN = (CHECKOUT / "docs" / "how-to" / "own_agent.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    """The code blocks of the page in a language."""
-    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+def blocks(language: str, page: str = OWN) -> list[str]:
+    """The code blocks of a page in a language."""
+    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
 
 
 def shown(printed: str, page: str) -> bool:
@@ -35,7 +36,7 @@ def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["baselines"])
     main()
 
-    assert shown(capsys.readouterr().out, blocks("")[0])
+    assert shown(capsys.readouterr().out, blocks("", TEXT)[0])
 
 
 def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):

@@ -34,12 +34,14 @@ from ctgraph_rl.runs.train import new_agent
 from curricula.paper import ct_su_b1
 
 TEXT = (CHECKOUT / "docs" / "reference" / "methods.md").read_text(encoding="utf-8")
+OWN = (CHECKOUT / "docs" / "how-to" / "own_method.md").read_text(encoding="utf-8")
+OWN_AGENT = (CHECKOUT / "docs" / "how-to" / "own_agent.md").read_text(encoding="utf-8")
 YAML = {path.stem: path for path in sorted(Path(conf_dir(), "method").glob("*.yaml"))}
 
 
-def blocks(language: str) -> list[str]:
-    """The code blocks of the page in a language."""
-    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", TEXT, re.DOTALL | re.MULTILINE)
+def blocks(language: str, page: str = TEXT) -> list[str]:
+    """The code blocks of a page in a language."""
+    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     return [content for marked, content in fenced if marked == language]
 
 
@@ -140,9 +142,9 @@ def test_the_page_has_every_hook():
 
 def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(tmp_path):
     (tmp_path / "my_conf" / "method").mkdir(parents=True)
-    (tmp_path / "my_method.py").write_text(blocks("python")[0])
-    (tmp_path / "my_conf" / "method" / "l2_init.yaml").write_text(blocks("yaml")[0])
-    command = shlex.split(blocks("bash")[1])
+    (tmp_path / "my_method.py").write_text(blocks("python", OWN)[0])
+    (tmp_path / "my_conf" / "method" / "l2_init.yaml").write_text(blocks("yaml", OWN)[0])
+    command = shlex.split(blocks("bash", OWN)[0])
     env = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
 
     result = subprocess.run(
@@ -154,7 +156,7 @@ def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(t
     assert [m["frames"] for m in training] == [8192 * i for i in range(1, 5)]
     assert all(m["loss_method"] > 0 for m in training)
     names = {}
-    exec(compile(blocks("python")[0], "my_method.py", "exec"), names)
+    exec(compile(blocks("python", OWN)[0], "my_method.py", "exec"), names)
     trained = load(tmp_path / "out", make_method=partial(names["L2Init"], coeff=0.001))
     gap = trained.agent.method.weights.vector() - trained.agent.method.first
     assert gap.abs().max() > 0
@@ -191,12 +193,7 @@ def test_the_page_says_what_each_member_is_and_a_learner_has_them():
 def test_an_agent_that_is_no_learner_learns_with_the_gradient_step_of_the_page():
     """Plain gradient descent on the losses of the page about agents and the penalty of L2, against it by hand."""
     names: dict = {}
-    exec(
-        re.findall(
-            r"```python\n(.*?)```", (CHECKOUT / "docs" / "reference" / "agents.md").read_text("utf-8"), re.DOTALL
-        )[0],
-        names,
-    )
+    exec(blocks("python", OWN_AGENT)[0], names)
     exec(blocks("python")[-1], names)
     specs = CTGraphEnv([ct_su_b1()])
     agent = names["MyAgent"](specs.observation_spec_unbatched, specs.action_spec_unbatched, 4, 3, learning_rate=0.1)

@@ -1,0 +1,100 @@
+"""The page about errors quotes messages that are raised, word for word."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.paths import CHECKOUT
+
+import curricula
+from baselines.methods.ewc import EWC
+from baselines.methods.mask_lc import MaskLC
+from ctgraph_rl import CTGraph, CTGraphEnv, Evaluation, Observations, PaperImages, Protocol, Task, metrics
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.gym import CTGraphGymEnv
+from ctgraph_rl.log.scores import NO_EXPERTS
+from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
+
+TEXT = (CHECKOUT / "docs" / "reference" / "errors.md").read_text(encoding="utf-8")
+QUOTED = re.findall(r"^\| `(.+?)` \|", TEXT, re.MULTILINE)
+OF_RUNS = (
+    "this configuration was run",
+    "... holds a run of other code",
+    "... is in use by",
+    "... is nan in",
+    "portable=true needs",
+    "logger=wandb needs",
+)
+"""Beginnings of messages that need a run; tests of runs, trackers and faults hold them."""
+
+GRAPH, SMALL = CTGraph(2, 2), {"wait_ids": (2, 2), "decision_ids": (3, 3)}
+
+
+def act(*actions: int) -> None:
+    env = CTGraphEnv([ct_su_b1()])
+    data = env.reset()
+    for action in actions:
+        data = env.step(data.set("action", torch.tensor([action])))["next"]
+
+
+def act_after_the_end() -> None:
+    env = CTGraphGymEnv(ct_su_b1())
+    env.reset(seed=0)
+    for action in (0, 1, 0):
+        env.step(action)
+
+
+def prepared(method: object, **protocol: str) -> None:
+    method.prepare(replace(curricula.load("su_b1_4tasks"), protocol=Protocol(**protocol)))
+
+
+RAISED: list[Callable[[], object]] = [
+    lambda: CTGraph(2, 2, 1.0),
+    lambda: replace(ct_su_b1(), goal=(1, 3)),
+    lambda: Observations(wait_ids=(2, 3), decision_ids=(2, 2), end_ids=(4, 4)),
+    lambda: Task(GRAPH, (1, 2), Observations(**SMALL, end_ids=(4, 7), unique_waits=True), PaperImages(40)),
+    lambda: Task(GRAPH, (1, 2), Observations((3, 102), (2, 2), (103, 103)), PaperImages(40)),
+    lambda: replace(ct_su_b1(), step_reward=-0.01).memoryless_ceiling(),
+    lambda: act(7),
+    lambda: act(0, 1, 0),
+    act_after_the_end,
+    lambda: CTGraphEnv([ct_su_b1()]).set_tasks([ct_fo_b1()]),
+    lambda: checked_device("cuda"),
+    lambda: require(curricula.load("su_b1_4tasks", num_frames=5000).blocks[0].frame_rule(256, "block 1, 2, 3, 4")),
+    lambda: require(Evaluation(every=100).every_rule(256)),
+    lambda: prepared(MaskLC()),
+    lambda: prepared(EWC(1.0, False, 0.5, "policy", num_samples=1024, heads="auto"), boundaries="hidden"),
+    lambda: curricula.load("su_b1_4task"),
+]
+
+
+def matches(quoted: str, message: str) -> bool:
+    """Whether a message is the one quoted, in which ``...`` stands for anything."""
+    return re.fullmatch(".*".join(map(re.escape, quoted.split("..."))), message, re.DOTALL) is not None
+
+
+def test_every_message_that_the_page_quotes_is_raised():
+    messages = []
+    for raised in RAISED:
+        with pytest.raises(ValueError) as refusal:
+            raised()
+        messages.append(str(refusal.value))
+    of_metrics = [NO_EXPERTS]
+    for matrix, trained in ((torch.zeros(3, 2), [[0], [0]]), (torch.zeros(2, 1), [[0]])):
+        of_metrics += [metric.undefined for metric in metrics.of_matrix(matrix, trained).values()]
+    not_evaluated = torch.tensor([[float("nan")] * 2, [1, 0], [0, 1]])
+    of_metrics += [metric.undefined for metric in metrics.of_matrix(not_evaluated, [[0], [1]]).values()]
+
+    said = [*messages, *filter(None, of_metrics)]
+    assert len(QUOTED) >= 25
+    assert [
+        quoted
+        for quoted in QUOTED
+        if not quoted.startswith(OF_RUNS) and not any(matches(quoted, message) for message in said)
+    ] == []
+    assert [start for start in OF_RUNS if not any(quoted.startswith(start) for quoted in QUOTED)] == []
