@@ -12,13 +12,14 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Gradient
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, ct_su_b1
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import GroupedImages
 from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
 
@@ -37,6 +38,9 @@ READ_NOISE = 10
 
 READ_ROTATION = 5
 """Largest rotation when an image is read, in degrees; Table 3 of the paper has 0 or 5."""
+
+MOST_DEPTH = 4
+"""Changing goals are all tasks of one batch and evaluated for whole trials, so deeper graphs are refused."""
 
 DISSIMILAR = {(2, 2): (1, 2), (3, 2): (3, 1), (2, 3): (2, 1, 2), (3, 3): (2, 3, 1)}
 """Branching factor and depth of tasks that share nothing, each with its goal."""
@@ -208,6 +212,26 @@ def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAM
     return _curriculum(name, axes.goals_sharing(task, num_shared), num_frames)
 
 
+def changing_goals(num_frames: int = FRAMES, depth: int = 2, image_seed: int = 1) -> Curriculum:
+    """A surjective graph whose goal changes unannounced after as many episodes as it has end states: search, then repeat.
+
+    Section 4.1 of the paper reports of Ben-Iwhiwhu et al. 2020 such graphs of depth 2 and 3, where RL^2 "failed to solve
+    all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the end states one after the other,
+    so its success in episode i of a trial is min(1, i/n). Later goals are drawn uniformly; rows begin with all equally.
+
+    Args:
+        num_frames: frames of all rows together.
+        depth: d of the graph, with b=2 and p=0; the paper's are 2 and 3.
+        image_seed: seed of the image set that all tasks share.
+    """
+    require((is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"))
+    n = 2**depth
+    task = axes.reshaped(ct_su_b1(image_seed=image_seed), CTGraph(2, depth), "surjective", (1,) * depth)
+    trials = Evaluation(50 * n, greedy=False, episodes_per_row=n)
+    tasks = axes.all_goals(replace(task, goal_change=(n, n)))
+    return axes.sequence("su_b1_changing_goals", [tasks], num_frames, 1, PAPER, evaluation=trials)
+
+
 def random_graphs(num_frames: int = 51_200, image_seed: int = 1, num_tasks: int = 100, seed: int = 2023) -> Curriculum:
     """A large set of random surjective graphs that share their images: which features are invariant?
 
@@ -329,6 +353,7 @@ NAMED = {
     "fo_b1_stochastic_rewards": fo_b1_stochastic_rewards,
     "su_b1_similar_goals": partial(similar_goals, "su_b1_similar_goals", 2, 1),
     "su_b1_d4_similar_goals": partial(similar_goals, "su_b1_d4_similar_goals", 4, 2),
+    "su_b1_changing_goals": changing_goals,
     "random_graphs": random_graphs,
     "stochastic_grouped": stochastic_grouped,
     "co_hard_4tasks": co_hard_4tasks,
