@@ -19,6 +19,7 @@ from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
+from ctgraph_rl.core.tree import Swap
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
@@ -152,6 +153,11 @@ class CTGraphEnv(EnvBase):
     def branching_factor(self) -> Tensor:
         """b of each row, int64 [N]."""
         return self.rows.params.tree.branching_factor
+
+    @property
+    def swap(self) -> Swap | None:
+        """The swapped branches of each row's tree; None for no row."""
+        return self.rows.params.tree.swap
 
     @property
     def first_leaf(self) -> Tensor:

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
+from ctgraph_rl.core.tree import branch_of
 from ctgraph_rl.env import CTGraphEnv
 
 
@@ -61,10 +62,10 @@ class OptimalPolicy(NavigationPolicy):
     def _towards(self, leaf: Tensor) -> Tensor:
         """The decision on the way from each row's node to an end state; 1 where the node is not on the way."""
         b, node = self.env.branching_factor, self.env.node
-        child, decision = self.env.first_leaf + leaf, torch.ones_like(node)
+        child, decision, swap = self.env.first_leaf + leaf, torch.ones_like(node), self.env.swap
         for _ in range(self.env.max_depth):
             parent = (child - 1) // b
-            decision = torch.where(parent == node, child - b * parent, decision)
+            decision = torch.where(parent == node, branch_of(node, child - b * parent, swap), decision)
             child = parent
         return decision
 

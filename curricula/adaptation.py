@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ctgraph_rl.checks import require
+from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import OneHot, PaperImages
+from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import all_goals, given_goals, random_goals
@@ -14,6 +17,7 @@ from curricula.published import environment, full_mdp, goal_of
 
 SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"
 PENN_A = "Ben-Iwhiwhu et al. 2020, GECCO; github.com/dlpbc/penn-a"
+DICK_2020 = "Dick et al. 2020, Frontiers in Neurorobotics 14, 578675; github.com/JupiLogy/adaptive-model-detection"
 NM = "Ben-Iwhiwhu et al. 2022, Neural Networks; github.com/dlpbc/nm-metarl"
 
 UNANNOUNCED = Protocol(boundaries="hidden")
@@ -55,6 +59,24 @@ def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 2
     return sequence("penn_a_swap", tasks, frames, version=1, source=PENN_A, protocol=UNANNOUNCED)
 
 
+def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
+    """Two depth-2 graphs that differ in one transition, without notice: a change of task that is hard to detect.
+
+    Section 4.2 of the CT-graph paper: the graphs "had a single variation in the transition matrix". No configuration was
+    published. Here all wait states show one observation and all decision states another, as in CT-SU-B1, and each end
+    state has its own, so that the change is seen. In the second task the branches behind the first one are swapped: the
+    same goal is reached by the decisions (1, 2) instead of (1, 1).
+
+    Args:
+        num_frames: frames per task.
+        one_hot: observations are one-hot vectors; False: images.
+    """
+    x = Observations(wait_ids=(2, 2), decision_ids=(3, 3), end_ids=(4, 7), unique_ends=True)
+    task = Task(CTGraph(2, 2), (1, 1), x, OneHot(8) if one_hot else PaperImages(8))
+    tasks = (task, replace(task, swapped_branches=((1,), (1, 2))))
+    return sequence("dick2020_pair", tasks, num_frames, version=1, source=DICK_2020, protocol=UNANNOUNCED)
+
+
 META_BATCHES = {2: (501, 20, 20, 40), 3: (1001, 40, 25, 40), 4: (1501, 20, 60, 100)}
 """By depth: batches, tasks in a batch, episodes of a task before and again after its adaptation, test episodes."""
 
@@ -86,5 +108,5 @@ def _longest_episode(depth: int) -> int:
     return 2 * depth + 3
 
 
-NAMED = {f.__name__: f for f in (nm_uniform_goals, penn_a_swap, swoks_2x4)}
+NAMED = {f.__name__: f for f in (dick2020_pair, nm_uniform_goals, penn_a_swap, swoks_2x4)}
 """The curricula of this module by name."""

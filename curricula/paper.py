@@ -213,10 +213,10 @@ def similar_goals(name: str, depth: int, num_shared: int, num_frames: int = FRAM
 
 
 def changing_goals(num_frames: int = FRAMES, depth: int = 2, image_seed: int = 1) -> Curriculum:
-    """A surjective graph whose goal changes unannounced after as many episodes as it has end states: search, then repeat.
+    """A surjective graph whose goal changes after as many episodes as it has end states: search, then repeat.
 
-    Section 4.1 of the paper reports of Ben-Iwhiwhu et al. 2020 such graphs of depth 2 and 3, where RL^2 "failed to solve
-    all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the end states one after the other,
+    The changes are unannounced. Section 4.2 of the paper reports of Ben-Iwhiwhu et al. 2020 such graphs of depth 2 and
+    3, where RL^2 "failed to solve all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the end states one after the other,
     so its success in episode i of a trial is min(1, i/n). Later goals are drawn uniformly; rows begin with all equally.
 
     Args:

@@ -199,7 +199,8 @@ def _packed(tables: Tables) -> Tensor:
     extra = torch.zeros(count) if tree.extra_end_step is None else tree.extra_end_step
     reward_fn = torch.tensor([KERNEL_REWARDS.index(type(fn)) for fn in tables.uses.reward_fns])[g.reward_fn]
     legacy = torch.ones_like(x.num_ids) if x.legacy is None else x.legacy.num_ids
-    plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra]
+    none = torch.full_like(tree.first_leaf, -1)
+    plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra, *(tree.swap or (none, none, none))]
     plain += [x.num_views, x.num_angles, x.read_noise, x.reward_cue, x.cue_wraps, x.cue_element, x.noise_start]
     plain += [_bits(x.white), g.depth, g.num_leaves, reward_fn, g.multiplicative]
     plain += [g.change_first, g.change_last, g.legacy_change]

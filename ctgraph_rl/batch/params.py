@@ -15,7 +15,7 @@ from ctgraph_rl.core.graph import MAX_STATES, StateType
 from ctgraph_rl.core.rewards import RewardFn
 from ctgraph_rl.core.rotation import taps_of
 from ctgraph_rl.core.row_params import LegacyIndex, ObservationParams, RewardParams, Uses
-from ctgraph_rl.core.tree import TreeParams, tree_params
+from ctgraph_rl.core.tree import Swap, TreeParams, tree_params
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
@@ -91,7 +91,14 @@ def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
         first_leaf=each([graph.num_decision_states for graph in graphs]),
         stay_below=each([int(graph.wait_prob * 2**63) for graph in graphs]),
         extra_end_step=each(extra, torch.bool) if any(extra) else None,
+        swap=_swap(tasks, each) if any(task.swapped_branches for task in tasks) else None,
     )
+
+
+def _swap(tasks: tuple[Task, ...], each: MakeTensor) -> Swap:
+    pairs = [task.swapped_branches or ((), (0, 0)) for task in tasks]
+    nodes = [-1 if task.swapped_node is None else task.swapped_node for task in tasks]
+    return Swap(each(nodes), each([first for _, (first, _) in pairs]), each([second for _, (_, second) in pairs]))
 
 
 def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -> ObservationParams:
@@ -236,7 +243,7 @@ def _of_rows(part: Any, index: Tensor) -> Any:
     """Return parameters of rows from those of their tasks; what is a table of all tasks stays one."""
     rows = {}
     for name, value in part._asdict().items():
-        if isinstance(value, LegacyIndex):
+        if isinstance(value, (LegacyIndex, Swap)):
             rows[name] = _of_rows(value, index)
         elif isinstance(value, Tensor) and name not in _TABLES[type(part)]:
             rows[name] = value.index_select(0, index)
@@ -245,6 +252,7 @@ def _of_rows(part: Any, index: Tensor) -> Any:
 
 _TABLES: dict[type, tuple[str, ...]] = {
     TreeParams: ("next_kind", "decides"),
+    Swap: (),
     ObservationParams: ("first_view", "views_per_node", "num_ids"),
     LegacyIndex: ("num_ids",),
     RewardParams: (),

@@ -61,7 +61,8 @@ def render(
     The goal has a star below it; the way so far is a thick dark line, and the current state has a black outline. On
     failure the outline is around the fail mark, top right, and a cross is where it happened: at a decision state, which
     stands for the wait state before it too, or at the wait state before an end. Of a tree too large for the width only
-    the paths to the current node and to the goal are drawn, with stubs for other branches.
+    the paths to the current node and to the goal are drawn, with stubs for other branches. A small cross marks
+    a decision state with swapped branches.
 
     Args:
         tasks: the rows' tasks, N in all.
@@ -87,7 +88,7 @@ def render(
     _show(pictures[:, :, :size], observation.detach().cpu().numpy())
     states = zip(state_type.tolist(), node.tolist(), goal_leaf.tolist(), strict=True)
     for picture, task, state in zip(pictures, tasks, states, strict=True):
-        picture[:, size:] = _to_rgb(_draw_row(task.graph, *state, size))
+        picture[:, size:] = _to_rgb(_draw_row(task, *state, size))
     return torch.from_numpy(pictures)
 
 
@@ -115,9 +116,10 @@ def _grid(vectors: Pixels) -> Pixels:
     return grid.reshape(n, -1, columns)
 
 
-def _draw_row(graph: CTGraph, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
+def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
     """The right half of a row's picture in palette numbers."""
-    first_leaf, unit = graph.num_decision_states, size / 192
+    graph, unit, swapped = task.graph, size / 192, task.swapped_node
+    first_leaf = graph.num_decision_states
     goal, whole = first_leaf + goal_leaf, graph.num_end_states <= size // LEAF_WIDTH
     base, marks, waits = _picture(graph, size, () if whole else (node, goal))
     canvas, failed = base.copy(), kind == StateType.FAIL
@@ -126,6 +128,8 @@ def _draw_row(graph: CTGraph, kind: int, node: int, goal_leaf: int, size: int) -
     way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
     _lines(canvas, list(pairwise([*way, place])), 2 * unit, WAY)
     _star(canvas, marks[goal], unit)
+    if swapped is not None and swapped in marks:
+        _lines(canvas, _cross(marks[swapped], 0.6 * marks[swapped].radius), unit, OUTLINE)
     if failed:
         _lines(canvas, _cross(place, place.radius + 2.5 * unit), 2 * unit, kind)
     x, y, radius = marks[FAIL_KEY] if failed else place

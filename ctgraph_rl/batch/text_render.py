@@ -31,11 +31,19 @@ def as_text(tasks: Sequence[Task], state: RowState, observation: Tensor, white: 
 
 
 def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) -> str:
-    """Return where a row is: ``wait state after 1 2, step 4, goal 1 1``."""
+    """Return where a row is, by branches: ``wait state after 1 2, step 4, goal 1 1``; and what is swapped."""
     graph = task.graph
     goal, way = (" ".join(map(str, graph.path(at))) for at in (graph.num_decision_states + goal_leaf, node))
     place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
-    return f"{place}, step {step_count}, goal {goal}"
+    return f"{place}, step {step_count}, goal {goal}{_swap(task)}"
+
+
+def _swap(task: Task) -> str:
+    if task.swapped_branches is None:
+        return ""
+    path, (first, second) = task.swapped_branches
+    at = f"after {' '.join(map(str, path))}" if path else "at the first decision"
+    return f", {first} and {second} swapped {at}"
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:

@@ -19,7 +19,7 @@ enum { BLOCK = 64, NUMBERS = 64 };
 
 /* One of the different tasks, in the order of `native._packed`; every field has eight bytes. */
 typedef struct {
-    int64_t branching_factor, first_leaf, stay_below, extra_end_step;
+    int64_t branching_factor, first_leaf, stay_below, extra_end_step, swap_node, swap_first, swap_second;
     int64_t num_views, num_angles, read_noise, reward_cue, cue_wraps, cue_element, noise_start;
     double white;
     int64_t depth, num_leaves, reward_fn, multiplicative, change_first, change_last, legacy_change;
@@ -64,6 +64,7 @@ typedef struct {
     int count;
     const Task *task[BLOCK];
     int64_t branching_factor[BLOCK], first_leaf[BLOCK], stay_below[BLOCK], extra_end_step[BLOCK];
+    int64_t swap_node[BLOCK], swap_first[BLOCK], swap_second[BLOCK];
     uint64_t seed[BLOCK], number[BLOCK];
     int64_t kind[BLOCK], node[BLOCK], tick[BLOCK], step_count[BLOCK], goal_leaf[BLOCK], episodes_left[BLOCK];
     float episode_reward[BLOCK], reward[BLOCK], paid[BLOCK];
@@ -159,7 +160,9 @@ static void go(Block *block, const int64_t *action, int64_t pays_failure)
         int64_t decides = (kind == DECISION) & (a > 0) & (a <= b);
         next = decides ? WAIT : next;
         next = kind == END ? (block->extra_end_step[j] ? HOME : END) : next;
-        block->node[j] = decides ? node * b + a : node;
+        int64_t first = block->swap_first[j], second = block->swap_second[j];
+        int64_t swaps = (node == block->swap_node[j]) & ((a == first) | (a == second));
+        block->node[j] = decides ? node * b + (swaps ? first + second - a : a) : node;
         block->kind[j] = next;
         block->pays[j] = (next != kind) & ((next == END) | ((next == FAIL) & pays_failure));
     }
@@ -356,6 +359,9 @@ static int load(const Call *call, Block *block, int64_t first)
         block->branching_factor[j] = block->task[j]->branching_factor;
         block->first_leaf[j] = block->task[j]->first_leaf;
         block->stay_below[j] = block->task[j]->stay_below;
+        block->swap_node[j] = block->task[j]->swap_node;
+        block->swap_first[j] = block->task[j]->swap_first;
+        block->swap_second[j] = block->task[j]->swap_second;
         block->extra_end_step[j] = block->task[j]->extra_end_step;
         block->seed[j] = call->seed[call->own_seeds ? i : 0];
         block->kind[j] = from->kind[i];

@@ -42,6 +42,14 @@ class State(NamedTuple):
     node: Tensor  # int64
 
 
+class Swap(NamedTuple):
+    """Two decisions of one decision state of each row's tree that lead to each other's branch; int64."""
+
+    node: Tensor  # the decision state; -1 for none
+    first: Tensor  # a decision
+    second: Tensor  # another one
+
+
 class TreeParams(NamedTuple):
     """What the transition needs to know of each row's task; int64 if not said. `tree_params` makes it."""
 
@@ -54,10 +62,15 @@ class TreeParams(NamedTuple):
     decides: Tensor  # bool table: the move is a decision
     width: int  # of the tables: actions -1 to the largest b + 1; what is beyond counts as one of these
     by_action: bool  # else the tables are of b = 1, for which 1 is any decision, and 2 any action above b
+    swap: Swap | None = None  # None for no row
 
 
 def tree_params(
-    branching_factor: Tensor, first_leaf: Tensor, stay_below: Tensor, extra_end_step: Tensor | None = None
+    branching_factor: Tensor,
+    first_leaf: Tensor,
+    stay_below: Tensor,
+    extra_end_step: Tensor | None = None,
+    swap: Swap | None = None,
 ) -> TreeParams:
     """The parameters of trees, with tables of the moves of each different one."""
     extra = torch.zeros_like(branching_factor) if extra_end_step is None else extra_end_step.long()
@@ -80,6 +93,7 @@ def tree_params(
         decides=decides.flatten(),
         width=last_action + 2,
         by_action=by_action,
+        swap=swap,
     )
 
 
@@ -132,7 +146,16 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
     next_kind, decides = _look_up(tree.next_kind, move), _look_up(tree.decides, move)
     if tree.extra_end_step is not None:
         next_kind = next_kind.masked_fill((kind == _HOME) & (node > 0), _HOME)
-    return State(next_kind, torch.where(decides, node * tree.branching_factor + action, node))
+    branch = branch_of(node, action, tree.swap)
+    return State(next_kind, torch.where(decides, node * tree.branching_factor + branch, node))
+
+
+def branch_of(node: Tensor, decision: Tensor, swap: Swap | None) -> Tensor:
+    """Return the branch, in 1..b, that a decision leads to; as well the decision that leads to a branch."""
+    if swap is None:
+        return decision
+    swapped = (node == swap.node) & ((decision == swap.first) | (decision == swap.second))
+    return torch.where(swapped, swap.first + swap.second - decision, decision)
 
 
 def _look_up(table: Tensor, index: Tensor) -> Tensor:

@@ -240,6 +240,7 @@ def _expressible(task: Task) -> list[tuple[bool, str]]:
         (task.reward_fn in _DISTRIBUTIONS.values(), f"reward_fn={task.reward_fn!r}: use Needle or ReferenceLinear"),
         (task.step_reward == 0, f"step_reward={task.step_reward}: use 0"),
         (scales, f"reward_noise={task.reward_noise!r}: use 'multiplicative'"),
+        (task.swapped_branches is None, f"swapped_branches={task.swapped_branches}: use None"),
         (task.extra_end_step, "extra_end_step=False: use True"),
         (task.goal_change is None or task.legacy_goal_change, "legacy_goal_change=False with a goal_change: use True"),
         (x.home_ids == (0, 0), f"home_ids={x.home_ids}: use (0, 0)"),

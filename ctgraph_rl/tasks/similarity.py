@@ -1,7 +1,7 @@
 """Similarity of tasks: exact measures of goals, optimal actions, images and graphs, as matrices.
 
-All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the decisions that lead to them, in
-the *common tree*: decisions and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
+All measures are shares in [0, 1] and symmetric. States of two graphs are matched by the branches that lead to them, in
+the *common tree*: branches and depth up to the smaller of both. *Optimal* is what maximises the expected discounted
 return; actions are as those of an environment with all tasks, where one above a task's branching factor fails. Where
 nothing is at stake, such as off the way to a needle that costs nothing to miss, all actions are optimal.
 
@@ -49,7 +49,7 @@ def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     """
 
     def share(one: Task, other: Task) -> float:
-        pairs = list(zip(one.goal, other.goal, strict=False))
+        pairs = list(zip(one.goal_decisions, other.goal_decisions, strict=False))
         return next((k for k, (a, b) in enumerate(pairs) if a != b), len(pairs)) / len(pairs)
 
     return _matrix(_tasks(tasks), share)
@@ -110,12 +110,13 @@ def graph_containment(tasks: Sequence[Task]) -> Tensor:
     """Share of the smaller graph's decision states that the larger graph has too; float64 [T, T].
 
     1 where the larger has at least the depth and the branching factor of the smaller one, whatever their wait
-    probabilities.
+    probabilities. A decision state whose branches are swapped in one of the two tasks is not the same in both.
     """
 
     def share(one: Task, other: Task) -> float:
         smaller = min(task.graph.num_decision_states for task in (one, other))
-        return _common(one, other).num_decision_states / smaller
+        common = _common(one, other)
+        return (common.num_decision_states - _num_rewired(one, other, common)) / smaller
 
     return _matrix(_tasks(tasks), share)
 
@@ -141,6 +142,14 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
         for j, other in enumerate(items[: i + 1]):
             matrix[i, j] = matrix[j, i] = share(one, other)
     return matrix
+
+
+def _num_rewired(one: Task, other: Task, common: CTGraph) -> int:
+    """Return how many decision states of the common tree lead elsewhere in one of two tasks than in the other."""
+    swaps, b = {one.swapped_branches, other.swapped_branches}, common.branching_factor
+    differing = [swap for swap in swaps if swap is not None] if len(swaps) > 1 else []
+    inside = [path for path, (first, _) in differing if len(path) < common.depth and max((*path, first)) <= b]
+    return len(set(inside))
 
 
 def _common(one: Task, other: Task) -> CTGraph:

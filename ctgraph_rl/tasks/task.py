@@ -35,7 +35,8 @@ class Task:
 
     Args:
         graph: shape of the tree, <b, d, p>.
-        goal: the decisions that lead to the goal, d integers in 1..b.
+        goal: the branches that lead to the goal, d integers in 1..b; they are the decisions to take, but for
+            ``swapped_branches``.
         observations: which id each state shows, X.
         images: what is behind the ids, O.
         reward_fn: the share of ``goal_reward`` that each end state pays, g.
@@ -50,6 +51,9 @@ class Task:
         extra_end_step: end as the authors' implementation does: an end state takes one more action, any one, and the
             last observation of the episode is one of the home state. The reward still comes on entering the end state.
         legacy_goal_change: count as the authors' implementation does: the first goal lasts one episode less than drawn.
+        swapped_branches: (path, (first, second)): at the decision state behind the branches of ``path``, () for the
+            first one, the decisions ``first`` < ``second`` lead to each other's branch. All states keep their places,
+            images and rewards, so that two tasks differ in one transition. None: every decision leads to its branch.
 
     Raises:
         ValueError: names every field that breaks a rule.
@@ -68,11 +72,13 @@ class Task:
     goal_change: tuple[int, int] | None = None
     extra_end_step: bool = False
     legacy_goal_change: bool = False
+    swapped_branches: tuple[tuple[int, ...], tuple[int, int]] | None = field(default=None, metadata={"added": True})
 
     def __post_init__(self) -> None:
         self._check_parts()
         object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
+        object.__setattr__(self, "swapped_branches", _nested(self.swapped_branches))
         one_hot = len(self.images.shape) == 1
         x = self.observations
         varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
@@ -80,6 +86,7 @@ class Task:
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
             self._goal_rule(),
+            self._swap_rule(),
             *self.observations.rules(self.graph),
             (last_id < room, too_few),
             (
@@ -173,6 +180,32 @@ class Task:
             message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
 
+    def _swap_rule(self) -> tuple[bool, str]:
+        (b, d), swap = (self.graph.branching_factor, self.graph.depth), self.swapped_branches
+        pairs = isinstance(swap, tuple) and len(swap) == 2 and all(isinstance(part, tuple) for part in swap)
+        in_range = pairs and all(is_int(branch, 1, b) for part in swap or () for branch in part)
+        holds = in_range and swap is not None and len(swap[0]) < d and len(swap[1]) == 2 and swap[1][0] < swap[1][1]
+        rule = f"(path, (first, second)): fewer than {d} branches, and two of that decision state with first < second"
+        return swap is None or holds, f"swapped_branches must be {rule}, in 1..{b}, such as ((), (1, 2)), got {swap!r}"
+
+    @property
+    def swapped_node(self) -> int | None:
+        """Heap index of the decision state with swapped branches, None without."""
+        return None if self.swapped_branches is None else self.graph.node_at(self.swapped_branches[0])
+
+    def decision_to(self, node: int) -> int:
+        """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
+        branch, swap = self.graph.decision(node), self.swapped_branches
+        if swap is None or self.graph.parent(node) != self.swapped_node or branch not in swap[1]:
+            return branch
+        return sum(swap[1]) - branch
+
+    @property
+    def goal_decisions(self) -> tuple[int, ...]:
+        """The d decisions that lead to the goal: its branches, unless one of them is swapped."""
+        nodes = self.graph.nodes_to(self.graph.node_at(self.goal))
+        return tuple(map(self.decision_to, nodes[1:]))
+
     @property
     def goal_leaf(self) -> int:
         """Number of the end state with the goal: its base-b digits are the decisions, the first one leading."""
@@ -223,7 +256,22 @@ class Task:
             "branching_factor": f"b{self.graph.branching_factor}",
             "wait_prob": f"p{self.graph.wait_prob:g}",
             "images": images,
+            "swapped_branches": _swap_label(self.swapped_branches),
         }
+
+
+def _nested(value: object) -> object:
+    """A list-like value of list-like values as a tuple of tuples; anything else unchanged."""
+    outer = as_tuple(value)
+    return tuple(map(as_tuple, outer)) if isinstance(outer, tuple) else outer
+
+
+def _swap_label(swap: tuple[tuple[int, ...], tuple[int, int]] | None) -> str:
+    """Return ``swap1.2at2`` for the branches 1 and 2 of the decision state behind branch 2."""
+    if swap is None:
+        return "noswap"
+    path, pair = (".".join(map(str, part)) for part in swap)
+    return f"swap{pair}" + (f"at{path}" if path else "")
 
 
 def _reward_rule(name: str, value: object) -> tuple[bool, str]:

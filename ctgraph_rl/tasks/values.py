@@ -94,7 +94,7 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
 
     Exact for needles with goal_reward > 0, fail_reward <= 0 and step_reward = 0. No way on is then worse than failing,
     so waiting at wait states and deciding at decision states loses nothing, whether wait ids are unique or not. What is
-    left is the choice of decisions; with c_a the number of times that the goal takes decision a:
+    left is the choice of decisions; with c_a the number of times that the way to the goal takes decision a:
 
     - unique decisions: every decision can be the right one; goal_reward.
     - stochastic: decisions are drawn with the same probabilities q at every decision state, drawn ids or not, and
@@ -114,7 +114,7 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     require(*_ceiling_rules(task))
     if task.observations.unique_decisions:
         return task.goal_reward
-    counts = list(Counter(task.goal).values())
+    counts = list(Counter(task.goal_decisions).values())
     first, last = task.observations.decision_ids
     shares = _divided(last - first + 1, counts) if deterministic else [count / task.graph.depth for count in counts]
     return task.goal_reward * math.prod(share**count for share, count in zip(shares, counts, strict=True))
@@ -245,7 +245,14 @@ class _EveryNode:
 
     def children(self, values: Tensor, level: int) -> Tensor:
         """Values of level + 1 by parent and decision: float64 [b^level, b]."""
-        return values.view(-1, self.task.graph.branching_factor)
+        by_branch = values.view(-1, self.task.graph.branching_factor)
+        swap, node = self.task.swapped_branches, self.task.swapped_node
+        if swap is None or node is None or len(swap[0]) != level:
+            return by_branch
+        by_decision, (first, second) = by_branch.clone(), (branch - 1 for branch in swap[1])
+        number = node - self.task.graph.first_node(level)
+        by_decision[number, [first, second]] = by_branch[number, [second, first]]
+        return by_decision
 
 
 @dataclass(frozen=True)
@@ -261,7 +268,7 @@ class _GoalPath:
     def children(self, values: Tensor, level: int) -> Tensor:
         """Values of level + 1 by parent and decision: float64 [2, b]."""
         children = values[1].repeat(2, self.task.graph.branching_factor)
-        children[0, self.task.goal[level] - 1] = values[0]
+        children[0, self.task.goal_decisions[level] - 1] = values[0]
         return children
 
 

@@ -42,7 +42,7 @@ def _statements(task: Task, name: str) -> Iterator[str]:
         rings = {"peripheries": "2"} if state == (END, goal) else {}
         text = drawn.ids_text(task, state, layout.level[node])
         yield _attributes(_name(state), label=text, shape=SHAPES[kind], fillcolor=colour(kind), **rings)
-    for start, end, action in drawn.edges(layout):
+    for start, end, action in drawn.edges(task, layout):
         yield _attributes(f"{_name(start)} -> {_name(end)}", label="any" if start == HOME_KEY else str(action))
     for state in drawn.states(layout):
         if state[0] == WAIT and p > 0:

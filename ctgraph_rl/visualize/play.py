@@ -23,9 +23,10 @@ from rich.tree import Tree
 
 from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
-from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.tasks.images import white_level
+from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.player import Player
@@ -125,18 +126,19 @@ class Game:
     def truth(self) -> Tree:
         """The tree, with the goal and where the player is."""
         env = self.player.env
-        return truth(self.graph, StateType(int(env.state_type)), int(env.node), int(env.goal_leaf))
+        return truth(self.player.task, StateType(int(env.state_type)), int(env.node), int(env.goal_leaf))
 
 
-def truth(graph: CTGraph, kind: StateType, place: int, goal_leaf: int) -> Tree:
+def truth(task: Task, kind: StateType, place: int, goal_leaf: int) -> Tree:
     """A tree as text, with the goal and a place in it; of a large one the paths to both.
 
     Args:
-        graph: the tree.
+        task: whose tree it is.
         kind: the type of the state at the place.
         place: its node.
         goal_leaf: the number of the end state with the goal.
     """
+    graph = task.graph
     goal, below = graph.num_decision_states + goal_leaf, place
     while below < graph.num_decision_states:
         below = graph.branching_factor * below + 1
@@ -144,7 +146,7 @@ def truth(graph: CTGraph, kind: StateType, place: int, goal_leaf: int) -> Tree:
     root = Tree(Text("home" + (_here(kind) if kind == StateType.HOME else "")))
     drawn: dict[int, Tree] = {}
     for node in layout.x:
-        label = f"{graph.decision(node)}: " if node else ""
+        label = f"{task.decision_to(node)}: " if node else ""
         label += f"{kind_of(layout, node).name.lower()} state" + (", the goal" if node == goal else "")
         at_node = node == place and kind != StateType.HOME
         above = drawn[graph.parent(node)] if node else root

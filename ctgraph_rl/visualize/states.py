@@ -45,12 +45,12 @@ def states(layout: Layout, waits: bool = True) -> Iterator[Key]:
         yield kind_of(layout, node), node
 
 
-def edges(layout: Layout, waits: bool = True) -> Iterator[Edge]:
-    """All transitions between them; without wait states, to what these lead to."""
+def edges(task: Task, layout: Layout, waits: bool = True) -> Iterator[Edge]:
+    """All transitions of a task between them; without wait states, to what these lead to."""
     for node in layout.x:
         here = kind_of(layout, node), node
         above = (DECISION, layout.graph.parent(node)) if node else HOME_KEY
-        action = layout.graph.decision(node) if node else None
+        action = task.decision_to(node) if node else None
         yield Edge(above, (WAIT, node) if waits else here, action)
         if waits:
             yield Edge((WAIT, node), here, WAIT_ACTION)

@@ -132,7 +132,7 @@ class _TaskPicture:
         return f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
 
     def _draw_edges(self) -> None:
-        found = list(drawn.edges(self.layout, self.waits))
+        found = list(drawn.edges(self.task, self.layout, self.waits))
         lines = [[self.places[edge.start], self.places[edge.end]] for edge in found]
         strong = [self._is_strong(edge) for edge in found]
         widths = [self._width(edge) for edge in found]

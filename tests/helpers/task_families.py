@@ -161,6 +161,11 @@ FAMILIES = {
     "one-hot": [one_hot(p=0.5)],
     "reference": [Task.from_json(FILE, goal=(1, 2))],
     "mixed": MIXED,
+    "swapped": [
+        replace(fully_observable(3, 2, 0.5), swapped_branches=((2,), (1, 3))),
+        replace(surjective(2, 3, 0.2, goal=(1, 2, 2)), swapped_branches=((), (1, 2)), reward_fn=Gradient()),
+        surjective(2, 2),
+    ],
 }
 
 

@@ -66,17 +66,17 @@ def test_decisions_are_written_short(way, sign, text):
 
 
 def test_every_state_and_transition_of_a_graph_is_there():
-    graph = CTGraph(3, 2)
-    layout = lay_out(graph, [4])
+    task = make_task(branching_factor=3, depth=2)
+    graph, layout = task.graph, lay_out(task.graph, [4])
 
-    found, moves = list(states(layout)), list(edges(layout))
+    found, moves = list(states(layout)), list(edges(task, layout))
 
     assert len(found) == len(set(found)) == graph.num_states - 1  # fail aside
     assert len(moves) == 1 + 2 * graph.num_wait_states - 1  # into and out of each wait state
     assert {end for _, end, _ in moves} == set(found) - {(HOME, 0)}
     assert {Edge((HOME, 0), (WAIT, 0), None), Edge((WAIT, 0), (DECISION, 0), 0)} <= set(moves)
     assert {Edge((DECISION, 1), (WAIT, 6), 3), Edge((WAIT, 6), (END, 6), 0)} <= set(moves)
-    assert Edge((DECISION, 0), (DECISION, 2), 2) in set(edges(layout, waits=False))
+    assert Edge((DECISION, 0), (DECISION, 2), 2) in set(edges(task, layout, waits=False))
 
 
 @pytest.mark.parametrize("legacy", [False, True])

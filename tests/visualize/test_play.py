@@ -13,9 +13,9 @@ import pytest
 from rich.console import Console
 
 from ctgraph_rl import cli
-from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.policies import OptimalPolicy
-from ctgraph_rl.tasks.configurations import ct_fo_b1
+from ctgraph_rl.tasks.configurations import ct_fo_b1, make_task
 from ctgraph_rl.visualize.play import SHADES, Game, has_colours, keyboard, main, picture, truth
 from ctgraph_rl.visualize.player import Player
 
@@ -87,24 +87,32 @@ def test_nothing_tells_the_state_but_the_question_mark(play):
 
     assert not re.search(r"you are here|you wait|home\n", hidden)
     assert "1: decision state  <- you are here" in told
-    assert told.replace("\n".join(lines_of(truth(CTGraph(2, 2), StateType.DECISION, 1, 0))) + "\n", "") == hidden
+    assert (
+        told.replace(
+            "\n".join(lines_of(truth(make_task(branching_factor=2, depth=2), StateType.DECISION, 1, 0))) + "\n", ""
+        )
+        == hidden
+    )
 
 
 def test_the_truth_is_the_tree_with_goal_and_position():
-    assert lines_of(truth(CTGraph(2, 1), StateType.WAIT, 2, 0)) == [
+    assert lines_of(truth(make_task(branching_factor=2, depth=1), StateType.WAIT, 2, 0)) == [
         "home",
         "└── decision state",
         "    ├── 1: end state, the goal",
         "    └── 2: end state  <- you wait before it",
     ]
-    assert lines_of(truth(CTGraph(2, 1), StateType.HOME, 0, 1))[0] == "home  <- you are here"
-    assert "1: end state, the goal  <- you failed here" in lines_of(truth(CTGraph(2, 1), StateType.FAIL, 1, 0))[2]
+    assert lines_of(truth(make_task(branching_factor=2, depth=1), StateType.HOME, 0, 1))[0] == "home  <- you are here"
+    assert (
+        "1: end state, the goal  <- you failed here"
+        in lines_of(truth(make_task(branching_factor=2, depth=1), StateType.FAIL, 1, 0))[2]
+    )
 
 
 def test_the_truth_of_a_large_tree_is_short():
-    graph = CTGraph(1000, 4)
+    task = make_task(branching_factor=1000, depth=4, fully_observable=False)
 
-    lines = lines_of(truth(graph, StateType.DECISION, 5, 10**12 - 1))
+    lines = lines_of(truth(task, StateType.DECISION, 5, 10**12 - 1))
 
     assert len(lines) == 1 + 1 + 4 + 4 + 7  # home, root, two ways, what is left out
     assert sum("the goal" in line for line in lines) == sum("you are here" in line for line in lines) == 1
