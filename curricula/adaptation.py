@@ -62,10 +62,10 @@ def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 2
 def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:
     """Two depth-2 graphs that differ in one transition, without notice: a change of task that is hard to detect.
 
-    Section 4.2 of the CT-graph paper: the graphs "had a single variation in the transition matrix". No configuration was
-    published. Here all wait states show one observation and all decision states another, as in CT-SU-B1, and each end
-    state has its own, so that the change is seen. In the second task the branches behind the first one are swapped: the
-    same goal is reached by the decisions (1, 2) instead of (1, 1).
+    Section 4.2 of the CT-graph paper: the graphs "had a single variation in the transition matrix". No configuration
+    was published. Here all wait states show one observation and all decision states another, as in CT-SU-B1, and each
+    end state has its own, so that the change is seen. In the second task the branches behind the first one are swapped:
+    the same goal is reached by the decisions (1, 2) instead of (1, 1).
 
     Args:
         num_frames: frames per task.

@@ -216,8 +216,9 @@ def changing_goals(num_frames: int = FRAMES, depth: int = 2, image_seed: int = 1
     """A surjective graph whose goal changes after as many episodes as it has end states: search, then repeat.
 
     The changes are unannounced. Section 4.2 of the paper reports of Ben-Iwhiwhu et al. 2020 such graphs of depth 2 and
-    3, where RL^2 "failed to solve all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the end states one after the other,
-    so its success in episode i of a trial is min(1, i/n). Later goals are drawn uniformly; rows begin with all equally.
+    3, where RL^2 "failed to solve all tasks". A trial is n = 2^depth episodes with one goal. The best policy tries the
+    end states one after the other, so its success in episode i of a trial is min(1, i/n). Later goals are drawn
+    uniformly; rows begin with all equally.
 
     Args:
         num_frames: frames of all rows together.

@@ -217,7 +217,7 @@ MISSING = (
     Missing(
         "context detection, 2020",
         "Dick et al., Frontiers in Neurorobotics: a pair of depth-2 graphs that differ in one transition",
-        "no CT-graph configuration was published",
+        "no CT-graph configuration was published; dick2020_pair is rebuilt from the words of the paper",
     ),
     Missing(
         "the confounding graphs of MOHQA",
