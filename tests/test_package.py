@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -58,6 +59,8 @@ def test_the_wheel_declares_version_licence_and_console_script(wheel):
 
     assert (metadata["Name"], metadata["Version"]) == ("ctgraph_rl", ctgraph_rl.__version__)
     assert metadata["License-Expression"] == "Apache-2.0"
+    assert not re.search(r"\]\((?!https?:|#)", metadata.get_payload()), "a package index resolves no relative link"
+    assert metadata.get_payload().startswith("# ctgraph_rl\n")
     assert dict(scripts["console_scripts"]) == {"ctgraph-rl": "ctgraph_rl.cli:main"}
 
 
