@@ -35,7 +35,27 @@ def test_each_seed_of_the_main_job_knows_the_goal_of_the_last_block_alone(make):
     assert sorted(of) == [(seed, block) for seed in "01234" for block in "01234"]
     for (_, block), lines in of.items():
         assert [float(line["return_mean"]) for line in lines] == [float(task == int(block)) for task in (1, 2, 3, 4)]
-    assert "Mean return over 100 greedy episodes, the same for all of five seeds." in README
+    assert (
+        "LSTM-PPO learns four goals, one after the other, and forgets each in the next block (mean over five seeds)"
+        in README
+    )
+
+
+def test_readme_says_how_many_seeds_solve_depth_5(make):
+    ladder = make.groups(make.read("depth_ladder"), "agent", "depth")
+    solved = {agent: [float(line["greedy_success"]) for line in ladder[agent, "5"]] for agent in ("ppo", "ppo_count")}
+    (deepest,) = {(line["configuration"], line["frames"]) for line in ladder["ppo", "5"]}
+
+    assert (solved, deepest) == ({"ppo": [0.0] * 5, "ppo_count": [1.0] * 5}, ("single_task", "102400"))
+    assert (
+        "At depth 5, with 102,400 frames, PPO solves its task in 0 of 5 seeds, and with a count-based bonus in 5 of 5"
+        in README
+    )
+    assert (
+        "a linear combination of masks solves all eight tasks in 5 of 5 seeds; PPO alone solves depth 5 in 3 of 5"
+        in README
+    )
+    assert "both of depth 5 in three of five" in LIFELONG and "Mask LC solves all eight tasks in every seed" in LIFELONG
 
 
 def test_a2c_on_fo_b2_learns_one_goal_in_some_seeds_and_meets_the_other(make):
