@@ -1,4 +1,4 @@
-"""Makes main_job.png beside this file, README's first figure: the tree of CT-SU-B1 and the main job's performance matrix."""
+"""Makes main_job.png, README's first figure: the tree of CT-SU-B1 beside the performance matrix of the main job."""
 
 from __future__ import annotations
 

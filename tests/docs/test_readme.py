@@ -6,6 +6,8 @@ from typing import Any
 import pytest
 from helpers.paths import CHECKOUT
 
+import curricula
+
 README = CHECKOUT / "README.md"
 
 
@@ -22,8 +24,11 @@ def test_the_python_in_readme_runs_in_its_order_and_prints_what_it_says(capsys):
     assert names["recorder"].metrics["average_performance"].value is not None
 
 
-def test_readme_is_short():
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
+def test_readme_is_short_and_counts_the_curricula():
+    text = README.read_text(encoding="utf-8")
+
+    assert len(text.splitlines()) <= 120
+    assert f"{len(curricula.names())} named, versioned curricula" in text
 
 
 def test_every_example_with_stable_baselines3_sets_one_thread():
