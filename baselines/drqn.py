@@ -13,7 +13,7 @@ from baselines.recurrent_q import RecurrentQ
 class DRQN(RecurrentQ):
     """Deep recurrent Q-learning; the arguments are those of `RecurrentQ`."""
 
-    solves = "partially observable tasks too, where an episode is short enough to remember"
+    solves = "partially observable tasks too, if episodes are short enough to remember"
 
     def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Compute the squared error of the value."""

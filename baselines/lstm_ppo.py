@@ -13,4 +13,4 @@ class LSTMPPO(PPO):
     """PPO with an LSTM before the heads; the arguments are those of `PPO`."""
 
     memory = True
-    solves = "partially observable tasks too, where an episode is short enough to remember"
+    solves = "partially observable tasks too, if episodes are short enough to remember"

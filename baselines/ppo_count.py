@@ -55,7 +55,7 @@ class PPOCount(PPO):
         settings: the arguments of `PPO`.
     """
 
-    solves = "fully observable tasks (CT-FO) whose goal random actions hardly ever reach"
+    solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
 
     def __init__(
         self,

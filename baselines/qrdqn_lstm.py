@@ -25,7 +25,7 @@ class QRDQNLSTM(RecurrentQ):
         settings: the arguments of `RecurrentQ`.
     """
 
-    solves = "partially observable tasks too, where an episode is short enough to remember"
+    solves = "partially observable tasks too, if episodes are short enough to remember"
 
     def __init__(
         self, observation_spec: Composite, action_spec: TensorSpec, num_quantiles: int, **settings: Any

@@ -78,7 +78,7 @@ class RL2(PPO):
     """
 
     memory = True
-    solves = "tasks whose goal changes after a number of episodes: it searches, then returns"
+    solves = "tasks whose goal changes after a number of episodes: it searches for the goal, then returns to it"
 
     def __init__(
         self, observation_spec: Composite, action_spec: TensorSpec, trial_episodes: int, **settings: Any

@@ -46,7 +46,7 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """Return the end of a message on a word that is none of the choices: the nearest one, or else all of them."""
+    """Return the end of a message about a word that is not among the choices: the nearest one, or else all."""
     choices = list(choices)
     near = nearest(word, choices)
     return f"did you mean {near!r}?" if near is not None else f"choices: {', '.join(choices) or 'none'}"

@@ -72,7 +72,7 @@ options:
 def main() -> None:
     """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; settings alone are for `ctgraph_rl.run`.
 
-    Ends quietly where nobody reads its output any more, as in ``ctgraph-rl results | head``.
+    Ends quietly if its output is no longer read, as in ``ctgraph-rl results | head``.
     """
     try:
         _call()

@@ -114,16 +114,16 @@ def _time(num_frames: int, frames_per_second: float | None) -> str:
 
 def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
     """Return a protocol in words."""
-    told = {
-        "hidden": "The learner is not told its task.",
+    ids = {
+        "hidden": "The learner does not observe its task.",
         "one_hot": f"Every observation comes with a one-hot task id of length {protocol.length(num_tasks)}.",
         "at_boundaries": "The learner is given the task's id where a block begins and where it is evaluated.",
     }
     boundaries = {
-        "announced": "A new block ends all episodes, and the learner is told.",
-        "hidden": "A row goes over to the next block when its episode ends, and nobody is told.",
+        "announced": "A new block ends all episodes and is announced.",
+        "hidden": "A row changes to the next block when its episode ends, without notice.",
     }
-    return f"{told[protocol.task_id]} {boundaries[protocol.boundaries]}"
+    return f"{ids[protocol.task_id]} {boundaries[protocol.boundaries]}"
 
 
 def evaluation_in_words(evaluation: Evaluation) -> str:

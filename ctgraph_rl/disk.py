@@ -23,7 +23,7 @@ PART = ".part"
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:
-    """Write a file so that whoever reads it, also after a crash, finds the old content or the new.
+    """Write a file so that a reader, also after a crash, finds the old content or the new.
 
     A link at its place is replaced, its target stays as it is.
 
@@ -53,7 +53,7 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool
 
 
 def is_writable(folder: Path | str) -> bool:
-    """Return whether files can be made in a folder; on a read-only file system nobody can."""
+    """Return whether files can be made in a folder; never on a read-only file system."""
     return os.access(folder, os.W_OK)
 
 
@@ -92,7 +92,7 @@ def cannot_write(path: Path, num_bytes: int, error: OSError) -> OSError:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder last: new, moved and removed ones; some file systems cannot and need not be told."""
+    """Make the names in a folder last: new, moved and removed ones; where a file system can sync folders."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -102,7 +102,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_folders(folder: Path) -> None:
-    """Make a folder and all above it last, whoever has made them."""
+    """Make a folder and all above it last."""
     for each in (folder.absolute(), *folder.absolute().parents):
         sync_folder(each)
 

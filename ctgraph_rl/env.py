@@ -126,7 +126,7 @@ class CTGraphEnv(EnvBase):
         self.rows.switch_tasks(tasks, switch, at_episode_end)
 
     def set_goals(self, goals: Iterable[Sequence[int]] | Tensor) -> None:
-        """Give every row a goal: see `Rows.set_goals`. The outcome is told by the goal at the end of an episode."""
+        """Give every row a goal: see `Rows.set_goals`. The outcome of an episode follows from the goal at its end."""
         self.rows.set_goals(goals)
 
     @property

@@ -1,4 +1,4 @@
-"""Reference policies that know the hidden state: what can be reached, and what luck gives.
+"""Reference policies that know the hidden state: what can be reached, and what random actions reach.
 
 Each is built on the environment that it acts in, takes the data of its rows and writes ``action``:
 ``env.rollout(100, OptimalPolicy(env))``, and ``evaluate(OptimalPolicy, tasks)``, which builds it on an environment of

@@ -112,7 +112,7 @@ def sequence(
         num_frames: frames of every block, or a list with those of each.
         version: raised when the content changes.
         source: where the sequence comes from.
-        protocol: what the learner is told; None: no task ids, announced boundaries.
+        protocol: what the learner knows of tasks; None: no task ids, announced boundaries.
         evaluation: how performance is measured; None: the defaults of `Evaluation`.
         switch: how rows change between the tasks of a block.
     """

@@ -156,7 +156,7 @@ def chosen(what: str, number: int, choices: Sequence[Any]) -> Any:
     """The choice of a number counted from 0.
 
     Raises:
-        ValueError: for a number that is none; names those that are.
+        ValueError: for a number that does not exist; lists those that do.
     """
     require((is_int(number, 0, len(choices) - 1), f"{what} must be in 0..{len(choices) - 1}, got {number!r}"))
     return choices[number]
@@ -232,7 +232,7 @@ MISSING = (
     Missing(
         "the goals of penn_a_swap",
         "which goals the authors' trials had",
-        "they were drawn anew in every generation; penn_a_swap draws by the same rule from a seed of its own",
+        "they were drawn again in every generation; penn_a_swap draws by the same rule from a seed of its own",
     ),
 )
 """Sequences that cannot be recovered, and why; nothing here is guessed."""

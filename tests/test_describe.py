@@ -1,4 +1,4 @@
-"""What is told of a curriculum before any run: closed forms against the environment's chain, words, tables, figures."""
+"""What is said of a curriculum before any run: closed forms against the environment's chain, words, tables, figures."""
 
 import builtins
 import math
@@ -71,12 +71,12 @@ def test_times_have_a_unit_that_fits(rate, time):
 
 
 def test_the_protocol_is_said_in_words():
-    announced = " A new block ends all episodes, and the learner is told."
+    announced = " A new block ends all episodes and is announced."
 
-    assert protocol_in_words(Protocol(), 4) == "The learner is not told its task." + announced
+    assert protocol_in_words(Protocol(), 4) == "The learner does not observe its task." + announced
     assert protocol_in_words(Protocol("one_hot", "hidden"), 4) == (
         "Every observation comes with a one-hot task id of length 4. "
-        "A row goes over to the next block when its episode ends, and nobody is told."
+        "A row changes to the next block when its episode ends, without notice."
     )
     assert "where a block begins and where it is evaluated" in protocol_in_words(Protocol("at_boundaries"), 4)
 

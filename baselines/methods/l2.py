@@ -1,4 +1,4 @@
-"""L2: all weights are held near their values at the end of the last task.
+"""L2: a penalty on changes of all weights since the end of the last task.
 
 The simplest baseline of Kirkpatrick et al. 2017 (arXiv 1612.00796), where EWC was compared with it.
 """

@@ -28,7 +28,7 @@ STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
     StateType.END: (0, 158, 115),
     StateType.FAIL: (213, 94, 0),
 }
-"""Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito: told apart with any colour vision."""
+"""Blue, sky blue, orange, bluish green and vermillion of Okabe and Ito: distinct with any colour vision."""
 
 BACKGROUND, EDGE, GOAL, OUTLINE, WAY = range(5, 10)
 EXTRA_COLOURS = (255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0)

@@ -29,7 +29,7 @@ T = TypeVar("T")
 class Rows(nn.Module):
     """A batch of CT-graphs without TorchRL or Gymnasium: one task, one random stream and one state per row.
 
-    ``state`` is replaced at every step and never written into, so whoever holds it keeps it. Its fields are buffers:
+    ``state`` is replaced at every step and never written into, so references to it stay valid. Its fields are buffers:
     they are in ``state_dict()`` and follow ``to()``.
 
     Args:

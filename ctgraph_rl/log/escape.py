@@ -1,6 +1,6 @@
 """Names, labels, sources, settings and reasons as text, whatever they hold: one function for each kind of output.
 
-They may be a stranger's. `terminal_text` also stands for HTML, where the template escapes what it gives, and for JSON,
+They may come from other people. `terminal_text` also serves HTML, where the template escapes what it gives, and JSON,
 whose own quoting is enough. What cannot be printed, such as escape sequences, marks of writing direction and halves of
 surrogate pairs, is shown as in Python, ``\\x1b``.
 """

@@ -80,7 +80,7 @@ def parsed(line: bytes) -> dict[str, Any]:
 
 
 def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
-    """Refuse a measurement that is none of ours.
+    """Refuse a measurement that this package did not write.
 
     Args:
         measurement: what `parsed` returned.

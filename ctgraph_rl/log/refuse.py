@@ -13,7 +13,7 @@ from ctgraph_rl.log.escape import terminal_lines
 def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
     """Turn an error of the user into the usage, one message and exit code 2.
 
-    A pipe that nobody reads any more is no such error.
+    A broken pipe is no such error.
     """
     try:
         yield

@@ -83,7 +83,7 @@ class RunLog:
 
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
-        """Go on writing a log from a `position`; the lines after it are removed.
+        """Resume writing a log from a `position`; the lines after it are removed.
 
         Raises:
             ValueError: if the file ends before it, or a line is no measurement.
@@ -270,7 +270,7 @@ class RunLog:
             labels: the name of each task; default: as its evaluations say, ``task 1`` and so on where they do not.
 
         Raises:
-            ValueError: for a block that trains several tasks, whose effects cannot be told apart, one without a
+            ValueError: for a block that trains several tasks, whose effects cannot be separated, one without a
                 finished episode, and a task that was never evaluated.
         """
         tasks = [sorted(set(block)) for block in self._trained(trained)]

@@ -8,7 +8,7 @@ ranges, and read ratios of sparse rewards with care, or take contrasts of unscal
 
 Means leave out tasks and pairs without a value as l2metrics does; here they are counted. Deviations, on purpose:
 
-- Where other tasks are trained between the two evaluations of a transfer, it cannot be told whose it is. l2metrics
+- Where other tasks are trained between the two evaluations of a transfer, its cause is not known. l2metrics
   keeps the last of them, direct learning included; here there is no value.
 - Ratios and contrasts of negative performance, in which an improvement may read as a loss, have no value here; nor has
   a relative performance whose expert has the sum 0, which is infinite there.

@@ -33,7 +33,7 @@ MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
 
 MOST_SENTENCES = 10
-"""Seeds without results that are told one by one."""
+"""Seeds without results that are listed one by one."""
 
 MOST_COLUMNS = 10
 """Tasks up to which a performance matrix is a table in LaTeX."""

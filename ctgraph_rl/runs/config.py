@@ -213,7 +213,7 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
     """Return the configuration with other choices of some groups, such as ``{"agent": "dqn"}``; None: the default.
 
     Raises:
-        ValueError: for an unknown name, with the one that was probably meant, and a directory that is none.
+        ValueError: for an unknown name, with the one that was probably meant, and a path that is not a directory.
     """
     is_folder = config_dir is None or config_dir.is_dir()
     require((is_folder, f"config_dir must be a directory, got {config_dir}"))

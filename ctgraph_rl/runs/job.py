@@ -198,7 +198,7 @@ def run_job(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    if (run_dir / METRICS).exists() and not is_writable(run_dir):  # no lock either, and nobody else can write
+    if (run_dir / METRICS).exists() and not is_writable(run_dir):  # no lock either: no process can write
         config.check_values(cfg)
         if is_finished(cfg, run_dir):
             return

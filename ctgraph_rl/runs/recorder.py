@@ -233,7 +233,7 @@ class Recorder:
             The mean return on each task, by label.
 
         Raises:
-            ValueError: for frames out of order or beyond the curriculum, and a policy that is none.
+            ValueError: for frames out of order or beyond the curriculum, and what is not a policy.
         """
         last = self.curriculum.num_frames
         require(

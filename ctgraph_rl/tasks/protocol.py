@@ -146,8 +146,8 @@ class Protocol:
     Args:
         task_id: ``hidden``; ``one_hot``: every observation comes with a one-hot ``task_id``; ``at_boundaries``: the
             agent is given the task's id where a block begins and where it is evaluated.
-        boundaries: ``announced``: at the start of a block all episodes end and the agent is told; ``hidden``: each row
-            goes over to the next block's task when its episode ends, without notice to the agent.
+        boundaries: ``announced``: at the start of a block all episodes end and the agent is notified; ``hidden``: each
+            row changes to the next block's task when its episode ends, without notice to the agent.
         num_task_ids: length of the one-hot id; None: just enough.
         task_ids: the id of each of the curriculum's ``tasks``, all different; None: their positions, from 0.
 

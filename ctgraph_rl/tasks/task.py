@@ -123,7 +123,7 @@ class Task:
     def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
         """This task as a configuration file of the authors' implementation, with the keys of 2023.
 
-        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for the goal (2, 1).
+        The file has no goal: call ``set_high_reward_path`` there with the decisions less 1, [1, 0] for ``goal=(2, 1)``.
         ``Task.from_json(task.to_json(), goal=task.goal)`` equals every task that `from_json` made.
 
         Args:

@@ -65,7 +65,7 @@ def worst_value(task: Task, gamma: float) -> float:
 def policy_value(task: Task, policy: Tensor, gamma: float = 1.0) -> float:
     """The expected discounted return of a memoryless policy from the home state; with gamma = 1 the mean return.
 
-    Ids that a state draws are averaged, as a wait state draws anew at every step. Needles take O(d) when neither
+    Ids that a state draws are averaged, as a wait state draws one at every step. Needles take O(d) when neither
     waits nor decisions are unique, other tasks visit every state.
 
     Args:

@@ -38,7 +38,7 @@ WIDTH = 24
 """Columns that an image takes at least; the pixels of a small one are repeated."""
 VECTOR_COLUMNS = 16
 MOST_BRANCHES = 16
-"""End states up to which the truth is told of the whole tree."""
+"""Largest number of end states for which the whole tree is shown."""
 MOST_KEYS = 9
 """Largest action that one key names; larger ones are typed as lines."""
 END_OF_INPUT = "\x04"
@@ -49,17 +49,17 @@ OUTCOMES = {
     OUTCOME_GOAL: "the goal",
 }
 RULES = """You see what an agent sees: one image at a time. Behind it is a tree with {d} decisions in a row,
-{b} branches at each, and waiting before and after. At home any action goes on. A wait state wants action 0,
+{b} branches at each, and waiting before and after. At home any action leads on. A wait state wants action 0,
 again and again if need be; a decision state wants one of 1..{b}. Anything else fails.
 One of {leaves:,} end states is the goal."""
 
 
 class Game:
-    """A player, what was reached so far, and how it is told.
+    """A player, what was reached so far, and how it is shown.
 
     Args:
         player: acts in the environment.
-        console: where it is told.
+        console: where it is shown.
     """
 
     def __init__(self, player: Player, console: Console) -> None:
@@ -119,9 +119,11 @@ class Game:
     def score(self) -> str:
         """Return how often the goal was reached, and how often random actions reach it."""
         share = f", {self.successes / self.episodes:.0%}" if self.episodes else ""
-        luck = self.graph.reward_prob_random
-        times = f", 1 in {1 / luck:,.0f}" if luck else ""
-        return f"goal in {self.successes} of {self.episodes} episodes{share}; random actions: P_R = {luck:.3g}{times}"
+        p_random = self.graph.reward_prob_random
+        times = f", 1 in {1 / p_random:,.0f}" if p_random else ""
+        return (
+            f"goal in {self.successes} of {self.episodes} episodes{share}; random actions: P_R = {p_random:.3g}{times}"
+        )
 
     def truth(self) -> Tree:
         """The tree, with the goal and where the player is."""

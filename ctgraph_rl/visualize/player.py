@@ -17,7 +17,7 @@ class Player:
 
     Args:
         task: what is played.
-        policy: who acts where no action is given, as for `evaluate`; None: nobody does.
+        policy: acts where no action is given, as for `evaluate`; None: an action must be given.
         initial_state: gives a recurrent policy's state for a number of rows.
         seed: decides the environment.
         greedy: most likely actions; False samples and explores as in training.

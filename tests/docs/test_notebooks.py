@@ -1,6 +1,6 @@
 """The notebooks run from top to bottom, and say what is so.
 
-What they store is made anew by ``jupyter nbconvert --to notebook --execute --inplace`` with
+What they store is made by ``jupyter nbconvert --to notebook --execute --inplace`` with
 ``--ExecutePreprocessor.record_timing=False --ExecutePreprocessor.coalesce_streams=True``.
 """
 
@@ -55,8 +55,8 @@ def says(prose: str, *claims: str) -> None:
 def test_the_environment_is_what_its_notebook_says(tmp_path, monkeypatch):
     names, prose = run("environment.ipynb", tmp_path, monkeypatch)
 
-    says(prose, "goal (1, 2)", "Every interval holds P_R", "34 billion frames", "1.7 quadrillion", "toss a coin: 0.25")
-    for task, (low, high) in zip(names["lucky"], names["intervals"], strict=True):
+    says(prose, "goal 1.2", "Every interval holds P_R", "34 billion frames", "1.7 quadrillion", "toss a coin: 0.25")
+    for task, (low, high) in zip(names["shapes"], names["intervals"], strict=True):
         assert low < task.graph.reward_prob_random < high
     assert names["low"] < 1 / 243 < names["high"]
     assert [float(f"{names['deep'][d]:.2g}") for d in (8, 12)] == [34e9, 1.7e15]
@@ -75,7 +75,7 @@ def test_a_learner_of_ones_own_learns_forgets_and_transfers_as_its_notebook_says
 
     says(prose, "need 651 frames", "(0.8 + 0.2 / 3)^5 = 49 %", "it is 1.25", "Forward transfer is 0")
     says(prose, "medians of 0.50, 0.35 and 0.24", "In 21 of 30 cases")
-    assert round(names["luck"]) == 651
+    assert round(names["random_frames"]) == 651
     np.testing.assert_array_equal(names["matrix"], [[0] * 4, *np.eye(4)])
     assert all(recorder.metrics["stage_reached"].value == 1.25 for recorder in names["recorders"])
     assert names["metrics"]["forward_transfer"].value == 0

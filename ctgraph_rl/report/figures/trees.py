@@ -74,7 +74,7 @@ def find_trees(run: Run) -> Trees:
         if (run.path / AGENT).exists():
             trained = load(run.path)
             return Trees(trained.curriculum, trained, "")
-    except Exception as error:  # files of others fail in any way, and the report goes on
+    except Exception as error:  # files of others fail in any way; the report says why
         reason = " ".join(str(error).split()).rstrip(". ") or type(error).__name__
     try:
         return Trees(Curriculum.from_json(run.path / CURRICULUM), None, reason)

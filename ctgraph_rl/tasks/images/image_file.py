@@ -64,7 +64,7 @@ class ImageFile:
 
     @property
     def images(self) -> Tensor:
-        """uint8 [classes * instances, r, r], the instances of a class in a row; read anew from the file."""
+        """uint8 [classes * instances, r, r], the instances of a class in a row; read from the file again."""
         array = _read(self.path)
         require(self._hash_rule())
         return resize(torch.from_numpy(np.array(array, order="C")).flatten(0, 1), self.shape[-1])
