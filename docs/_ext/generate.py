@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 from api_pages import api_pages
+from baseline_cards import baseline_cards
+from command_pages import command_pages
+from curriculum_cards import curriculum_cards
+from figures import draw_all
 from links import OUTSIDE, relocated
+from metric_cards import metric_cards
 from sphinx.application import Sphinx
 
 FOLDER = "generated"
@@ -21,7 +27,9 @@ def write(path: Path, text: str) -> None:
 def generate(app: Sphinx) -> None:
     """Write all generated pages, and remove those that are generated no more."""
     folder = Path(app.srcdir) / FOLDER
-    pages = {folder / path: text for path, text in api_pages()}
+    figures = draw_all(folder / "figures")
+    made = (api_pages(), command_pages(), baseline_cards(), metric_cards(), curriculum_cards(figures))
+    pages = {folder / path: text for path, text in chain(*made)}
     pages |= {folder.parents[1] / page: _copy(app, name, page) for name, page in OUTSIDE.items() if FOLDER in page}
     for path, text in pages.items():
         write(path, text)

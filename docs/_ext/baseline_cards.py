@@ -1,0 +1,76 @@
+"""A card for each agent and each lifelong-learning method, from its yaml, its class and the raw results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+from inspect import getdoc
+
+from results_of import agents_results, methods_results
+from yaml_settings import base_of, escaped, first_comment, names_in, settings_of, table
+
+from baselines.catalogue import Entry, catalogue
+from baselines.methods.__main__ import needs_ids
+
+
+def baseline_cards() -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each card, and of the lists of them, in Markdown."""
+    for group, facts in (("agent", _agent_facts), ("method", _method_facts)):
+        entries = list(catalogue(group))
+        yield f"{group}s/index.md", _index(group, entries)
+        for entry in entries:
+            yield f"{group}s/{entry.name}.md", _card(group, entry, facts(entry))
+
+
+def _index(group: str, entries: list[Entry]) -> str:
+    rows = [f"| [`{entry.name}`]({entry.name}.md) | {escaped(entry.comment)} |" for entry in entries]
+    pages = "\n".join(entry.name for entry in entries)
+    words = f"Choose one with `{group}=NAME`. Each card has all settings with their defaults."
+    listing = "\n".join([f"| `{group}=` | |", "|---|---|", *rows])
+    return f"# {group.title()}s\n\n{words}\n\n{listing}\n\n```{{toctree}}\n:hidden:\n{pages}\n```\n"
+
+
+def _agent_facts(entry: Entry) -> dict[str, str]:
+    return {"memory": "yes" if entry.kind.memory else "no", "can solve in principle": entry.kind.solves}
+
+
+def _method_facts(entry: Entry) -> dict[str, str]:
+    ids = {"yes": "yes", "no": "no"}.get(needs_ids(entry), f"only with `{needs_ids(entry)}`")
+    return {"needs task ids": ids, "needs to know boundaries": "yes" if entry.kind.needs_boundaries else "no"}
+
+
+def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
+    command = f"ctgraph-rl agent={entry.name}" if group == "agent" else f"ctgraph-rl agent=ppo method={entry.name}"
+    results = agents_results(entry.name) if group == "agent" else methods_results(entry.name)
+    rows = ["| | |", "|---|---|", *(f"| {fact} | {value} |" for fact, value in facts.items())]
+    settings = settings_of(f"{group}/{entry.name}")
+    parts = [
+        f"# `{group}={entry.name}`",
+        escaped(entry.comment),
+        "\n".join(rows),
+        f"```bash\n{command}\n```",
+        *(["## Settings", table(settings, f"{group}.")] if settings else []),
+        *_variants(group, entry.name),
+        *(["## Results", results] if results else []),
+        *_source(entry),
+        "## Class",
+        f"```{{eval-rst}}\n.. autoclass:: {entry.kind.__module__}.{entry.kind.__name__}\n   :members:\n```",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _variants(group: str, name: str) -> list[str]:
+    """Return a section with the yaml files that only change values of this one."""
+    others = [other for other in names_in(group) if base_of(group, other) == name]
+    sections = [
+        f"### `{group}={other}`\n\n{escaped(first_comment(f'{group}/{other}'))}\n\n"
+        + table(settings_of(f"{group}/{other}"), f"{group}.")
+        for other in others
+    ]
+    return ["## Variants", *sections] if sections else []
+
+
+def _source(entry: Entry) -> list[str]:
+    """Return a section with the papers that the module of an entry names."""
+    words = (getdoc(import_module(entry.kind.__module__)) or "").split("\n\n")[1:]
+    return ["## Source", " ".join(escaped(words[0]).replace("``", "`").split())] if words else []

@@ -1,0 +1,147 @@
+"""A card for each published curriculum: pictures, who can solve it, tables, command, results and how to cite it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bibliography import entries_of
+from results_of import curriculum_results
+from yaml_settings import CONF, escaped, settings_of, table
+
+import curricula
+from baselines.catalogue import catalogue
+from ctgraph_rl import Curriculum, Task
+from ctgraph_rl.describe import Sheet, describe, to_markdown
+from ctgraph_rl.tasks.values import random_frames_to_goal
+
+MANY = 16
+"""Tasks from which on the tables of a card are folded."""
+
+
+def curriculum_cards(figures: dict[str, tuple[str, str]]) -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each card, and of the list of them, in Markdown.
+
+    Args:
+        figures: by name the files with the graphs and the similarity of each curriculum, in ``generated/figures``.
+    """
+    all_curricula = {name: curricula.load(name) for name in curricula.names()}
+    yield "curricula/index.md", _index(all_curricula)
+    for name, curriculum in all_curricula.items():
+        yield f"curricula/{name}.md", _card(curriculum, *figures[name])
+
+
+def _index(all_curricula: dict[str, Curriculum]) -> str:
+    head = ["| curriculum | tasks | frames | tasks that need memory | what it is |", "|---|--:|--:|--:|---|"]
+    rows = [
+        f"| [`{name}`]({name}.md) | {len(c.tasks):,} | {c.num_frames:,} | {_need_memory(c)} | {_purpose(name)} |"
+        for name, c in all_curricula.items()
+    ]
+    pages = "\n".join(all_curricula)
+    words = "Every curriculum with a name. Run one with `ctgraph-rl curriculum=NAME`."
+    listing = "\n".join([*head, *rows])
+    return f"# Curricula\n\n{words}\n\n{listing}\n\n```{{toctree}}\n:hidden:\n{pages}\n```\n"
+
+
+def _purpose(name: str) -> str:
+    return escaped(curricula.summary(name)).replace("``", "`")
+
+
+def _need_memory(curriculum: Curriculum) -> str:
+    needs = [needs_memory(task) for task in curriculum.tasks]
+    return "not known" if None in needs else f"{sum(map(bool, needs)):,}"
+
+
+def needs_memory(task: Task) -> bool | None:
+    """Return whether policies without memory fall short of the optimal return; None where that is not known."""
+    try:
+        return task.memoryless_ceiling(deterministic=True) < task.optimal_value(1.0) - 1e-9
+    except ValueError:
+        return None
+
+
+def _card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
+    name = curriculum.name
+    overview, *sheets = describe(curriculum)
+    results = curriculum_results(name)
+    parts = [
+        f"# `{name}`",
+        _purpose(name),
+        f"![The graphs of {name}, and where the goals are](../figures/{graphs})",
+        _facts(overview),
+        f"```bash\nctgraph-rl curriculum={name}\n```",
+        f'```python\nimport curricula\n\ncurriculum = curricula.load("{name}")\n```',
+        "## Who can solve it",
+        "\n".join(f"- {sentence}" for sentence in _who(curriculum)),
+        "## How alike its tasks are",
+        f"![Similarity of the tasks of {name}](../figures/{similarity})",
+        *_folded(sheets, len(curriculum.tasks)),
+        *_settings(name),
+        *(["## Results", results] if results else []),
+        "## Cite",
+        f"Name the curriculum as `{name}`, version {curriculum.version} ({curriculum.fingerprint}), of ctgraph_rl.",
+        *(f"```bibtex\n{entry}\n```" for entry in entries_of(curriculum.source)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _facts(overview: Sheet) -> str:
+    """Return the first table of the description, without its title."""
+    return to_markdown(overview).split("\n\n", 1)[1].strip()
+
+
+def _folded(sheets: list[Sheet], tasks: int) -> list[str]:
+    """Return the other tables of the description, folded where they are long."""
+    tables = [to_markdown(sheet).strip() for sheet in sheets]
+    if tasks <= MANY:
+        return tables
+    lead = f"<details><summary>Tables of all {tasks:,} tasks</summary>"
+    return ["## Tables", lead, *(text.replace("## ", "### ", 1) for text in tables), "</details>"]
+
+
+def _settings(name: str) -> list[str]:
+    settings = settings_of(f"curriculum/{name}") if (CONF / "curriculum" / f"{name}.yaml").is_file() else []
+    words = "A run with another value is reported as modified."
+    return ["## Settings", words, table(settings, "curriculum.")] if settings else []
+
+
+def _who(curriculum: Curriculum) -> Iterator[str]:
+    """Yield sentences on what an agent needs to solve the curriculum."""
+    yield _of_memory(curriculum.tasks)
+    hardest = max(curriculum.tasks, key=random_frames_to_goal)
+    frames, longest = random_frames_to_goal(hardest), max(block.num_frames for block in curriculum.blocks)
+    label = escaped(dict(zip(curriculum.tasks, curriculum.labels, strict=True))[hardest])
+    yield (
+        f"Exploration: on {label}, the hardest task for it, a random policy first reaches the goal after "
+        f"{_rounded(frames)} frames in the mean; the longest block has {longest:,}."
+    )
+    if curriculum.protocol.task_id == "hidden" and _conflicts(curriculum.tasks):
+        yield (
+            "Task ids are hidden, and some tasks with the same graph and images have different goals: no single "
+            "policy solves all tasks at once, so what was learned first is overwritten."
+        )
+
+
+def _of_memory(tasks: tuple[Task, ...]) -> str:
+    needs = [needs_memory(task) for task in tasks]
+    with_memory, without = (_agents(memory) for memory in (True, False))
+    if None in needs:
+        return "Memory: whether it is needed has no closed form here."
+    if not any(needs):
+        return f"Memory: not needed, so agents without memory can solve it, too: {without}."
+    which = "every task" if all(needs) else f"{sum(map(bool, needs)):,} of {len(tasks):,} tasks"
+    return f"Memory: needed for {which}, so only agents with memory can solve it: {with_memory}."
+
+
+def _agents(memory: bool) -> str:
+    return ", ".join(f"[`{e.name}`](../agents/{e.name}.md)" for e in catalogue("agent") if e.kind.memory == memory)
+
+
+def _conflicts(tasks: tuple[Task, ...]) -> bool:
+    """Whether two tasks look the same and have different goals."""
+    return len({(t.graph, t.images, t.observations) for t in tasks}) < len(
+        {(t.graph, t.images, t.observations, t.goal) for t in tasks}
+    )
+
+
+def _rounded(value: float) -> str:
+    return f"{value:,.0f}" if value < 1e7 else f"{value:.1e}"
