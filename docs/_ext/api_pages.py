@@ -113,6 +113,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.policy_gradient",
             "baselines.q_learning",
             "baselines.recurrent_q",
+            "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.networks",
             "baselines.optimisers",
             "baselines.methods.method",
@@ -132,8 +133,13 @@ def exported(page: str) -> list[str]:
 
 
 def _page_of(name: str) -> str:
-    wing = ctgraph_rl._HOMES[name].split(".")[0]
+    wing = _home(name).split(".")[1]
     return next((page for page, wings in EXPORTED.items() if wing in wings), ELSEWHERE)
+
+
+def _home(name: str) -> str:
+    """Return the module that an exported name is defined in."""
+    return getattr(getattr(ctgraph_rl, name), "__module__", "")
 
 
 def api_pages() -> Iterator[tuple[str, str]]:
@@ -164,6 +170,6 @@ def _directive(name: str) -> str:
 def _module(entry: str) -> str:
     """Return a section with what a module defines, without what ``ctgraph_rl`` exports of it."""
     name, _, members = entry.partition(":")
-    left_out = [each for each in ctgraph_rl.__all__ if f"ctgraph_rl.{ctgraph_rl._HOMES.get(each)}" == name]
+    left_out = [each for each in ctgraph_rl.__all__ if _home(each) == name]
     options = [f"   :members: {members}", *([f"   :exclude-members: {', '.join(left_out)}"] if left_out else [])]
     return "\n".join([_title(f"``{name}``", "-"), "", f".. automodule:: {name}", *options])

@@ -7,7 +7,7 @@ from importlib import import_module
 from inspect import getdoc
 
 from results_of import agents_results, methods_results
-from yaml_settings import base_of, escaped, first_comment, names_in, settings_of, table
+from yaml_settings import ALONE, base_of, escaped, first_comment, names_in, settings_of, table
 
 from baselines.catalogue import Entry, catalogue
 from baselines.methods.__main__ import needs_ids
@@ -24,10 +24,9 @@ def baseline_cards() -> Iterator[tuple[str, str]]:
 
 def _index(group: str, entries: list[Entry]) -> str:
     rows = [f"| [`{entry.name}`]({entry.name}.md) | {escaped(entry.comment)} |" for entry in entries]
-    pages = "\n".join(entry.name for entry in entries)
     words = f"Choose one with `{group}=NAME`. Each card has all settings with their defaults."
     listing = "\n".join([f"| `{group}=` | |", "|---|---|", *rows])
-    return f"# {group.title()}s\n\n{words}\n\n{listing}\n\n```{{toctree}}\n:hidden:\n{pages}\n```\n"
+    return f"# {group.title()}s\n\n{words}\n\n{listing}\n"
 
 
 def _agent_facts(entry: Entry) -> dict[str, str]:
@@ -45,7 +44,9 @@ def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
     rows = ["| | |", "|---|---|", *(f"| {fact} | {value} |" for fact, value in facts.items())]
     settings = settings_of(f"{group}/{entry.name}")
     parts = [
+        ALONE,
         f"# `{group}={entry.name}`",
+        f"[All {group}s](index.md)",
         escaped(entry.comment),
         "\n".join(rows),
         f"```bash\n{command}\n```",

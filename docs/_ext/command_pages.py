@@ -30,19 +30,16 @@ def command_pages() -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each page, in Markdown."""
     parts = ["# Command line", "`ctgraph-rl` runs an agent on a curriculum; its first word may be another command."]
     for name in ("", *cli.COMMANDS):
-        parts += [f"## `ctgraph-rl {name}`".replace(" `", "`"), *_helps(name)]
+        parts += [f"## `{f'ctgraph-rl {name}'.strip()}`", *_helps(name)]
     yield "commands.md", "\n\n".join(parts) + "\n"
     yield "settings.md", _settings()
 
 
 def _helps(name: str) -> Iterator[str]:
     """Yield the help of a command and of its own commands, as code blocks."""
-    try:
-        parser = _parser(name) if name else None
-    except SystemExit:
-        parser = None
+    parser = None if name in ("", "run") else _parser(name)
     if parser is None:
-        yield _block(_printed([*([name] if name else []), "--help"]))
+        yield _block(_printed([*name.split(), "--help"]))
         return
     yield _block(parser.format_help())
     for action in parser._actions:

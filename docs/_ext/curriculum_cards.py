@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 from bibliography import entries_of
 from results_of import curriculum_results
-from yaml_settings import CONF, escaped, settings_of, table
+from yaml_settings import ALONE, CONF, escaped, settings_of, table
 
 import curricula
 from baselines.catalogue import catalogue
@@ -27,7 +28,7 @@ def curriculum_cards(figures: dict[str, tuple[str, str]]) -> Iterator[tuple[str,
     all_curricula = {name: curricula.load(name) for name in curricula.names()}
     yield "curricula/index.md", _index(all_curricula)
     for name, curriculum in all_curricula.items():
-        yield f"curricula/{name}.md", _card(curriculum, *figures[name])
+        yield f"curricula/{name}.md", card(curriculum, *figures[name])
 
 
 def _index(all_curricula: dict[str, Curriculum]) -> str:
@@ -36,10 +37,9 @@ def _index(all_curricula: dict[str, Curriculum]) -> str:
         f"| [`{name}`]({name}.md) | {len(c.tasks):,} | {c.num_frames:,} | {_need_memory(c)} | {_purpose(name)} |"
         for name, c in all_curricula.items()
     ]
-    pages = "\n".join(all_curricula)
     words = "Every curriculum with a name. Run one with `ctgraph-rl curriculum=NAME`."
     listing = "\n".join([*head, *rows])
-    return f"# Curricula\n\n{words}\n\n{listing}\n\n```{{toctree}}\n:hidden:\n{pages}\n```\n"
+    return f"# Curricula\n\n{words}\n\n{listing}\n"
 
 
 def _purpose(name: str) -> str:
@@ -51,6 +51,7 @@ def _need_memory(curriculum: Curriculum) -> str:
     return "not known" if None in needs else f"{sum(map(bool, needs)):,}"
 
 
+@cache
 def needs_memory(task: Task) -> bool | None:
     """Return whether policies without memory fall short of the optimal return; None where that is not known."""
     try:
@@ -59,12 +60,14 @@ def needs_memory(task: Task) -> bool | None:
         return None
 
 
-def _card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
+def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
     name = curriculum.name
     overview, *sheets = describe(curriculum)
     results = curriculum_results(name)
     parts = [
+        ALONE,
         f"# `{name}`",
+        "[All curricula](index.md)",
         _purpose(name),
         f"![The graphs of {name}, and where the goals are](../figures/{graphs})",
         _facts(overview),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from inspect import getdoc
 
 import torch
-from yaml_settings import escaped
+from yaml_settings import ALONE, escaped
 
 from ctgraph_rl import metrics
 
@@ -23,9 +23,8 @@ def metric_cards() -> Iterator[tuple[str, str]]:
     rows = [f"| [`{name}`]({name}.md) | `{each.formula}` | {escaped(each.source)} |" for name, each in found.items()]
     head = ["| metric | formula | source |", "|---|---|---|"]
     words = "Every metric of `metrics.json`. R is the performance matrix; tasks and blocks count from 1."
-    pages = "\n".join(found)
     listing = "\n".join([*head, *rows])
-    yield "metrics/index.md", f"# Metrics\n\n{words}\n\n{listing}\n\n```{{toctree}}\n:hidden:\n{pages}\n```\n"
+    yield "metrics/index.md", f"# Metrics\n\n{words}\n\n{listing}\n"
     for name in found:
         yield f"metrics/{name}.md", _card(name, values.get(name))
 
@@ -42,7 +41,13 @@ def _card(name: str, value: metrics.Metric | None) -> str:
         "terms without a value": "left out of the mean" if entry.meaning.partial else "make the metric undefined",
     }
     rows = ["| | |", "|---|---|", *(f"| {fact} | {words} |" for fact, words in facts.items())]
-    parts = [f"# `{name}`", escaped(text.split("\n\n")[0].replace("\n", " ")).replace("``", "`"), "\n".join(rows)]
+    parts = [
+        ALONE,
+        f"# `{name}`",
+        "[All metrics](index.md)",
+        escaped(text.split("\n\n")[0].replace("\n", " ")).replace("``", "`"),
+        "\n".join(rows),
+    ]
     python = f"```{{eval-rst}}\n.. autofunction:: {entry.metric.__module__}.{name}\n   :no-index:\n```"
     return "\n\n".join([*parts, *_example(value), "## In Python", python]) + "\n"
 

@@ -13,6 +13,9 @@ from ctgraph_rl.packages import conf_dir
 
 CONF = Path(conf_dir())
 
+ALONE = "---\norphan: true\n---"
+"""Says that no table of contents lists a page: the sidebar of all pages would be long, and slow to build."""
+
 
 class Setting(NamedTuple):
     """A line of a yaml file: dotted key, default and comment."""

@@ -1,0 +1,108 @@
+"""The generated pages of the site: what they hold, without a build; CI builds all of it strictly."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+
+import pytest
+from helpers.paths import CHECKOUT
+
+import ctgraph_rl
+import curricula
+from baselines.catalogue import catalogue
+from ctgraph_rl import cli, metrics
+
+EXTENSIONS = CHECKOUT / "docs" / "_ext"
+
+
+@pytest.fixture(scope="module")
+def site():
+    """Import a module of ``docs/_ext`` by name."""
+    before = set(sys.modules)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(EXTENSIONS))
+        yield importlib.import_module
+    for name in {path.stem for path in EXTENSIONS.glob("*.py")} - before:
+        sys.modules.pop(name, None)
+
+
+def test_every_exported_name_stands_on_one_page_of_the_api(site):
+    pages = dict(site("api_pages").api_pages())
+    listed = re.findall(r"auto(?:class|function):: ctgraph_rl\.(\w+)$", "\n".join(pages.values()), re.MULTILINE)
+
+    assert sorted(listed) == sorted(set(ctgraph_rl.__all__) - {"metrics"})
+
+
+def test_every_command_and_its_own_commands_show_their_help(site):
+    page = dict(site("command_pages").command_pages())["commands.md"]
+
+    headings = re.findall(r"^##+ `ctgraph-rl ?(.*)`$", page, re.MULTILINE)
+    assert {*cli.COMMANDS, "", "curricula describe"} <= {*headings}
+    assert page.count("usage: ") >= len(cli.COMMANDS)
+    assert "\x1b" not in page
+
+
+def test_every_setting_of_a_run_has_its_default_and_a_comment(site):
+    settings = site("yaml_settings").settings_of("config")
+
+    own = [setting for setting in settings if not setting.key.startswith("hydra.")]
+    assert ("seed", "0") in [setting[:2] for setting in own]
+    assert ("protocol.task_id", "null") in [setting[:2] for setting in own]
+    assert [setting.key for setting in own if not setting.comment] == []
+
+
+def test_a_card_of_a_curriculum_has_its_parts(site):
+    card = site("curriculum_cards").card(curricula.load("su_b1_4tasks"), "graphs.png", "similarity.png")
+
+    for part in ("a78b6121f1224f71", "ctgraph-rl curriculum=su_b1_4tasks", "graphs.png", "similarity.png", "| P_R |"):
+        assert part in card
+    assert "Memory: needed for 2 of 4 tasks, so only agents with memory can solve it: [`drqn`]" in card
+    assert "no single policy solves all tasks at once" in card
+    assert "soltoggio2023configurable" in card
+    assert "baselines.md" in card.split("## Results")[1]
+
+
+def test_a_fully_observable_curriculum_needs_no_memory(site):
+    cards = site("curriculum_cards")
+
+    assert "Memory: not needed" in cards.card(curricula.load("fo_b1_4tasks"), "a", "b")
+    assert [cards.needs_memory(task) for task in curricula.load("su_b1_4tasks").tasks] == [False, True, True, False]
+
+
+def test_every_source_of_a_curriculum_has_bibtex(site):
+    entries_of = site("bibliography").entries_of
+
+    assert [name for name in curricula.names() if not entries_of(curricula.load(name).source)] == []
+
+
+def test_every_agent_method_and_metric_has_a_card(site):
+    pages = {*dict(site("baseline_cards").baseline_cards()), *dict(site("metric_cards").metric_cards())}
+
+    for group in ("agent", "method"):
+        assert {f"{group}s/{entry.name}.md" for entry in catalogue(group)} <= pages
+    assert {f"metrics/{name}.md" for name in metrics.definitions()} <= pages
+
+
+def test_cards_show_settings_variants_results_and_examples(site):
+    cards = {**dict(site("baseline_cards").baseline_cards()), **dict(site("metric_cards").metric_cards())}
+
+    assert "| `method.coeff` | `100.0` | lambda |" in cards["methods/ewc.md"]
+    assert "### `method=ewc_published`" in cards["methods/ewc.md"]
+    assert "Raw: `methods.csv`" in cards["methods/ewc.md"]
+    assert "Raw: `baselines_b1.csv`" in cards["agents/a2c.md"]
+    assert "**-0.45**; its terms are -0.6, -0.3" in cards["metrics/backward_transfer.md"]
+
+
+def test_links_to_files_beside_docs_lead_to_their_pages(site):
+    relocated = site("links").relocated
+    text = (
+        "[a](../../SECURITY.md#x) [b](loggers.md) [c](../../baselines/ppo.py) [d](https://x.y/z.md) ![e](../../p.png)"
+    )
+
+    moved = relocated(text, "docs/how-to/a.md", "docs/how-to/a.md", "")
+
+    assert moved == "[a](../generated/security.md#x) [b](loggers.md) c [d](https://x.y/z.md) ![e](../../p.png)"
+    there = relocated("[c](../../baselines/ppo.py)", "docs/how-to/a.md", "docs/how-to/a.md", "https://host/repository")
+    assert there == "[c](https://host/repository/blob/main/baselines/ppo.py)"
