@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import ctgraph_rl
 
 EXPORTED = {
+    "curricula": ("tasks.curriculum", "tasks.protocol"),
     "tasks": ("core", "tasks"),
     "environments": ("env", "batch"),
     "learning": ("agent", "learn", "log", "runs"),
 }
-"""For each page, the folders and modules of ``ctgraph_rl`` whose exported names it documents."""
+"""For each page, the folders and modules of ``ctgraph_rl`` whose exported names it documents; the first counts."""
 
 ELSEWHERE = "learning"
 """The page of exported names from other modules."""
@@ -133,8 +134,8 @@ def exported(page: str) -> list[str]:
 
 
 def _page_of(name: str) -> str:
-    wing = _home(name).split(".")[1]
-    return next((page for page, wings in EXPORTED.items() if wing in wings), ELSEWHERE)
+    home = _home(name).removeprefix("ctgraph_rl.")
+    return next((page for page, homes in EXPORTED.items() if home.startswith(homes)), ELSEWHERE)
 
 
 def _home(name: str) -> str:

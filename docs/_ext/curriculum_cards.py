@@ -61,6 +61,7 @@ def needs_memory(task: Task) -> bool | None:
 
 
 def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
+    """Return a card in Markdown; ``graphs`` and ``similarity`` are the files of its figures."""
     name = curriculum.name
     overview, *sheets = describe(curriculum)
     results = curriculum_results(name)
