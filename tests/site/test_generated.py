@@ -104,5 +104,7 @@ def test_links_to_files_beside_docs_lead_to_their_pages(site):
     moved = relocated(text, "docs/how-to/resume.md", "docs/how-to/resume.md", "")
 
     assert moved == "[a](../generated/security.md#x) [b](loggers.md) c [d](https://x.y/z.md) ![e](../../p.png)"
-    there = relocated("[c](../../baselines/ppo.py)", "docs/how-to/resume.md", "docs/how-to/resume.md", "https://host/repository")
+    there = relocated(
+        "[c](../../baselines/ppo.py)", "docs/how-to/resume.md", "docs/how-to/resume.md", "https://host/repository"
+    )
     assert there == "[c](https://host/repository/blob/main/baselines/ppo.py)"
