@@ -40,6 +40,7 @@ class DQN(QLearner):
             same after every decision, so nothing is learned about decisions: ``n_steps`` helps.
     """
 
+    stackable = True
     solves = "fully observable tasks (CT-FO)"
 
     def __init__(
@@ -106,7 +107,15 @@ class DQN(QLearner):
     def _target_values(self, data: Data) -> Tensor:
         """Compute the target network's action values."""
         trunk, head = self.greedy.module[0].module
-        old = [self.dqn.target_value_network_params["module", "0", "module", i, "module"] for i in ("0", "1")]
-        weights = [dict(part.flatten_keys(".").items()) for part in old]
-        features = functional_call(trunk.module, weights[0], tuple(data[key] for key in trunk.in_keys))
-        return functional_call(head.module, weights[1], (features,))
+        parts: list[dict[str, Tensor]] = [{}, {}]
+        for name, value in self.other_weights().items():
+            part, _, name = name.partition(".")
+            parts[int(part)][name] = value
+        features = functional_call(trunk.module, parts[0], tuple(data[key] for key in trunk.in_keys))
+        return functional_call(head.module, parts[1], (features,))
+
+    def other_weights(self) -> dict[str, Tensor]:
+        """Return the target network's weights: those of its trunk as ``0.*``, those of its head as ``1.*``."""
+        parts = (self.dqn.target_value_network_params["module", "0", "module", i, "module"] for i in ("0", "1"))
+        flat = [part.flatten_keys(".").items() for part in parts]
+        return {f"{i}.{name}": value for i, items in enumerate(flat) for name, value in items}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -14,6 +15,9 @@ class Hooks(nn.Module):
 
     `baselines.methods.method.Method` derives from it. Buffers and parameters are saved with the agent.
     """
+
+    stackable: ClassVar[bool] = True
+    """Whether the hooks take tensors with the seeds as a leading dimension, see `baselines.together`."""
 
     def transform_minibatch(self, batch: Data) -> Data:
         """Return the minibatch to learn from in place of the given one."""

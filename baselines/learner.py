@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from types import FunctionType
 from typing import Any, ClassVar
@@ -38,6 +38,9 @@ class Learner(nn.Module):
 
     memory: ClassVar[bool] = False
     """Whether earlier steps of an episode can change the action."""
+
+    stackable: ClassVar[bool] = False
+    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.together`; not with ``memory``."""
 
     solves: ClassVar[str]
     """Which tasks it can solve in principle, in a few words."""
@@ -82,8 +85,30 @@ class Learner(nn.Module):
         raise NotImplementedError
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch; see `ctgraph_rl.agent.Agent`."""
+        """Learn from a batch by gradient steps on its minibatches; see `ctgraph_rl.agent.Agent`."""
+        steps = [self.after_update(self.gradient_step(minibatch)) for minibatch in self.minibatches(batch)]
+        return self.after_batch(self.mean_measurements(steps))
+
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Yield the minibatches of a batch, each for one gradient step, which is taken before the next is made."""
         raise NotImplementedError
+
+    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Called after a gradient step with what was measured in it; return what is worth logging of that."""
+        return measured
+
+    def after_batch(self, measurements: dict[str, float]) -> dict[str, float]:
+        """Called after the last gradient step of a batch with the mean measurements; return what is worth logging."""
+        return measurements
+
+    @property
+    def needs_weights(self) -> bool:
+        """Whether `after_update` reads the weights after the next gradient step."""
+        return False
+
+    def other_weights(self) -> dict[str, Tensor]:
+        """Return the tensors beside parameters and buffers that the losses read, such as those of a target network."""
+        return {}
 
     def num_learnt(self, batch: TensorDictBase) -> int:
         """Return how many frames of a batch one pass learns from."""
@@ -151,13 +176,16 @@ class Learner(nn.Module):
         Raises:
             FloatingPointError: names the first number that is not finite, or the largest weight.
         """
-        table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1)
+        return self.means(list(steps[0]), torch.stack([torch.stack(list(step.values())) for step in steps], dim=1))
+
+    def means(self, names: Sequence[str], table: Tensor) -> dict[str, float]:
+        """Return the means of a table of measurements, [names, gradient steps]; see `mean_measurements`."""
         for wrong in (~table.isfinite()).any(dim=0).nonzero()[:1, 0]:
-            for name, value in zip(steps[0], table[:, wrong], strict=True):
+            for name, value in zip(names, table[:, wrong], strict=True):
                 require_finite(name, value)
         largest = torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max()
         require_finite("the largest weight", largest, LARGEST_WEIGHT)
-        return dict(zip(steps[0], table.mean(dim=1).tolist(), strict=True))
+        return dict(zip(names, table.mean(dim=1).tolist(), strict=True))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the optimiser's state, so that `state_dict` is complete."""

@@ -44,9 +44,10 @@ class Encoder(nn.Module):
         self.further = nn.Sequential(*layers)
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
-        """Map uint8 [..., *shape] and further inputs, [..., n] each, to float32 [..., num_features]."""
-        flat = observation.flatten(-self.event_dims).float() * self.scale
-        flat = torch.cat([flat, *(values.float() for values in extra)], dim=-1) if extra else flat
+        """Map uint8 [..., *shape] and further inputs, [..., n] each, to [..., num_features] of the weights' dtype."""
+        dtype = self.linear.weight.dtype
+        flat = observation.flatten(-self.event_dims).to(dtype) * self.scale
+        flat = torch.cat([flat, *(values.to(dtype) for values in extra)], dim=-1) if extra else flat
         return self.further(self.linear(flat).relu())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +11,9 @@ from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 
 OPTIMISERS = ("adam", "rmsprop")
+
+LATE = 1e9
+"""A step of Adam so late that its moments need no correction."""
 
 
 def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
@@ -41,3 +44,87 @@ def functional_step(optimiser: torch.optim.Optimizer, gradients: list[Tensor]) -
         averages: tuple[list[Tensor], list, list] = (state["square_avg"], [], [])
         settings |= {key: group[key] for key in ("alpha", "momentum", "centered")}
         rmsprop(parameters, gradients, *averages, state["step"], **settings)
+
+
+def is_stackable(optimiser: torch.optim.Optimizer) -> bool:
+    """Return whether `StackedOptimiser` takes the steps of an optimiser: of one that `make_optimiser` returns."""
+    name = {torch.optim.Adam: "adam", torch.optim.RMSprop: "rmsprop"}.get(type(optimiser))
+    if name is None or len(optimiser.param_groups) != 1:
+        return False
+    usual = make_optimiser(name, [nn.Parameter(torch.zeros(1))], optimiser.defaults["lr"])
+    return optimiser.defaults == usual.defaults
+
+
+class StackedOptimiser:
+    """The steps of equal optimisers of several seeds in one operation, PyTorch's fused Adam.
+
+    RMSprop is Adam without a first moment, beta1 = 0, whose second moment needs no correction: that of a late step.
+
+    Args:
+        optimisers: of each seed; their state is read, and written by `write`.
+        parameters: for each parameter of an optimiser those of all seeds, `stacked`.
+    """
+
+    def __init__(self, optimisers: Sequence[torch.optim.Optimizer], parameters: Sequence[Tensor]) -> None:
+        self.optimisers, self.parameters, self.num_steps = optimisers, parameters, 0
+        self.own = list(zip(*(optimiser.param_groups[0]["params"] for optimiser in optimisers), strict=True))
+        settings, self.is_adam = optimisers[0].defaults, isinstance(optimisers[0], torch.optim.Adam)
+        betas = settings["betas"] if self.is_adam else (0.0, settings["alpha"])
+        self.adam = torch.optim.Adam(parameters, settings["lr"], betas, settings["eps"], fused=True)
+        for parameter, own in zip(parameters, self.own, strict=True):
+            self.adam.state[parameter] = self._read(parameter, own)
+
+    @property
+    def moments(self) -> dict[str, str]:
+        """The moments in Adam's state, and as the optimisers name them."""
+        return {"exp_avg": "exp_avg", "exp_avg_sq": "exp_avg_sq"} if self.is_adam else {"exp_avg_sq": "square_avg"}
+
+    def _read(self, parameter: Tensor, own: Sequence[Tensor]) -> dict[str, Tensor]:
+        """Return Adam's state of a parameter of all seeds; the optimisers have none before the first step."""
+        states = [optimiser.state.get(each) for optimiser, each in zip(self.optimisers, own, strict=True)]
+        state = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
+        state["step"] = torch.full((), 0.0 if self.is_adam else LATE, device=parameter.device)
+        if states[0]:
+            state |= {key: stacked([each[name] for each in states]) for key, name in self.moments.items()}
+            state |= {"step": states[0]["step"].clone()} if self.is_adam else {}
+        return state
+
+    def step(self, gradients: Iterable[Tensor], max_norm: float) -> Tensor:
+        """Scale the gradients of each seed down to a norm, and take a step; return the norms before, [seeds]."""
+        gradients = list(gradients)
+        norms = [torch.linalg.vector_norm(each, dim=tuple(range(1, each.ndim))) for each in gradients]
+        norm = torch.linalg.vector_norm(torch.stack(norms), dim=0)
+        scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient * scale.view(-1, *[1] * (gradient.ndim - 1))
+        self.adam.step()
+        self.num_steps += 1
+        return norm
+
+    @torch.no_grad()
+    def write(self) -> None:
+        """Write the state to the optimisers of the seeds."""
+        for parameter, own in zip(self.parameters, self.own, strict=True):
+            moments = {name: unstacked(self.adam.state[parameter][key]) for key, name in self.moments.items()}
+            for number, (optimiser, each) in enumerate(zip(self.optimisers, own, strict=True)):
+                state = optimiser.state[each]
+                if not state:
+                    zeros = {name: torch.zeros_like(each) for name in moments}
+                    state |= {"step": torch.zeros((), device=each.device), **zeros}
+                state["step"].add_(self.num_steps)
+                for name, value in moments.items():
+                    state[name].copy_(value[number])
+        self.num_steps = 0
+
+
+def stacked(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack the parameters of several seeds, matrices as [seeds, inputs, outputs].
+
+    In this order in memory their gradients come out of the backward pass.
+    """
+    return torch.stack([tensor.mT if tensor.ndim == 2 else tensor for tensor in tensors])
+
+
+def unstacked(tensor: Tensor) -> Tensor:
+    """Return the parameters of several seeds as they are, [seeds, ...]: a view of what `stacked` returned."""
+    return tensor.mT if tensor.ndim == 3 else tensor

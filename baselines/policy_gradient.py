@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -66,6 +67,7 @@ class PolicyGradient(Learner):
 
     num_epochs = num_minibatches = 1
     output_keys = ("log_probs", "state_value")
+    stackable = True
 
     def __init__(
         self,
@@ -148,14 +150,12 @@ class PolicyGradient(Learner):
         features = self.trunk.over_time(data)
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
-    def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch for some epochs; return mean losses, entropy and gradient norm."""
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""
         given = self._with_advantage(batch)
         items = {key: value if self.memory else value.flatten(0, 1) for key, value in given.items()}
-        steps: list[dict[str, Tensor]] = []
         for _ in range(self.num_epochs):
-            steps += map(self.gradient_step, self._minibatches(items))
-        return self.mean_measurements(steps)
+            yield from self._minibatches(items)
 
     def reward(self, batch: TensorDictBase) -> Tensor:
         """Return the reward to maximise, float32 [num_envs, num_steps, 1]: the environment's."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -173,22 +174,31 @@ class QLearner(Learner):
         """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""
         raise NotImplementedError
 
-    def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch, take gradient steps on replayed items, and anneal exploration; return mean measurements."""
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Store a batch, and yield minibatches of replayed items."""
         self.replay.extend(self.experience(self.multi_step(batch)))
-        steps = [self._update() for _ in range(self.num_updates)]
-        self.exploration.step()
-        return {**self.mean_measurements(steps), "exploration": self.exploration.eps.item()}
+        for _ in range(self.num_updates):
+            self.replayed, items = self._sample()
+            yield items
 
-    def _update(self) -> dict[str, Tensor]:
-        index, items = self._sample()
-        measured = self.gradient_step(items)
+    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Set the priorities of the replayed items, and copy the weights to the target network if it is time."""
         squared = measured.pop("td_error", None)
         if self.prioritized and squared is not None:
             self.mean_measurements([measured])  # raises before a priority becomes NaN
-            self.replay.update_priority(index, squared.cpu().sqrt())
+            self.replay.update_priority(self.replayed, squared.cpu().sqrt())
         self.target_update.step()
         return measured
+
+    def after_batch(self, measurements: dict[str, float]) -> dict[str, float]:
+        """Anneal exploration; return the mean measurements with it."""
+        self.exploration.step()
+        return {**measurements, "exploration": self.exploration.eps.item()}
+
+    @property
+    def needs_weights(self) -> bool:
+        """Whether the target network gets the weights after the next gradient step."""
+        return self.prioritized or self.target_update.counter == self.target_update.value_network_update_interval
 
     def _sample(self) -> tuple[Tensor, dict[Any, Tensor]]:
         """Return indices of replayed items and the items, as ``replay.sample()`` does, in plain tensors."""

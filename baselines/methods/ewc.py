@@ -37,6 +37,8 @@ class EWC(SampledImportance):
         settings: ``num_samples`` and ``heads`` of `SampledImportance`.
     """
 
+    stackable = True
+
     def __init__(self, coeff: float, online: bool, alpha: float, fisher: str, **settings: Any) -> None:
         require(*true_or_false(online=online), *fraction(alpha=alpha), *one_of(("policy", "loss"), fisher=fisher))
         super().__init__(coeff=coeff, **settings)

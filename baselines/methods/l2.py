@@ -17,6 +17,8 @@ class L2(Importance):
     The arguments are those of `Importance`.
     """
 
+    stackable = True
+
     def task_importance(self) -> Tensor:
         """Return 1 for all weights."""
         return torch.ones_like(self.importance)

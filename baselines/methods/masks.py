@@ -29,6 +29,7 @@ class Masks(TaskMethod):
     alone could be kept in P bits.
     """
 
+    stackable = True
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 
     constant: Tensor  # c, float32 [P]
@@ -100,7 +101,7 @@ class Masks(TaskMethod):
         with torch.enable_grad():
             scores = self.current_scores()
         constants = self.weights.split(self.constant)
-        of_scores = [constant * gradient.flatten() for constant, gradient in zip(constants, gradients, strict=True)]
+        of_scores = [c * gradient.reshape(c.shape) for c, gradient in zip(constants, gradients, strict=True)]
         return torch.autograd.grad(scores, self.trainable, of_scores, materialize_grads=True)
 
     def after_step(self) -> None:
@@ -167,8 +168,8 @@ class CombinedMasks(Masks):
         earlier = self.num_combined
         if not earlier:
             return super().current_scores()
-        old = self.weights.split(self.scores[:earlier])
-        return list(map(_combined, self.betas[:, : earlier + 1], old, self.own))
+        old = self.weights.split(self.scores[..., :earlier, :])
+        return list(map(_combined, self.betas[..., : earlier + 1].unbind(-2), old, self.own))
 
 
 def _masked(scores: Tensor, constant: Tensor) -> Tensor:
@@ -176,9 +177,9 @@ def _masked(scores: Tensor, constant: Tensor) -> Tensor:
 
 
 def _combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
-    """Combine earlier scores of a weight tensor, [k, n], with new ones, [n]; shares are a softmax of k + 1."""
-    shares = betas.softmax(dim=0)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
-    return (shares[:-1, None] * old).sum(dim=0) + shares[-1] * new
+    """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n]; shares are a softmax of k + 1."""
+    shares = betas.softmax(dim=-1)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
+    return (shares[..., :-1, None] * old).sum(dim=-2) + shares[..., -1:] * new
 
 
 def _signed_constant(parameter: Tensor) -> Tensor:

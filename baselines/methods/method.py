@@ -25,6 +25,8 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 class Method(Hooks):
     """A method that does nothing, from which others derive: the agent is fine-tuned on one task after the other."""
 
+    stackable = False
+
     needs_task_id: bool = False
     """Whether it needs the id of the task, in learning and in evaluation."""
 

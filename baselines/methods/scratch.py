@@ -18,6 +18,7 @@ class Scratch(TaskMethod):
     Stored are 4 P bytes for each of the curriculum's tasks. Nothing is forgotten and nothing is transferred.
     """
 
+    stackable = True
     agent_members = (*TaskMethod.agent_members, "clear_optimiser_state", "reset_parameters")
 
     kept: Tensor  # float32 [tasks, P]

@@ -1,0 +1,297 @@
+"""Several seeds as one batch: agents of equal structure whose networks act and learn in the same operations.
+
+Only what takes time is stacked, and only for as long as it takes: between two calls each agent is whole, so that saving,
+evaluation and the hooks at task changes are those of an agent alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams
+from torch import Tensor, nn
+from torch.func import vmap
+
+from baselines.learner import Learner, total_loss
+from baselines.methods.method import AgentWithMethod
+from baselines.networks import Data
+from baselines.optimisers import StackedOptimiser, is_stackable, stacked, unstacked
+from ctgraph_rl.agent import Agent
+
+LARGEST_MINIBATCH = 512
+"""Items of the largest minibatches that are stacked: with larger ones, products of one seed keep a core busy."""
+
+
+def why_not_together(agent: Agent) -> str | None:
+    """Return why agents like this one cannot act and learn as one batch; None if they can."""
+    learner = _learner(agent)
+    name = type(learner).__name__
+    if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
+        return f"{name} cannot be vectorised over seeds"
+    if type(learner).learn is not Learner.learn or type(learner).gradient_step is not Learner.gradient_step:
+        return f"{name} learns in a way of its own"
+    if not learner.method.stackable:
+        return f"{type(learner.method).__name__} cannot be vectorised over seeds"
+    if not is_stackable(learner.optimiser):
+        return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
+    return None
+
+
+class Group:
+    """Agents of one configuration with different seeds, which act and learn together.
+
+    Each draws from a generator of its own, in the order in which it draws from torch's global one when alone.
+
+    Args:
+        agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_together` has no objection.
+        generators: of each agent, with the state of torch's global generator after the agent was built.
+    """
+
+    def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
+        self.agents, self.generators = list(agents), list(generators)
+        self.learners = [_learner(agent) for agent in agents]
+        self.template = Template(self.learners[0])
+        self.is_stacked = self.learners[0].minibatch_size <= LARGEST_MINIBATCH
+        self._acting: Stack | None = None
+
+    @contextmanager
+    def random(self, number: int) -> Iterator[None]:
+        """Let torch's global generator be that of one agent."""
+        generator, before = self.generators[number], torch.get_rng_state()
+        torch.set_rng_state(generator.get_state())
+        try:
+            yield
+        finally:
+            generator.set_state(torch.get_rng_state())
+            torch.set_rng_state(before)
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        self._acting = None
+        for number, agent in enumerate(self.agents):
+            with self.random(number):
+                agent.start_task(task)
+
+    def end_task(self) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        self._acting = None
+        for number, agent in enumerate(self.agents):
+            with self.random(number):
+                agent.end_task()
+
+    def policy(self, data: TensorDictBase) -> TensorDictBase:
+        """Write the actions of all agents, [seeds * num_envs], and what they need to learn from them."""
+        if self._acting is None:
+            self._acting = Stack(self.template, self.learners)
+        keys = [key for key in self.learners[0].policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
+        outputs = self._acting.outputs({key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
+        written = self._explored(outputs) if "action_value" in outputs else sampled(outputs, self.generators)
+        for key, value in written.items():
+            data.set(key, value.flatten(0, 1))
+        return data
+
+    def _explored(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the best actions, and where an agent explores random ones."""
+        actions = outputs["action_value"].argmax(dim=-1)
+        for number, (learner, action) in enumerate(zip(self.learners, actions, strict=True)):
+            with self.random(number):
+                action.copy_(learner.exploration(TensorDict({"action": action}, action.shape))["action"])
+        return {"action": actions}
+
+    def learn(self, batch: TensorDictBase) -> list[dict[str, float]]:
+        """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps]; return what each measured."""
+        self._acting = None
+        parts = batch.chunk(len(self.agents))
+        return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
+
+    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float]]:
+        measurements = []
+        for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
+            with self.random(number):
+                measurements.append(agent.learn(part))
+        return measurements
+
+    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float]]:
+        for agent, part in zip(self.agents, parts, strict=True):
+            if isinstance(agent, AgentWithMethod):
+                agent.method.on_batch(part)
+        minibatches = [learner.minibatches(part) for learner, part in zip(self.learners, parts, strict=True)]
+        stack, steps = Stack(self.template, self.learners), []
+        while given := self._next(minibatches):
+            steps.append(self._update(stack, given))
+        stack.write()
+        names = list(steps[0])
+        table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
+        pairs = zip(self.learners, table, strict=True)
+        return [learner.after_batch(learner.means(names, column)) for learner, column in pairs]
+
+    def _next(self, minibatches: Sequence[Iterator[dict[Any, Tensor]]]) -> list[Data]:
+        """Return the next minibatch of each agent; none after the last."""
+        given = []
+        for number, (learner, iterator) in enumerate(zip(self.learners, minibatches, strict=True)):
+            with self.random(number):
+                minibatch = next(iterator, None)
+                given += [] if minibatch is None else [learner.method.transform_minibatch(minibatch)]
+        return given
+
+    def _update(self, stack: Stack, minibatches: Sequence[Data]) -> dict[str, Tensor]:
+        """Take a gradient step of all agents; return what was measured, [seeds] each."""
+        needs_weights = self.learners[0].needs_weights
+        measured = stack.gradient_step({key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]})
+        if type(self.learners[0]).after_update is Learner.after_update:
+            return measured
+        if needs_weights:
+            stack.write()
+        for number, learner in enumerate(self.learners):
+            kept = learner.after_update({key: value[number] for key, value in measured.items()})
+        if needs_weights:
+            stack.read_others()
+        return {key: measured[key] for key in kept}
+
+
+def sampled(outputs: Mapping[str, Tensor], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
+    """Draw actions from categorical distributions, as `torch.multinomial` draws one of each row.
+
+    Args:
+        outputs: ``log_probs``, [seeds, num_envs, num_actions], and ``state_value``.
+        generators: of each seed.
+
+    Returns:
+        ``action`` and ``action_log_prob``, [seeds, num_envs], and ``state_value``.
+    """
+    log_probs = outputs["log_probs"]
+    chances, noise = log_probs.softmax(dim=-1), torch.empty_like(log_probs, memory_format=torch.contiguous_format)
+    for row, generator in zip(noise, generators, strict=True):
+        row.exponential_(generator=generator)
+    action = (chances / noise).argmax(dim=-1)
+    of_action = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+    return {"action": action, "action_log_prob": of_action, "state_value": outputs["state_value"]}
+
+
+class _Place(NamedTuple):
+    """Where a module has a tensor."""
+
+    module: nn.Module
+    name: str
+
+
+def _places(learner: Learner) -> list[_Place]:
+    """Return where a learner has its parameters and buffers, in an order that depends on its structure alone."""
+    modules = [module for module in learner.modules() if not isinstance(module, TensorDictParams)]
+    return [
+        _Place(module, name)
+        for module in modules
+        for kind in (module._parameters, module._buffers)
+        for name, value in kind.items()
+        if value is not None
+    ]
+
+
+class Template:
+    """A copy of a learner with no tensors of its own: it computes with those that are bound to it.
+
+    Args:
+        learner: what is copied.
+    """
+
+    def __init__(self, learner: Learner) -> None:
+        learner.weights  # noqa: B018, a cached property that the copy shall have
+        self.learner = deepcopy(learner)
+        found = _places(self.learner)
+        tensors = [getattr(place.module, place.name) for place in found]
+        first = {id(tensor): number for number, tensor in reversed(list(enumerate(tensors)))}
+        self.numbers = [first[id(tensor)] for tensor in tensors]
+        """For each place the first one with the same tensor."""
+
+        self.weights = [first[id(tensor)] for tensor in self.learner.weights]
+        self.trained = [first[id(tensor)] for tensor in self.learner.trainable]
+        self.places = found
+        for place in found:
+            place.module._parameters.pop(place.name, None)
+            place.module._buffers.pop(place.name, None)
+
+    def bind(self, tensors: Sequence[Tensor], others: Mapping[str, Tensor]) -> Learner:
+        """Give the copy its tensors, one for each place, and the learner's other weights; return it."""
+        for place, tensor in zip(self.places, tensors, strict=True):
+            place.module.__dict__[place.name] = tensor
+        weights = [tensors[number] for number in self.weights]
+        self.learner.__dict__ |= {"weights": weights, "other_weights": lambda: others}
+        if hasattr(self.learner.method, "weights"):
+            self.learner.method.weights.parameters = weights
+        return self.learner
+
+
+class Stack:
+    """The tensors of several learners, [seeds, ...] each, and their gradient step.
+
+    Matrices are kept as [seeds, inputs, outputs], in which their gradients come out of the backward pass.
+
+    Args:
+        template: a copy of one of the learners.
+        learners: whose tensors are read, and written by `write`.
+    """
+
+    def __init__(self, template: Template, learners: Sequence[Learner]) -> None:
+        self.template, self.learners = template, learners
+        self.members = [[getattr(*place) for place in _places(learner)] for learner in learners]
+        self.learned = {*template.weights, *template.trained}
+        self.kept: dict[int, Tensor] = {}
+        self.parameters: set[int] = set()
+        for number in dict.fromkeys(template.numbers):
+            tensors = [each[number].detach() for each in self.members]
+            if isinstance(self.members[0][number], nn.Parameter):
+                self.parameters.add(number)
+            join = stacked if number in self.parameters else torch.stack
+            self.kept[number] = join(tensors).requires_grad_(number in self.learned)
+        self.read_others()
+        optimisers = [learner.optimiser for learner in learners]
+        self.optimiser = StackedOptimiser(optimisers, [self.kept[number] for number in template.trained])
+
+    @property
+    def _tensors(self) -> list[Tensor]:
+        """The tensors of all places, [seeds, ...] each."""
+        seen = {number: unstacked(each) if number in self.parameters else each for number, each in self.kept.items()}
+        return [seen[number] for number in self.template.numbers]
+
+    def read_others(self) -> None:
+        """Read the learners' other weights."""
+        others = [learner.other_weights() for learner in self.learners]
+        self.others = {key: torch.stack([each[key].detach() for each in others]) for key in others[0]}
+
+    @torch.no_grad()
+    def write(self) -> None:
+        """Write the weights and the optimiser's state to the learners."""
+        for number in self.learned:
+            for tensors, value in zip(self.members, unstacked(self.kept[number]), strict=True):
+                tensors[number].copy_(value)
+        self.optimiser.write()
+
+    def outputs(self, data: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Compute the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
+        bind = self.template.bind
+        return vmap(lambda *given: bind(given[0], given[1]).outputs(given[2]))(self._tensors, self.others, data)
+
+    def losses(self, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Compute the losses of all learners, [seeds] each, from minibatches, [seeds, items, ...]."""
+        bind = self.template.bind
+        return vmap(lambda *given: bind(given[0], given[1]).losses(given[2]))(self._tensors, self.others, batch)
+
+    def gradient_step(self, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Take `Learner.gradient_step` of all learners; return losses and gradient norms, [seeds] each."""
+        losses = self.losses(batch)
+        weights = [self.kept[number] for number in self.template.weights]
+        gradients = torch.autograd.grad(total_loss(losses).sum(), weights)
+        learner = self.template.bind(self._tensors, self.others)
+        changed = learner.method.transform_gradients(list(map(unstacked, gradients)))
+        norm = self.optimiser.step(map(unstacked, changed), learner.max_grad_norm)
+        learner.method.after_step()
+        return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
+
+
+def _learner(agent: Agent) -> Any:
+    return agent.agent if isinstance(agent, AgentWithMethod) else agent
