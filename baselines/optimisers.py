@@ -91,7 +91,7 @@ class StackedOptimiser:
 
     def step(self, gradients: Iterable[Tensor], max_norm: float) -> Tensor:
         """Scale the gradients of each seed down to a norm, and take a step; return the norms before, [seeds]."""
-        gradients = list(gradients)
+        gradients = [gradient.contiguous() for gradient in gradients]  # as the fused step needs them
         norms = [torch.linalg.vector_norm(each, dim=tuple(range(1, each.ndim))) for each in gradients]
         norm = torch.linalg.vector_norm(torch.stack(norms), dim=0)
         scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)

@@ -6,7 +6,7 @@ evaluation and the hooks at task changes are those of an agent alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, NamedTuple
@@ -103,20 +103,24 @@ class Group:
                 action.copy_(learner.exploration(TensorDict({"action": action}, action.shape))["action"])
         return {"action": actions}
 
-    def learn(self, batch: TensorDictBase) -> list[dict[str, float]]:
-        """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps]; return what each measured."""
+    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+        """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps].
+
+        Returns:
+            What each measured, or the error that names what is not finite.
+        """
         self._acting = None
         parts = batch.chunk(len(self.agents))
         return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
 
-    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float]]:
-        measurements = []
+    def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
+        measured = []
         for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
             with self.random(number):
-                measurements.append(agent.learn(part))
-        return measurements
+                measured.append(_or_error(agent.learn, part))
+        return measured
 
-    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float]]:
+    def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
         for agent, part in zip(self.agents, parts, strict=True):
             if isinstance(agent, AgentWithMethod):
                 agent.method.on_batch(part)
@@ -128,7 +132,7 @@ class Group:
         names = list(steps[0])
         table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
         pairs = zip(self.learners, table, strict=True)
-        return [learner.after_batch(learner.means(names, column)) for learner, column in pairs]
+        return [_or_error(lambda of, column: of.after_batch(of.means(names, column)), *pair) for pair in pairs]
 
     def _next(self, minibatches: Sequence[Iterator[dict[Any, Tensor]]]) -> list[Data]:
         """Return the next minibatch of each agent; none after the last."""
@@ -152,6 +156,14 @@ class Group:
         if needs_weights:
             stack.read_others()
         return {key: measured[key] for key in kept}
+
+
+def _or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str, float] | FloatingPointError:
+    """Return what a function measures, or its error where that is not finite."""
+    try:
+        return measure(*given)
+    except FloatingPointError as error:
+        return error
 
 
 def sampled(outputs: Mapping[str, Tensor], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:

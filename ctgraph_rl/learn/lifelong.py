@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, Protocol
@@ -23,6 +24,17 @@ from ctgraph_rl.tasks.curriculum import Block, Curriculum
 
 OfferCheckpoint = Callable[[Callable[[], dict[str, Any]], bool], object]
 """Takes a function that makes the run's state, and whether a block ends here; saves the state if it is time."""
+
+
+class Actor(Protocol):
+    """What collects batches: the members of an `Agent` that act."""
+
+    num_steps: int
+    policy: Any
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """See `ctgraph_rl.agent.Agent`."""
+        ...
 
 
 class Progress(Protocol):
@@ -77,14 +89,16 @@ def learn_curriculum(
     if saved is None:
         evaluator.evaluate_if_due(agent, 0)
     frames = 0 if saved is None else saved["frames"]
-    for segment in _segments(curriculum, frames):
+    for segment in segments(curriculum, frames):
         if frames == segment.start:
-            agent.start_task(_announced_id(curriculum, segment.blocks[0]))
+            agent.start_task(announced_id(curriculum, segment.blocks[0]))
             saved = None
-        for batch, carried in _collect(segment, env, agent, evaluator, saved):
+        evaluate = partial(evaluator.evaluate_if_due, agent)
+        restore = None if saved is None else partial(_restore, saved, agent, env)
+        for batch, carried in collect_segment(segment, env, agent, evaluate, done=frames - segment.start, restore=restore):
             frames += batch.numel()
             measurements = _learn(agent, batch, curriculum.block_at(frames), frames)
-            episode_return = _log_training(log, curriculum, batch, frames - batch.numel(), measurements)
+            episode_return = log_training(log, curriculum, batch, frames - batch.numel(), measurements)
             if progress is not None:
                 progress.update(curriculum.block_at(frames), frames, episode_return)
             if checkpoint is not None:
@@ -95,56 +109,72 @@ def learn_curriculum(
     return log
 
 
-class _Segment(NamedTuple):
+class Segment(NamedTuple):
     """Blocks with no announced boundary between them."""
 
     start: int  # frames of the run before it
     blocks: tuple[Block, ...]
 
 
-def _segments(curriculum: Curriculum, frames: int) -> Iterator[_Segment]:
+def segments(curriculum: Curriculum, frames: int) -> Iterator[Segment]:
     """Yield the segments that end after ``frames`` frames of the run, or right there."""
     start = 0
     for blocks in curriculum.segments:
         end = start + sum(block.num_frames for block in blocks)
         if frames <= end:
-            yield _Segment(start, blocks)
+            yield Segment(start, blocks)
         start = end
 
 
-def _collect(
-    segment: _Segment, env: CTGraphEnv, agent: Agent, evaluator: Evaluator, saved: Mapping[str, Any] | None
+def collect_segment(
+    segment: Segment,
+    env: CTGraphEnv,
+    agent: Actor,
+    evaluate: Callable[[int], object],
+    *,
+    done: int = 0,
+    restore: Callable[[], TensorDictBase] | None = None,
+    num_seeds: int = 1,
 ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
     """Yield the batches of a segment, each with the data that the next step starts from.
 
-    A saved state is one between two batches of this segment.
+    Args:
+        segment: what is learned; its frames are those of one seed.
+        env: has the rows of all seeds.
+        agent: what acts.
+        evaluate: called between two steps with the frames of the run so far.
+        done: frames of the segment that were learned before.
+        restore: restores a state between two batches of this segment, and returns the data of the next step.
+        num_seeds: seeds whose rows the environment has, equally many of each.
     """
     ends = list(accumulate(block.num_frames for block in segment.blocks))
     following = dict(zip(ends, segment.blocks[1:], strict=False))
-    done = 0 if saved is None else saved["frames"] - segment.start
-    _set_tasks(env, segment.blocks[sum(end <= done for end in ends[:-1])])
-    carried = None if saved is None else _restore(saved, agent, env)
+    _set_tasks(env, segment.blocks[sum(end <= done for end in ends[:-1])], num_seeds)
+    carried = None if restore is None else restore()
+    num_rows = env.numel() // num_seeds
 
-    def between_steps(frames: int) -> None:
+    def between_steps(of_all_seeds: int) -> None:
+        frames = of_all_seeds // num_seeds
         if frames:
-            evaluator.evaluate_if_due(agent, segment.start + frames)
-        next_end = frames + env.numel()
+            evaluate(segment.start + frames)
+        next_end = frames + num_rows
         if next_end in following:  # so that a row whose episode ends with the block does not begin another of its task
-            _set_tasks(env, following[next_end], at_episode_end=True)
+            _set_tasks(env, following[next_end], num_seeds, at_episode_end=True)
 
-    length, num_steps, state = ends[-1], agent.num_steps, agent.initial_state
-    return batches(env, agent.policy, length, num_steps, state, between_steps=between_steps, carried=carried, done=done)
+    length, num_steps, state = num_seeds * ends[-1], agent.num_steps, agent.initial_state
+    where = {"between_steps": between_steps, "carried": carried, "done": num_seeds * done}
+    return batches(env, agent.policy, length, num_steps, state, **where)
 
 
-def _set_tasks(env: CTGraphEnv, block: Block, at_episode_end: bool = False) -> None:
-    """Give an environment the tasks of a block."""
+def _set_tasks(env: CTGraphEnv, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
+    """Give an environment the tasks of a block, the rows of each seed the same."""
     if block.switch is None:
-        env.set_tasks(block.rows(env.numel()), at_episode_end)
+        env.set_tasks(num_seeds * block.rows(env.numel() // num_seeds), at_episode_end)
     else:
         env.switch_tasks(block.tasks, block.switch, at_episode_end)
 
 
-def _announced_id(curriculum: Curriculum, block: Block) -> int | None:
+def announced_id(curriculum: Curriculum, block: Block) -> int | None:
     """Return the task id that the agent gets at the announced start of a block of one task, unless ids are hidden."""
     how = curriculum.protocol
     known = how.task_id != "hidden" and how.boundaries == "announced" and len(set(block.tasks)) == 1
@@ -153,18 +183,26 @@ def _announced_id(curriculum: Curriculum, block: Block) -> int | None:
 
 def _learn(agent: Agent, batch: TensorDictBase, block: int, frames: int) -> dict[str, float]:
     """Let the agent learn from a batch; a value that is not finite stops the run."""
-    where = f"in block {block} after {frames} frames; the run stops here"
     try:
         measurements = agent.learn(batch)
+        require_finite(measurements)
     except FloatingPointError as error:
-        raise FloatingPointError(f"{error} {where}") from None
-    for name, value in measurements.items():
-        if not math.isfinite(value):
-            raise FloatingPointError(f"{name} is {value} {where}")
+        raise FloatingPointError(f"{error} in block {block} after {frames} frames; the run stops here") from None
     return measurements
 
 
-def _log_training(
+def require_finite(measurements: Mapping[str, float]) -> None:
+    """Refuse a measurement that is not finite.
+
+    Raises:
+        FloatingPointError: names it.
+    """
+    for name, value in measurements.items():
+        if not math.isfinite(value):
+            raise FloatingPointError(f"{name} is {value}")
+
+
+def log_training(
     log: RunLog, curriculum: Curriculum, batch: TensorDictBase, start: int, measurements: Mapping[str, float]
 ) -> float:
     """Append a line for each block that a batch has frames of; return the mean return of the last line."""
@@ -204,16 +242,23 @@ def _restore(saved: Mapping[str, Any], agent: Agent, env: CTGraphEnv) -> TensorD
     Raises:
         ValueError: if it is not one of this agent and curriculum.
     """
-    try:
+    with saved_state_fits():
         agent.load_state_dict(saved["agent"])
         env.load_state_dict(saved["env"])
-    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
-        message = f"the saved state does not fit this agent and curriculum, start again (overwrite=true): {error}"
-        raise ValueError(message) from error
     torch.set_rng_state(saved["random"])
     if saved["random_cuda"] is not None:
         torch.cuda.set_rng_state(saved["random_cuda"], env.device)
     return TensorDict(saved["carried"], env.batch_size, device=env.device)
+
+
+@contextmanager
+def saved_state_fits() -> Iterator[None]:
+    """Say what to do where a saved state is not one of an agent and curriculum."""
+    try:
+        yield
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        message = f"the saved state does not fit this agent and curriculum, start again (overwrite=true): {error}"
+        raise ValueError(message) from error
 
 
 def check_rows(curriculum: Curriculum, num_envs: int) -> None:

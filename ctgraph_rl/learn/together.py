@@ -1,0 +1,195 @@
+"""The loop over a curriculum for several seeds as one batch: one environment, one forward pass, one gradient step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.learn.collect import Policy, make_env
+from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.learn.lifelong import (
+    Progress,
+    announced_id,
+    check_ids,
+    check_rows,
+    collect_segment,
+    log_training,
+    require_finite,
+    saved_state_fits,
+    segments,
+)
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+OfferCheckpoints = Callable[[Callable[[], list[dict[str, Any]]], bool], object]
+"""Takes a function that makes the state of each seed's run, and whether a block ends here."""
+
+
+class Group(Protocol):
+    """Agents of one configuration with different seeds that act and learn together, such as `baselines.together.Group`.
+
+    Between two calls each agent is as if it had learned alone.
+    """
+
+    agents: Sequence[Agent]
+    generators: Sequence[torch.Generator]
+    """What each agent draws from, in place of torch's global generator."""
+
+    policy: Policy
+    """Writes the actions of all rows, [seeds * num_envs], those of a seed one after the other."""
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        ...
+
+    def end_task(self) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        ...
+
+    def learn(self, batch: TensorDictBase) -> Sequence[dict[str, float] | FloatingPointError]:
+        """Learn from a batch, [seeds * num_envs, num_steps]; return what each agent measured, or raised."""
+        ...
+
+
+def why_not_together(curriculum: Curriculum) -> str | None:
+    """Return why seeds cannot learn a curriculum in one environment; None if they can."""
+    shared = any(block.switch is not None and block.switch.together for block in curriculum.blocks)
+    return "its blocks change the tasks of all rows at once" if shared else None
+
+
+def learn_together(
+    curriculum: Curriculum,
+    group: Group,
+    seeds: Sequence[int],
+    logs: Sequence[RunLog],
+    progress: Progress | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    saved: Sequence[Mapping[str, Any]] | None = None,
+    checkpoint: OfferCheckpoints | None = None,
+) -> None:
+    """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
+
+    Each seed has the rows of the environment, the generator, the evaluations and the log that it has alone; no seed's
+    numbers depend on another's data. Losses and actions differ from those of a run alone by rounding.
+
+    Args:
+        curriculum: what to learn; `why_not_together` has no objection.
+        group: the learners.
+        seeds: of each agent.
+        logs: where the measurements of each are appended.
+        progress: is updated after every batch with the mean return of all seeds.
+        device: where the environment lives.
+        saved: the states of all seeds, as ``checkpoint`` was given them, to resume from with the same bits as if the
+            group had never stopped.
+        checkpoint: is offered the states after every batch.
+
+    Raises:
+        ValueError: before any work, as `learn_curriculum` does.
+        FloatingPointError: if a loss or weight of a seed is not finite; names the seed, the block and the frames.
+    """
+    device, [agent, *_] = checked_device(device), group.agents
+    check_rows(curriculum, agent.num_envs)
+    check_ids(curriculum, agent)
+    env = _make_env(curriculum, agent.num_envs, seeds, device)
+    evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
+    actor = _Actor(group, agent.num_steps)
+
+    def evaluate(frames: int) -> None:
+        for evaluator, each in zip(evaluators, group.agents, strict=True):
+            evaluator.evaluate_if_due(each, frames)
+
+    if saved is None:
+        evaluate(0)
+    frames = 0 if saved is None else saved[0]["frames"]
+    for segment in segments(curriculum, frames):
+        if frames == segment.start:
+            group.start_task(announced_id(curriculum, segment.blocks[0]))
+            saved = None
+        place = {"done": frames - segment.start, "num_seeds": len(seeds)}
+        restore = None if saved is None else partial(_restore, saved, group, env)
+        for batch, carried in collect_segment(segment, env, actor, evaluate, restore=restore, **place):
+            start, frames = frames, frames + batch.numel() // len(seeds)
+            block = curriculum.block_at(frames)
+            measured = group.learn(batch)
+            _require_finite(seeds, measured, f"in block {block} after {frames} frames; the run stops here")
+            given = zip(logs, batch.chunk(len(seeds)), measured, strict=True)
+            returns = [log_training(log, curriculum, part, start, each) for log, part, each in given]
+            if progress is not None:
+                progress.update(block, frames, sum(returns) / len(returns))
+            if checkpoint is not None:
+                checkpoint(partial(_states, frames, group, env, carried, logs=logs), curriculum.is_end(frames))
+        group.end_task()
+        evaluate(frames)
+
+
+class _Actor:
+    """The agents of a group as one that acts; none has a recurrent state."""
+
+    def __init__(self, group: Group, num_steps: int) -> None:
+        self.policy, self.num_steps = group.policy, num_steps
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return an empty state."""
+        return TensorDict(batch_size=[num_envs])
+
+
+def _make_env(curriculum: Curriculum, num_envs: int, seeds: Sequence[int], device: torch.device) -> CTGraphEnv:
+    """Return an environment with the rows of each seed as it has them alone, one seed after the other."""
+    env = make_env(curriculum, len(seeds) * curriculum.blocks[0].rows(num_envs), seeds[0], device)
+    seed = torch.tensor(seeds, device=device).repeat_interleave(num_envs)
+    env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(len(seeds)))
+    return env
+
+
+def _require_finite(
+    seeds: Sequence[int], measured: Sequence[dict[str, float] | FloatingPointError], where: str
+) -> None:
+    """Stop if a measurement of a seed is not finite."""
+    for seed, each in zip(seeds, measured, strict=True):
+        try:
+            if isinstance(each, FloatingPointError):
+                raise each
+            require_finite(each)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"seed {seed}: {error} {where}") from None
+
+
+def _states(
+    frames: int, group: Group, env: CTGraphEnv, carried: TensorDictBase, logs: Sequence[RunLog]
+) -> list[dict[str, Any]]:
+    """Return the state of each seed's run, as `learn_curriculum` saves that of one; a run alone cannot resume it."""
+    count = len(group.agents)
+    of_env = {key: value.chunk(count) for key, value in env.state_dict().items()}
+    given = zip(group.agents, group.generators, carried.chunk(count), logs, strict=True)
+    return [
+        {
+            "frames": frames,
+            "agent": agent.state_dict(),
+            "env": {key: parts[number].clone() for key, parts in of_env.items()},
+            "carried": part.clone().to_dict(),
+            "random": generator.get_state(),
+            "random_cuda": None,
+            "log": log.position(),
+        }
+        for number, (agent, generator, part, log) in enumerate(given)
+    ]
+
+
+def _restore(saved: Sequence[Mapping[str, Any]], group: Group, env: CTGraphEnv) -> TensorDictBase:
+    """Restore the saved states; return the data that the next step starts from."""
+    with saved_state_fits():
+        for agent, generator, state in zip(group.agents, group.generators, saved, strict=True):
+            agent.load_state_dict(state["agent"])
+            generator.set_state(state["random"])
+        states = [state["env"] for state in saved]
+        env.load_state_dict({key: torch.cat([state[key] for state in states]) for key in states[0]})
+    num_envs = env.numel() // len(saved)
+    return torch.cat([TensorDict(state["carried"], [num_envs], device=env.device) for state in saved])
