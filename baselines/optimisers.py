@@ -81,7 +81,7 @@ class StackedOptimiser:
 
     def _read(self, parameter: Tensor, own: Sequence[Tensor]) -> dict[str, Tensor]:
         """Return Adam's state of a parameter of all seeds; the optimisers have none before the first step."""
-        states = [optimiser.state.get(each) for optimiser, each in zip(self.optimisers, own, strict=True)]
+        states = [optimiser.state.get(each, {}) for optimiser, each in zip(self.optimisers, own, strict=True)]
         state = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
         state["step"] = torch.full((), 0.0 if self.is_adam else LATE, device=parameter.device)
         if states[0]:

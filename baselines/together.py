@@ -1,6 +1,6 @@
 """Several seeds as one batch: agents of equal structure whose networks act and learn in the same operations.
 
-Only what takes time is stacked, and only for as long as it takes: between two calls each agent is whole, so that saving,
+Weights are stacked for forward passes and gradient steps alone. Between two calls each agent has its own, so saving,
 evaluation and the hooks at task changes are those of an agent alone.
 """
 
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.func import vmap
 
 from baselines.learner import Learner, total_loss
-from baselines.methods.method import AgentWithMethod
+from baselines.methods.method import AgentWithMethod, Method
 from baselines.networks import Data
 from baselines.optimisers import StackedOptimiser, is_stackable, stacked, unstacked
 from ctgraph_rl.agent import Agent
@@ -146,7 +146,8 @@ class Group:
     def _update(self, stack: Stack, minibatches: Sequence[Data]) -> dict[str, Tensor]:
         """Take a gradient step of all agents; return what was measured, [seeds] each."""
         needs_weights = self.learners[0].needs_weights
-        measured = stack.gradient_step({key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]})
+        batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
+        measured = stack.gradient_step(batch)
         if type(self.learners[0]).after_update is Learner.after_update:
             return measured
         if needs_weights:
@@ -233,7 +234,7 @@ class Template:
             place.module.__dict__[place.name] = tensor
         weights = [tensors[number] for number in self.weights]
         self.learner.__dict__ |= {"weights": weights, "other_weights": lambda: others}
-        if hasattr(self.learner.method, "weights"):
+        if isinstance(self.learner.method, Method):
             self.learner.method.weights.parameters = weights
         return self.learner
 
@@ -288,21 +289,26 @@ class Stack:
         bind = self.template.bind
         return vmap(lambda *given: bind(given[0], given[1]).outputs(given[2]))(self._tensors, self.others, data)
 
-    def losses(self, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
-        """Compute the losses of all learners, [seeds] each, from minibatches, [seeds, items, ...]."""
+    def losses(self, batch: dict[Any, Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """Compute the losses of all learners from minibatches, [seeds, items, ...].
+
+        Returns:
+            The losses, [seeds] each, and their gradients by the weights, [seeds, ...] each.
+        """
         bind = self.template.bind
-        return vmap(lambda *given: bind(given[0], given[1]).losses(given[2]))(self._tensors, self.others, batch)
+        losses = vmap(lambda *given: bind(given[0], given[1]).losses(given[2]))(self._tensors, self.others, batch)
+        weights = [self.kept[number] for number in self.template.weights]
+        gradients = torch.autograd.grad(total_loss(losses).sum(), weights)
+        return {key: value.detach() for key, value in losses.items()}, list(map(unstacked, gradients))
 
     def gradient_step(self, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
         """Take `Learner.gradient_step` of all learners; return losses and gradient norms, [seeds] each."""
-        losses = self.losses(batch)
-        weights = [self.kept[number] for number in self.template.weights]
-        gradients = torch.autograd.grad(total_loss(losses).sum(), weights)
+        losses, gradients = self.losses(batch)
         learner = self.template.bind(self._tensors, self.others)
-        changed = learner.method.transform_gradients(list(map(unstacked, gradients)))
+        changed = learner.method.transform_gradients(gradients)
         norm = self.optimiser.step(map(unstacked, changed), learner.max_grad_norm)
         learner.method.after_step()
-        return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
+        return {**losses, "grad_norm": norm}
 
 
 def _learner(agent: Agent) -> Any:

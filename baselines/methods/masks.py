@@ -177,7 +177,7 @@ def _masked(scores: Tensor, constant: Tensor) -> Tensor:
 
 
 def _combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
-    """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n]; shares are a softmax of k + 1."""
+    """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n], by shares of a softmax."""
     shares = betas.softmax(dim=-1)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
     return (shares[..., :-1, None] * old).sum(dim=-2) + shares[..., -1:] * new
 

@@ -95,7 +95,8 @@ def learn_curriculum(
             saved = None
         evaluate = partial(evaluator.evaluate_if_due, agent)
         restore = None if saved is None else partial(_restore, saved, agent, env)
-        for batch, carried in collect_segment(segment, env, agent, evaluate, done=frames - segment.start, restore=restore):
+        done = frames - segment.start
+        for batch, carried in collect_segment(segment, env, agent, evaluate, done=done, restore=restore):
             frames += batch.numel()
             measurements = _learn(agent, batch, curriculum.block_at(frames), frames)
             episode_return = log_training(log, curriculum, batch, frames - batch.numel(), measurements)
@@ -162,7 +163,7 @@ def collect_segment(
             _set_tasks(env, following[next_end], num_seeds, at_episode_end=True)
 
     length, num_steps, state = num_seeds * ends[-1], agent.num_steps, agent.initial_state
-    where = {"between_steps": between_steps, "carried": carried, "done": num_seeds * done}
+    where: dict[str, Any] = {"between_steps": between_steps, "carried": carried, "done": num_seeds * done}
     return batches(env, agent.policy, length, num_steps, state, **where)
 
 

@@ -118,8 +118,8 @@ def learn_together(
         for batch, carried in collect_segment(segment, env, actor, evaluate, restore=restore, **place):
             start, frames = frames, frames + batch.numel() // len(seeds)
             block = curriculum.block_at(frames)
-            measured = group.learn(batch)
-            _require_finite(seeds, measured, f"in block {block} after {frames} frames; the run stops here")
+            where = f"in block {block} after {frames} frames; the run stops here"
+            measured = [_finite(seed, each, where) for seed, each in zip(seeds, group.learn(batch), strict=True)]
             given = zip(logs, batch.chunk(len(seeds)), measured, strict=True)
             returns = [log_training(log, curriculum, part, start, each) for log, part, each in given]
             if progress is not None:
@@ -149,17 +149,15 @@ def _make_env(curriculum: Curriculum, num_envs: int, seeds: Sequence[int], devic
     return env
 
 
-def _require_finite(
-    seeds: Sequence[int], measured: Sequence[dict[str, float] | FloatingPointError], where: str
-) -> None:
-    """Stop if a measurement of a seed is not finite."""
-    for seed, each in zip(seeds, measured, strict=True):
-        try:
-            if isinstance(each, FloatingPointError):
-                raise each
-            require_finite(each)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"seed {seed}: {error} {where}") from None
+def _finite(seed: int, measured: dict[str, float] | FloatingPointError, where: str) -> dict[str, float]:
+    """Return the measurements of a seed, which must be finite."""
+    try:
+        if isinstance(measured, FloatingPointError):
+            raise measured
+        require_finite(measured)
+    except FloatingPointError as error:
+        raise FloatingPointError(f"seed {seed}: {error} {where}") from None
+    return measured
 
 
 def _states(

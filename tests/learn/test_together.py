@@ -1,0 +1,313 @@
+"""Seeds that learn as one batch: each as alone, none changed by another, resumed bit by bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from helpers.kill_runs import equal
+from helpers.scripted import ONE, THREE, TWO, Told, decide, of
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, saved_and_loaded
+
+from baselines import together
+from baselines.optimisers import StackedOptimiser, make_optimiser, stacked
+from baselines.together import Group, Stack, Template, sampled
+from ctgraph_rl import Block, Curriculum, RunLog, learn_curriculum
+from ctgraph_rl.learn.together import learn_together, why_not_together
+from ctgraph_rl.runs.config import target
+from ctgraph_rl.runs.train import new_agent, with_method
+from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
+
+SEEDS = (0, 3, 8)
+
+AGENTS = {
+    "a2c": ["agent.optimiser=rmsprop", "agent.normalize_advantage=true"],
+    "reinforce": [],
+    "ppo": MINIBATCHES,
+    "ppo_count": [*MINIBATCHES, "agent.num_hash_bits=6"],
+    "ppo_published": MINIBATCHES,
+    "dqn": REPLAY,
+    "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
+}
+
+METHODS = ("scratch", "l2", "ewc", "mask_ri", "mask_lc", "mask_blc")
+
+CURRICULUM = of(Block(ONE, 80), Block(THREE, 120), Block(ONE, 56), task_id="at_boundaries")
+"""Blocks of no whole number of batches, which are of 32 frames, and a task that returns."""
+
+
+class Together(NamedTuple):
+    """Learns a curriculum with new agents, one of each seed."""
+
+    make_agent: Any
+    curriculum: Curriculum = CURRICULUM
+
+    def group(self, seeds=SEEDS) -> Group:
+        generators = []
+
+        def built(seed: int):
+            agent = new_agent(self.curriculum, self.make_agent, seed)
+            generators.append(torch.Generator().set_state(torch.get_rng_state()))
+            return agent
+
+        return Group([built(seed) for seed in seeds], generators)
+
+    def learn(self, seeds=SEEDS, saved=None, logs=None, checkpoint=None) -> tuple[Group, list[RunLog]]:
+        group, logs = self.group(seeds), [RunLog() for _ in seeds] if logs is None else logs
+        torch.manual_seed(1234)
+        learn_together(self.curriculum, group, seeds, logs, saved=saved, checkpoint=checkpoint)
+        return group, logs
+
+    def alone(self, seed: int) -> tuple[Any, RunLog]:
+        agent = new_agent(self.curriculum, self.make_agent, seed)
+        return agent, learn_curriculum(self.curriculum, agent, seed)
+
+
+@pytest.fixture
+def make(compose):
+    """Makes a `Together` of an agent's name in `AGENTS`, a method and more settings."""
+
+    def make(name: str = "a2c", method: str = "finetune", *overrides: str, curriculum=CURRICULUM) -> Together:
+        settings = [*TINY, *AGENTS[name], *overrides]
+        cfg = compose(f"agent={name.removeprefix('prioritized ')}", f"method={method}", *settings)
+        make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), curriculum)
+        return Together(make_agent, curriculum)
+
+    return make
+
+
+def lines(log: RunLog) -> list[dict[str, Any]]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in log.measurements]
+
+
+def first_training(log: RunLog) -> dict[str, float]:
+    first = next(line for line in lines(log) if line["kind"] == "training")
+    return {key: value for key, value in first.items() if key != "kind"}
+
+
+def states(group: Group) -> list[tuple[Any, torch.Tensor]]:
+    pairs = zip(group.agents, group.generators, strict=True)
+    return [(saved_and_loaded(agent.state_dict()), generator.get_state()) for agent, generator in pairs]
+
+
+alternating = decide(lambda data: 1 + data["step_count"].squeeze(-1) % 2)
+"""Decisions that depend on the steps of the episode alone."""
+
+
+class ScriptedGroup:
+    """Agents that act by a script, and keep the batches that each is given."""
+
+    def __init__(self, count: int, policy) -> None:
+        self.agents = [Told(policy, num_envs=8, num_steps=4) for _ in range(count)]
+        self.generators, self.policy = [], policy
+
+    def start_task(self, task=None) -> None:
+        pass
+
+    end_task = start_task
+
+    def learn(self, batch):
+        return [agent.learn(part) for agent, part in zip(self.agents, batch.chunk(len(self.agents)), strict=True)]
+
+
+@pytest.mark.parametrize(
+    "curriculum",
+    [
+        of(Block(THREE, 80), Block(ONE, 120)),
+        of(Block(THREE, 80), Block(ONE, 120), boundaries="hidden", task_id="one_hot"),
+        of(Block((ONE, THREE), 80), Block(TWO, 80)),
+        of(Block((ONE, THREE), 96, ByEpisode(2)), Block(TWO, 40), boundaries="hidden"),
+        of(Block((THREE, ONE), 96, AtRandom(0.5)), Block(TWO, 40), boundaries="hidden"),
+    ],
+)
+def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_evaluations_of_a_run_alone(curriculum):
+    group, logs = ScriptedGroup(len(SEEDS), alternating), [RunLog() for _ in SEEDS]
+
+    learn_together(curriculum, group, SEEDS, logs)
+
+    for seed, agent, log in zip(SEEDS, group.agents, logs, strict=True):
+        alone = Told(alternating, num_envs=8, num_steps=4)
+        assert lines(learn_curriculum(curriculum, alone, seed)) == lines(log)
+        for one, other in zip(alone.batches, agent.batches, strict=True):
+            assert equal(one.to_dict(), other.to_dict())
+    pairs = zip(*(agent.batches for agent in group.agents[:2]), strict=True)
+    assert any(not torch.equal(one["observation"], other["observation"]) for one, other in pairs)
+
+
+@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in AGENTS), *(("ppo", m) for m in METHODS)])
+def test_losses_and_gradients_of_the_first_update_are_those_of_a_run_alone(make, monkeypatch, name, method):
+    its, found = make(name, method), {}
+    update = Group._update
+
+    def kept(group, stack, minibatches):
+        if not found:
+            for learner in group.learners:
+                learner.double()
+            in_double = Stack(Template(group.learners[0]), group.learners)
+            batch = {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
+            found["losses"], found["gradients"] = in_double.losses(batch)
+            for number, learner in enumerate(group.learners):
+                losses = learner.losses({key: wide(value) for key, value in minibatches[number].items()})
+                found[number] = losses, torch.autograd.grad(together.total_loss(losses), learner.weights)
+                learner.float()
+        return update(group, stack, minibatches)
+
+    monkeypatch.setattr(Group, "_update", kept)
+    its.learn()
+
+    for number in range(len(SEEDS)):
+        losses, gradients = found[number]
+        assert list(losses) == list(found["losses"])
+        for key, value in losses.items():
+            torch.testing.assert_close(found["losses"][key][number], value, rtol=1e-10, atol=1e-10)
+        for gradient, one in zip(found["gradients"], gradients, strict=True):
+            torch.testing.assert_close(gradient[number], one, rtol=1e-10, atol=1e-10)
+    assert any(gradient.abs().max() > 1e-6 for gradient in found["gradients"])
+
+
+def wide(value: torch.Tensor) -> torch.Tensor:
+    return value.double() if value.is_floating_point() else value
+
+
+@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in AGENTS), *(("ppo", m) for m in METHODS)])
+def test_each_seed_ends_near_its_run_alone(make, name, method):
+    its = make(name, method)
+
+    group, logs = its.learn()
+
+    for seed, agent, log in zip(SEEDS, group.agents, logs, strict=True):
+        alone, its_log = its.alone(seed)
+        assert [line.keys() for line in lines(log)] == [line.keys() for line in lines(its_log)]
+        assert agent.state_dict().keys() == alone.state_dict().keys()
+        assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
+
+
+def test_large_minibatches_are_learned_from_one_seed_after_the_other_by_the_agents_own_code(make, monkeypatch):
+    monkeypatch.setattr(together, "LARGEST_MINIBATCH", 0)
+    its = make("ppo", "ewc")
+
+    group, logs = its.learn()
+
+    assert not group.is_stacked
+    for seed, agent, log in zip(SEEDS, group.agents, logs, strict=True):
+        alone, its_log = its.alone(seed)
+        assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
+        assert agent.state_dict().keys() == alone.state_dict().keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "method"), [("ppo", "ewc"), ("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
+)
+def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
+    its = make(name, method)
+
+    group, logs = its.learn((0, 3, 8))
+    other, other_logs = its.learn((0, 5, 8))
+
+    for number in (0, 2):
+        assert equal(states(group)[number], states(other)[number])
+        assert lines(logs[number]) == lines(other_logs[number])
+    assert not equal(states(group)[1], states(other)[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("ppo", "finetune"), ("ppo", "ewc"), ("ppo_published", "mask_lc"), ("a2c", "scratch"), ("prioritized dqn", "l2")],
+)
+def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_path, name, method):
+    its, kept = make(name, method), []
+
+    def whole_logs(folder: Path) -> list[RunLog]:
+        folder.mkdir()
+        return [RunLog(folder / f"{seed}.jsonl") for seed in SEEDS]
+
+    logs = whole_logs(tmp_path / "whole")
+    group, _ = its.learn(logs=logs, checkpoint=lambda make_states, end: kept.append(saved_and_loaded(make_states())))
+
+    for place in (0, len(kept) // 2, len(kept) - 1):
+        for seed in SEEDS:
+            (tmp_path / f"{seed}.jsonl").write_bytes((tmp_path / "whole" / f"{seed}.jsonl").read_bytes())
+        pairs = zip(SEEDS, kept[place], strict=True)
+        resumed_logs = [RunLog.resume(tmp_path / f"{seed}.jsonl", state["log"]) for seed, state in pairs]
+        resumed, _ = its.learn(saved=kept[place], logs=resumed_logs)
+        assert equal(states(resumed), states(group))
+        assert list(map(lines, resumed_logs)) == list(map(lines, logs))
+
+
+@pytest.mark.parametrize("name", ["adam", "rmsprop"])
+def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name):
+    torch.manual_seed(0)
+    own = [[torch.nn.Parameter(torch.randn(*shape).double()) for shape in ((3, 3), (4,))] for _ in SEEDS]
+    optimisers = [make_optimiser(name, parameters, 0.1) for parameters in own]
+    copies = [[torch.nn.Parameter(each.detach().clone()) for each in parameters] for parameters in own]
+    others = [make_optimiser(name, parameters, 0.1) for parameters in copies]
+
+    for _ in range(2):  # the second time with the state of the first
+        kept = [stacked([each.detach() for each in pair]).requires_grad_() for pair in zip(*own, strict=True)]
+        stack = StackedOptimiser(optimisers, kept)
+        for _ in range(3):
+            gradients = [torch.randn_like(parameter) for parameter in kept]
+            norms = stack.step(gradients, 0.5)
+            for number, parameters in enumerate(copies):
+                parameters[0].grad, parameters[1].grad = (
+                    gradients[0][number].mT.contiguous(),
+                    gradients[1][number].clone(),
+                )
+                norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
+                assert norms[number] == pytest.approx(norm.item(), rel=1e-12)
+                others[number].step()
+        stack.write()
+        for number, parameters in enumerate(own):
+            parameters[0].data.copy_(kept[0][number].mT.detach())
+            parameters[1].data.copy_(kept[1][number].detach())
+
+    for number in range(len(SEEDS)):
+        for one, other in zip(own[number], copies[number], strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+            mine, its = optimisers[number].state[one], others[number].state[other]
+            assert mine.keys() == its.keys()
+            for key in its:
+                torch.testing.assert_close(mine[key], its[key], rtol=1e-12, atol=1e-12)
+
+
+def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generator():
+    log_probs = torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(0)).log_softmax(dim=-1)
+    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
+
+    written = sampled({"log_probs": log_probs, "state_value": log_probs[..., :1]}, generators)
+
+    for number, seed in enumerate(SEEDS):
+        alone = torch.Generator().manual_seed(seed)
+        chances = log_probs[number].softmax(dim=-1)
+        assert torch.equal(written["action"][number], chances.multinomial(1, generator=alone).squeeze(-1))
+        assert torch.equal(alone.get_state(), generators[number].get_state())
+
+
+def test_a_seed_whose_loss_is_not_finite_is_named(make, monkeypatch):
+    its = make("ppo")
+    start = Group.start_task
+
+    def spoiled(group, task=None):
+        start(group, task)
+        group.learners[1].weights[0].data.fill_(torch.nan)
+
+    monkeypatch.setattr(Group, "start_task", spoiled)
+
+    with pytest.raises(FloatingPointError, match=r"seed 3: loss_objective is nan in block 1 after 32 frames; the run"):
+        its.learn()
+
+
+def test_what_cannot_be_one_batch_says_why(compose):
+    def reason(agent: str, method: str = "finetune") -> str | None:
+        cfg = compose(f"agent={agent}", f"method={method}", *TINY)
+        make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), CURRICULUM)
+        return together.why_not_together(new_agent(CURRICULUM, make_agent, 0))
+
+    assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
+    assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds"
+    assert reason("dqn") is reason("ppo", "mask_lc") is None
+    switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
+    assert why_not_together(switching) == "its blocks change the tasks of all rows at once"
+    assert why_not_together(CURRICULUM) is None
