@@ -14,7 +14,7 @@ from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
 from ctgraph_rl.report import results
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
-from ctgraph_rl.report.figures.learning_curves import learning_curves, training_curves
+from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
@@ -23,7 +23,7 @@ from ctgraph_rl.report.terminal import code_notes, mixed_code
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
 
-OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (learning_curves, training_curves)
+OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (mean_curves, learning_curves, training_curves)
 """Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
 
 OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)

@@ -154,6 +154,13 @@ def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED
     return over_seeds([history.evaluations.get(label, []) for history in _histories(runs)], bounds)
 
 
+def mean_curve(history: History) -> Curve:
+    """Return the mean return over all tasks of a run, at the evaluations of all of them."""
+    curves = [dict(history.evaluations.get(label, [])) for label in history.labels]
+    shared = sorted(set.intersection(*map(set, curves))) if curves else []
+    return [(frames, math.fsum(curve[frames] for curve in curves) / len(curves)) for frames in shared]
+
+
 def training_curve(
     runs: Iterable[Run], block: int, *, start: int, end: int, places: int, bounds: Bounds = UNBOUNDED
 ) -> list[Point]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -66,6 +66,28 @@ def short(name: str) -> str:
     """A name that fits into a figure: its middle is left out; for matplotlib, which shows it as it is."""
     name, half = terminal_text(name), LONGEST_NAME // 2
     return figure_text(name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}")
+
+
+def contrast(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the contrast ratio of two colours, 1 to 21, by the Web Content Accessibility Guidelines 2.2.
+
+    Args:
+        one: red, green and blue of sRGB, each in [0, 1].
+        other: in the same way.
+    """
+    dark, light = sorted((_luminance(one), _luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def _luminance(colour: Sequence[float]) -> float:
+    """Return the relative luminance of a colour of sRGB."""
+    linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in colour]
+    return sum(weight * value for weight, value in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def ink(background: Sequence[float]) -> str:
+    """Return the colour of text on a background: the one of black and white with more contrast, at least 4.5."""
+    return "black" if contrast(background, (0, 0, 0)) >= contrast(background, (1, 1, 1)) else "white"
 
 
 def frames_axis(axes: Any) -> None:

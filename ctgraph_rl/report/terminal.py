@@ -28,14 +28,20 @@ WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sam
 MOST_SEEDS = 10
 """Seeds of a configuration that a sentence names."""
 
-MOST_COLUMNS = 6
-"""Tasks that the performance matrix is printed for; more do not fit on a terminal."""
+LONGEST_LABEL = 24
+"""Characters of a task's label in a table with a line for each task; the middle of a longer one is left out."""
 
 BARS, ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-:=+*#"
 """Heights of a curve's points, from the lowest value to the highest."""
 
 MOST_POINTS = 32
 """Characters of a curve; more evaluations share them."""
+
+FEWEST_POINTS = 5
+"""Characters that a curve has at least; where there is less room, it is left out."""
+
+WIDEST = 10**6
+"""Characters of a terminal on which everything fits."""
 
 
 def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
@@ -45,22 +51,28 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     run = read_run(Path(run_dir))
     require((run.history is not None, f"{run_dir} cannot be shown: {run.reason}"))
     assert run.history is not None
-    name, curves = Path(run_dir).name, sparklines(run.history.evaluations, bars)
-    many = len(run.history.labels) > MOST_COLUMNS
-    tables = [_task_table(name, run.history, curves)] if many else [_matrix(name, run.history), _curves(curves)]
+    name = Path(run_dir).name
+    tables = [_matrix(name, run.history), _curves(sparklines(run.history.evaluations, bars))]
+    if any(_width(table) > console.width for table in tables):
+        tables = [_task_table(name, run.history, bars, console.width)]
     for table in (*tables, metrics_table(run.metrics)):
         console.print(table)
+
+
+def _width(table: Table) -> int:
+    """Return the characters of a table's lines where nothing of them is wrapped or cut, its title apart."""
+    return Console(width=WIDEST).measure(table).maximum
 
 
 def _text(plain: str) -> Text:
     return Text(terminal_text(plain))
 
 
-def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS) -> dict[str, str]:
+def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = MOST_POINTS) -> dict[str, str]:
     """A line of text for each task: its mean return at all evaluations, in time order, on one scale for all tasks.
 
-    The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond `MOST_POINTS` share a place,
-    which shows their mean; one without a value is a space.
+    The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond ``most`` share a place, which
+    shows their mean; one without a value is a space.
     """
     known = [value for curve in evaluations.values() for _, value in curve if not math.isnan(value)]
     low, high = min([0.0, *known]), max([1.0, *known])
@@ -69,12 +81,12 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS) -> dict[str, 
         there = [value for value in values if not math.isnan(value)]
         return bars[round((fmean(there) - low) / (high - low) * (len(bars) - 1))] if there else " "
 
-    return {label: "".join(map(bar, _shared(curve))) for label, curve in evaluations.items()}
+    return {label: "".join(map(bar, _shared(curve, most))) for label, curve in evaluations.items()}
 
 
-def _shared(curve: Curve) -> list[list[float]]:
-    """The values of a curve in at most `MOST_POINTS` parts of nearly equal length."""
-    places = min(MOST_POINTS, len(curve))
+def _shared(curve: Curve, most: int) -> list[list[float]]:
+    """Return the values of a curve in at most so many parts of nearly equal length."""
+    places = min(most, len(curve))
     cuts = [len(curve) * place // places for place in range(places + 1)]
     return [[value for _, value in curve[start:end]] for start, end in pairwise(cuts)]
 
@@ -98,23 +110,44 @@ def _curves(curves: Mapping[str, str]) -> Table:
     return table
 
 
-def _task_table(name: str, history: History, curves: Mapping[str, str]) -> Table:
+def _task_table(name: str, history: History, bars: str, width: int) -> Table:
+    """Return a line for each task, with a curve as long as there is room for within a width."""
+    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
+    title = f"{name}: mean return on each task; {where}"
+    room = width - _width(_tasks(title, history, {})) - len("│  ")
+    if room < FEWEST_POINTS:
+        return _tasks(title, history, {})
+    return _tasks(title, history, sparklines(history.evaluations, bars, min(room, MOST_POINTS)))
+
+
+def _tasks(title: str, history: History, curves: Mapping[str, str]) -> Table:
     """Return a line for each task: its return before training, the best one after a block, the last one, and its curve.
 
     The block of a best that is not above 0 is left out: that is of no block.
     """
-    where = f"performance.csv has it after each of {len(history.ends) - 1} blocks"
-    table = Table(title=_text(f"{name}: mean return on each task; {where}"))
-    for heading in ("task", "before", "best", "best after block", "at the end", "curve"):
-        table.add_column(heading, justify="left" if heading in ("task", "curve") else "right")
+    table = Table(title=_text(title))
+    for heading in ("task", "before", "best", "in block", "at end"):
+        table.add_column(heading, justify="left" if heading == "task" else "right")
+    if curves:
+        table.add_column("curve")
     by_task = zip(*(values for _, values in _blocks(history)), strict=True)
     for label, values in zip(history.labels, by_task, strict=True):
-        known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
-        best, block = max(known, default=(math.nan, 0))
-        after = str(-block) if best > 0 else "-"
-        cells = (_shown(values[0]), _shown(best), after, _shown(values[-1]))
-        table.add_row(_text(label), *cells, _text(curves.get(label, "")))
+        curve = [_text(curves.get(label, ""))] if curves else []
+        table.add_row(_text(_shortened(label)), *_summary(values), *curve)
     return table
+
+
+def _summary(values: Sequence[float]) -> tuple[str, ...]:
+    """Return a task's return before training, its best after a block, that block, and its last one."""
+    known = [(value, -block) for block, value in enumerate(values) if block and not math.isnan(value)]
+    best, block = max(known, default=(math.nan, 0))
+    return _shown(values[0]), _shown(best), str(-block) if best > 0 else "-", _shown(values[-1])
+
+
+def _shortened(label: str) -> str:
+    """Return a label of at most `LONGEST_LABEL` characters; the middle of a longer one is left out."""
+    half = LONGEST_LABEL // 2
+    return label if len(label) <= LONGEST_LABEL else f"{label[: half - 2]}...{label[1 - half :]}"
 
 
 def _blocks(history: History) -> list[tuple[int, list[float]]]:

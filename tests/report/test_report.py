@@ -58,9 +58,9 @@ def test_many_tasks_are_a_line_each(tmp_path):
     labels = [f"goal{number}" for number in range(7)]
     returns = [[0.0] * 7, [1.0, *[0.25] * 6], [0.5, *[0.25] * 5, math.nan]]
 
-    rows = shown(write_run(tmp_path / "run", performance=returns, labels=labels), 90)
+    rows = shown(write_run(tmp_path / "run", performance=returns, labels=labels), 69)
 
-    assert ["task", "before", "best", "best after block", "at the end", "curve"] in rows
+    assert ["task", "before", "best", "in block", "at end", "curve"] in rows
     assert ["goal0", "0.00", "1.00", "1", "0.50", "▁█▅"] in rows
     assert ["goal1", "0.00", "0.25", "1", "0.25", "▁▃▃"] in rows
     assert ["goal6", "0.00", "0.25", "1", "-", "▁▃"] in rows
@@ -69,7 +69,23 @@ def test_many_tasks_are_a_line_each(tmp_path):
 def test_a_task_that_is_never_above_0_has_no_best_block(tmp_path):
     run_dir = write_run(tmp_path / "run", performance=[[0.0] * 7] * 2, labels=[f"goal{i}" for i in range(7)])
 
-    assert ["goal0", "0.00", "0.00", "-", "0.00", "▁▁"] in shown(run_dir, 90)
+    assert ["goal0", "0.00", "0.00", "-", "0.00", "▁▁"] in shown(run_dir, 70)
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("length", [7, 16, 40])
+@pytest.mark.parametrize("tasks", [1, 4, 6, 40])
+def test_a_terminal_shows_every_task_whatever_the_length_of_their_names(tmp_path, tasks, length, width):
+    labels = [f"{number}{'x' * (length - 4)}{number}" for number in range(10, 10 + tasks)]
+    run_dir = write_run(tmp_path / "run", performance=[[0.125] * tasks] * (tasks + 1), labels=labels)
+    console = Console(file=io.StringIO(), width=width)
+
+    print_summary(run_dir, console)
+
+    printed = console.file.getvalue()
+    assert "…" not in printed
+    assert max(map(len, printed.splitlines())) <= width
+    assert all(f" {label[:5]}" in printed and f"{label[-5:]} " in printed for label in labels)
 
 
 def test_an_undefined_metric_shows_why(run_dir):

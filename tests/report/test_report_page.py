@@ -49,7 +49,7 @@ def test_a_report_is_four_kinds_of_files_within_the_one_folder_given(tmp_path):
     folder = tmp_path / "runs" / "report"
     assert report.page == folder / "report.html"
     assert sorted(path.name for path in folder.iterdir()) == ["figures", "report.html", "report.md", "tables.tex"]
-    kinds = ("two-PPO-transfer", "two-curves", "two-training")
+    kinds = ("two-PPO-transfer", "two-curves", "two-mean", "two-training")
     assert sorted(path.name for path in (folder / "figures").iterdir()) == [
         f"{kind}.{ending}" for kind in kinds for ending in ("pdf", "png")
     ]
@@ -209,7 +209,7 @@ def test_more_agents_than_colours_are_in_the_tables_and_it_is_said(tmp_path):
     assert "The first 6 of 8 agents are shown." in html
     assert "2 more agents, in the tables only" in html
     assert "| Agent7 | average performance |" in markdown
-    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 6 + 2
+    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 6 + 3
 
 
 @pytest.mark.parametrize("tasks", [1, 12, 40])
@@ -220,7 +220,7 @@ def test_any_number_of_tasks_has_its_figures(tmp_path, tasks):
 
     html, _, _ = written(tmp_path / "out", run)
 
-    assert html.count("<figure>") == 3
+    assert html.count("<figure>") == 4
     assert ("The first 32 of 40 tasks are shown." in html) == (tasks == 40)
     columns = "l" * (tasks + 1)
     assert (rf"\begin{{tabular}}{{{columns}}}" in (tmp_path / "out" / "tables.tex").read_text()) == (tasks <= 10)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ctgraph_rl.report.figures.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.figures.trees import Trees
 from ctgraph_rl.report.sections import Matrix, Result, Section
-from ctgraph_rl.report.style import WIDTH, new_figure, short
+from ctgraph_rl.report.style import WIDTH, ink, new_figure, short
 
 MOST_NUMBERS = 10
 """Tasks up to which cells have numbers."""
@@ -22,6 +22,9 @@ MOST_NAMES = 32
 
 NEGATIVE = -0.05
 """Share of the scale from which on a cell without number is marked as negative."""
+
+NO_VALUE = (0.85, 0.85, 0.85)
+"""Colour of a cell without a value."""
 
 Values = list[list[float]]
 
@@ -61,9 +64,9 @@ def draw_performance(axes: Any, matrix: Matrix, labels: Sequence[str], trained: 
     values = _values(matrix)
     known = [value for row in values for value in row if not math.isnan(value)]
     low, high = min([0.0, *known]), max([1.0, *known])
-    _show(axes, values, "viridis", low, high)
+    image = _show(axes, values, "viridis", low, high)
     _name(axes, labels, len(values), 0)
-    _write(axes, matrix, lambda value: "white" if value < low + 0.6 * (high - low) else "black", "")
+    _write(axes, matrix, image, "")
     _box(axes, trained, 1)
     axes.set(ylabel="after block", title="mean return on each task")
 
@@ -72,9 +75,9 @@ def draw_transfer(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Seq
     """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
     values = _values(matrix)
     largest = max([abs(value) for row in values for value in row if not math.isnan(value)], default=0.0) or 1.0
-    _show(axes, values, "PuOr", -largest, largest)
+    image = _show(axes, values, "PuOr", -largest, largest)
     _name(axes, labels, len(values), 1)
-    _write(axes, matrix, lambda value: "white" if abs(value) > 0.7 * largest else "black", "+")
+    _write(axes, matrix, image, "+")
     if len(labels) > MOST_NUMBERS:
         cells = [(j, i) for i, row in enumerate(values) for j, value in enumerate(row) if value < NEGATIVE * largest]
         axes.plot(*(zip(*cells, strict=True) if cells else ((), ())), marker="_", linestyle="", color="black")
@@ -86,12 +89,13 @@ def _values(matrix: Matrix) -> Values:
     return [[math.nan if cell.value is None else cell.value for cell in row] for row in matrix]
 
 
-def _show(axes: Any, values: Values, colours: str, low: float, high: float) -> None:
-    """The cells, with a scale beside them; what has no value is grey."""
-    axes.set_facecolor("0.85")
+def _show(axes: Any, values: Values, colours: str, low: float, high: float) -> Any:
+    """Draw the cells, with a scale beside them; what has no value is grey."""
+    axes.set_facecolor(NO_VALUE)
     image = axes.imshow(values or [[math.nan]], cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
     axes.figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
     axes.spines[:].set_visible(False)
+    return image
 
 
 def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
@@ -107,14 +111,14 @@ def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
     axes.tick_params(length=0)
 
 
-def _write(axes: Any, matrix: Matrix, ink: Callable[[float], str], sign: str) -> None:
-    """Each mean in its cell, with its interval where there is room."""
+def _write(axes: Any, matrix: Matrix, image: Any, sign: str) -> None:
+    """Write each mean into its cell, with its interval where there is room."""
     tasks = len(matrix[0]) if matrix else 0
     if tasks > MOST_NUMBERS:
         return
     for i, row in enumerate(matrix):
         for j, cell in enumerate(row):
-            colour = "black" if cell.value is None else ink(cell.value)
+            colour = ink(NO_VALUE if cell.value is None else image.to_rgba(cell.value)[:3])
             words = "-" if cell.value is None else f"{cell.value:{sign}.2f}" if cell.value else "0"
             if cell.low is not None and cell.high is not None and tasks <= MOST_INTERVALS:
                 words += f"\n[{cell.low:.2f}, {cell.high:.2f}]"

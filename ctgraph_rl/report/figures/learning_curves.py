@@ -9,7 +9,16 @@ from typing import Any
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
-from ctgraph_rl.report.sections import FEWEST_FOR_BANDS, Point, Result, Section, evaluation_curve, training_curve
+from ctgraph_rl.report.sections import (
+    FEWEST_FOR_BANDS,
+    Point,
+    Result,
+    Section,
+    evaluation_curve,
+    mean_curve,
+    over_seeds,
+    training_curve,
+)
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
 
 MOST_TASKS = 32
@@ -26,6 +35,10 @@ Places = Sequence[tuple[float, float]]
 """Values after numbers of frames."""
 
 COLUMNS = 4
+
+MARGIN = 0.03
+"""Share of the frames that an axis shows beside them."""
+
 PLACES = 160
 """Means over equal numbers of frames that the return while training is shown as, in all blocks together."""
 
@@ -41,6 +54,18 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
         "Grey: blocks that train the task; dashed: ends of blocks."
     )
     return CaptionedFigure("curves", "Learning curves", caption, draw_tasks(section))
+
+
+def mean_curves(section: Section) -> CaptionedFigure | None:
+    """Return the mean return over all tasks of all agents at evaluations; None without a finished run."""
+    if not any(result.finished for result in section.results):
+        return None
+    caption = (
+        f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "
+        f"from. {_agents(section)} Lines: means over seeds, where each has a value; bands: {BANDS}; thin lines: single "
+        f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
+    )
+    return CaptionedFigure("mean", "Mean return over all tasks", caption, draw_mean(section))
 
 
 def training_curves(section: Section) -> CaptionedFigure | None:
@@ -77,6 +102,19 @@ def draw_tasks(section: Section) -> Any:
             _draw(axes, position, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
         axes.set_title(short(label))
     _finish(figure, grid, section, "mean return")
+    return figure
+
+
+def draw_mean(section: Section) -> Any:
+    """Draw the mean return over all tasks, a curve for each agent."""
+    figure = new_figure(WIDTH, 2.3)
+    axes = figure.subplots()
+    _mark_blocks(axes, section, None)
+    for position, result in enumerate(section.results[:MOST_AGENTS]):
+        seeds = [curve for run in result.finished if run.history for curve in [mean_curve(run.history)] if curve]
+        points = over_seeds(seeds, result.bounds.of_returns)
+        _draw(axes, position, [points], seeds if len(seeds) <= MOST_SEEDS else [])
+    _finish(figure, [[axes]], section, "mean return over all tasks")
     return figure
 
 
@@ -152,7 +190,8 @@ def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
     low, high = min([0.0, *known]), max([1.0, *known])
     room = 0.05 * (high - low)
     panels[0].set_ylim(low - room, high + room)
-    panels[0].set_xlim(0, max(section.ends[-1], 1))
+    last = max(section.ends[-1], 1)
+    panels[0].set_xlim(-MARGIN * last, (1 + MARGIN) * last)  # room for marks at the ends
     for row in grid:
         row[0].set_ylabel(ylabel)
     for axes in panels:

@@ -1,0 +1,100 @@
+"""What figures of the report show, as drawn: numbers that can be read, and marks that are whole."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from helpers.made_runs import write_run
+
+from ctgraph_rl.report.sections import mean_curve, sections
+from ctgraph_rl.runs.read import find_runs
+
+pytest.importorskip("matplotlib")
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+
+from ctgraph_rl.report.figures.heatmaps import draw_matrices
+from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks
+from ctgraph_rl.report.style import contrast, ink, style
+
+
+@pytest.fixture
+def section(tmp_path):
+    """Three seeds of an agent, whose values go over the whole scale."""
+    for seed, value in enumerate((0.3, 0.5, 0.7)):
+        write_run(tmp_path / f"{seed}", seed=seed, performance=((0.0, math.nan), (1.0, value), (1 - value, 0.9)))
+    return sections(find_runs([tmp_path])[0])[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "ratio"),
+    [
+        ((0, 0, 0), (1, 1, 1), 21),
+        ((1, 0, 0), (1, 1, 1), 3.998),
+        ((0x76 / 255,) * 3, (1, 1, 1), 4.542),
+        ((0, 0, 1), (0, 0, 0), 2.444),
+    ],
+)
+def test_contrast_is_that_of_the_web_guidelines(one, other, ratio):
+    assert contrast(one, other) == contrast(other, one) == pytest.approx(ratio, abs=1e-3)
+
+
+@pytest.mark.parametrize("colours", ["viridis", "PuOr"])
+def test_numbers_on_every_colour_of_a_map_have_a_contrast_of_at_least_4_5(colours):
+    shades = [mpl.colormaps[colours](i)[:3] for i in range(256)]
+
+    assert min(contrast(shade, to_rgb(ink(shade))) for shade in shades) >= 4.5
+
+
+def test_each_number_is_written_in_the_ink_of_its_own_cell(section):
+    with style():
+        figure = draw_matrices(section, section.results[0])
+
+    for axes in figure.axes[:2]:
+        (image,) = axes.images
+        for text in axes.texts:
+            column, row = text.get_position()
+            value = image.get_array()[row, column]
+            shade = axes.get_facecolor() if math.isnan(value) else image.to_rgba(value)
+            assert contrast(shade[:3], to_rgb(text.get_color())) >= 4.5
+        assert len(axes.texts) == image.get_array().size
+
+
+@pytest.mark.parametrize("draw", [draw_mean, draw_tasks])
+def test_no_marker_is_cut_at_the_edge_of_its_panel(section, draw):
+    with style():
+        figure = draw(section)
+        FigureCanvasAgg(figure).draw()
+
+    for axes in figure.axes:
+        box = axes.get_window_extent()
+        for line in axes.lines:
+            if line.get_marker() in ("", "None"):
+                continue
+            radius = line.get_markersize() / 2 * figure.dpi / 72
+            for x, y in axes.transData.transform(line.get_xydata()):
+                assert box.x0 <= x - radius and x + radius <= box.x1
+                assert box.y0 <= y - radius and y + radius <= box.y1
+
+
+def test_the_mean_over_all_tasks_is_of_evaluations_of_all_of_them(section):
+    history = section.results[0].finished[0].history
+
+    curve = mean_curve(history)
+
+    assert [frames for frames, _ in curve] == [0, 1000, 2000]
+    assert math.isnan(curve[0][1])
+    assert [value for _, value in curve[1:]] == pytest.approx([0.65, 0.8])
+
+
+def test_few_seeds_are_thin_lines_beside_their_mean_and_no_band(section):
+    with style():
+        (axes,) = draw_mean(section).axes
+
+    widths = sorted(line.get_linewidth() for line in axes.lines if line.get_linestyle() == "-")
+
+    assert widths == [0.4, 0.4, 0.4, 1.4]
+    assert not axes.collections
