@@ -42,7 +42,7 @@ from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.policies import OptimalPolicy
-from ctgraph_rl.report import results
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.runs.read import find_runs
 from ctgraph_rl.runs.train import new_agent, train, with_method
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
@@ -353,10 +353,10 @@ def file_case(draw: random.Random, folder: Path, _: Any) -> tuple[str, str | Non
             lambda: (log().performance(), log().ends(), log().curves(), log().regimes()),
             lambda: write_tables(log(), run),
             lambda: write_l2logger(log().regimes(), run / f"l2logger{draw.random()}"),
-            lambda: results.text(results.table(find_runs([run])[0])),
+            lambda: formats.text(results.table(find_runs([run])[0])),
             lambda: load(run),
         ],
-        METRICS: [lambda: results.text(results.table(find_runs([run])[0]))],
+        METRICS: [lambda: formats.text(results.table(find_runs([run])[0]))],
         AGENT: [lambda: load(run)],
         "task.json": [lambda: Task.from_json(run / "task.json", (1, 1))],
     }[name]

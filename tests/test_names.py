@@ -23,7 +23,7 @@ import curricula
 from ctgraph_rl import RunLog, describe
 from ctgraph_rl.log import escape
 from ctgraph_rl.log.tables import write_tables
-from ctgraph_rl.report import results
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.style import short
@@ -177,10 +177,10 @@ def outputs(folder: Path, run: Path) -> dict[str, str]:
     print_summary(run, console)
     return {
         "html": (folder / "report" / "report.html").read_text(),
-        "markdown": (folder / "report" / "report.md").read_text() + "\n\n" + results.markdown(rows),
-        "latex": (folder / "report" / "tables.tex").read_text() + results.latex(rows),
+        "markdown": (folder / "report" / "report.md").read_text() + "\n\n" + formats.markdown(rows),
+        "latex": (folder / "report" / "tables.tex").read_text() + formats.latex(rows),
         "csv": (folder / "results.csv").read_bytes().decode(),
-        "terminal": results.text(rows) + console.file.getvalue(),
+        "terminal": formats.text(rows) + console.file.getvalue(),
     }
 
 

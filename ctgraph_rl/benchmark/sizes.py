@@ -24,7 +24,7 @@ from ctgraph_rl.log.files import LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog, write_metrics
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import write_tables
-from ctgraph_rl.report import results
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.runs.read import find_runs
 from ctgraph_rl.tasks.configurations import ct_su_b1
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -126,7 +126,7 @@ def readers_of_logs(curriculum: Curriculum, run: Path) -> Iterator[tuple[str, Ca
     yield "`scores`", lambda: scores(log, curriculum)
     yield "`write_metrics`", lambda: write_metrics(run / METRICS, scores(log, curriculum))
     yield "`write_tables`", lambda: write_tables(log, run, parquet=False)
-    yield "`ctgraph-rl results`, report tables", lambda: results.text(results.table(find_runs([run])[0]))
+    yield "`ctgraph-rl results`, report tables", lambda: formats.text(results.table(find_runs([run])[0]))
 
 
 def measured(sizes: Sequence[int]) -> list[Cost]:

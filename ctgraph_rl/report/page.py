@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
-from ctgraph_rl.log.escape import latex_text, markdown_text, terminal_text
-from ctgraph_rl.report import results
+from ctgraph_rl.log.escape import markdown_text, terminal_text
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
+from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table, latex
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
@@ -71,12 +72,19 @@ class Part(NamedTuple):
     section: Section
     facts: list[tuple[str, Any]]
     figures: list[Written]
-    table: results.Page
-    everything: results.Page | None  # the table of every measure
+    matrix: formats.Matrix  # agents by the most important measures
+    table: formats.Page  # the same, a line each
+    everything: formats.Page | None  # the table of every measure
     agents: list[AgentPart]
     unshown: int  # agents without figures
     runs: list[tuple[str, ...]]
     systems: list[tuple[str, int]]  # where the runs ran, and how many
+
+    @property
+    def by_agent(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        """The table of agents and measures as texts: its head and its rows."""
+        lines = [(agent, *(f"{c.value} {c.interval}".strip() for c in cells)) for agent, cells in self.matrix.rows]
+        return ("agent", *self.matrix.head), lines
 
 
 def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) -> Report:
@@ -104,8 +112,8 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
         "parts": parts,
         "problems": problems,
         "code": [*mixed_code(runs), *code_notes(runs)],
-        "legend": results.LEGEND,
-        "legend_of_means": results.MEANS,
+        "legend": formats.LEGEND,
+        "legend_of_means": formats.MEANS,
         "definitions": _definitions(parts),
         "version": __version__,
         "missing": [run for part in parts for run in part.section.runs if run.reason is not None],
@@ -148,8 +156,9 @@ def _part(section: Section, gallery: Gallery) -> Part:
         section,
         facts=list(facts(section)),
         figures=gallery.write((section.name,), (draw(section) for draw in OF_SECTION)),
-        table=next(results.pages(results.selected(section.rows))),
-        everything=next(results.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
+        matrix=next(formats.matrices(results.selected(section.rows))),
+        table=next(formats.pages(results.selected(section.rows))),
+        everything=next(formats.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
         unshown=max(0, len(section.results) - MOST_AGENTS),
         runs=[row for result in section.results for row in _runs(result)],
@@ -241,21 +250,20 @@ def _definitions(parts: Sequence[Part]) -> list[tuple[str, str, str, str]]:
 
 
 def _latex(parts: Sequence[Part]) -> str:
-    """Tables for papers: the measures of each curriculum, and each agent's matrices."""
-    found = ["% needs \\usepackage{booktabs}"]
+    """Return tables for papers: the measures of each curriculum, and each agent's matrices."""
+    labels, found = Labels(), [PREAMBLE]
     for part in parts:
-        found.append(results.latex(results.selected(part.section.rows)))
+        found += [formats.as_latex(part.matrix, labels)]
         for agent in part.agents:
             for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
                 who = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n})"
-                found.append(_latex_table(f"{who}: {numbers.title}; {results.MEANS}", numbers))
+                label = labels.new(part.section.name, agent.result.agent, numbers.title)
+                caption = f"{who}: {numbers.title}; {formats.MEANS}."
+                found.append(latex(Table(caption, label, numbers.head[0], numbers.head[1:], _named_cells(numbers))))
     return "\n\n".join(found) + "\n"
 
 
-def _latex_table(caption: str, numbers: Numbers) -> str:
-    rows = [[*map(latex_text, numbers.head)], *([*map(results.latex_value, row)] for row in numbers.rows)]
-    lines = [" & ".join(row) + r" \\" for row in rows]
-    title, columns = rf"\caption{{{latex_text(caption)}}}", "l" * len(numbers.head)
-    head = [r"\begin{table}", title, rf"\begin{{tabular}}{{{columns}}}"]
-    tail = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
-    return "\n".join([*head, r"\toprule", lines[0], r"\midrule", *lines[1:], *tail])
+def _named_cells(numbers: Numbers) -> list[tuple[str, list[Cell]]]:
+    """Return the rows of a matrix, each with its name and its cells."""
+    split = [(name, [cell.partition(" ") for cell in cells]) for name, *cells in numbers.rows]
+    return [(name, [Cell(value, interval) for value, _, interval in cells]) for name, cells in split]

@@ -12,19 +12,19 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
-from ctgraph_rl.log.escape import csv_text, latex_text, markdown_text, terminal_lines, terminal_text
+from ctgraph_rl.log.escape import csv_text, terminal_lines
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.formats import FORMATS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.report.terminal import print_problems
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
@@ -38,8 +38,8 @@ AGAINST_EXPERTS = (
 )
 """Metrics that are shown where some run of a curriculum has a value."""
 
-SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "mean_final_return", "solved_rate")
-"""Measures that are always shown."""
+SHOWN = (*(metric.__name__ for metric in metrics.SUMMARY), "solved_rate")
+"""Measures that are always shown; ``mean_final_return`` is the average performance of runs that were evaluated last."""
 
 _HERE = metrics.record.HERE
 AT_END = {
@@ -59,12 +59,6 @@ AT_END = {
     ),
 }
 """Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
-
-NO_RUN_FINISHED = "every_metric"
-"""The measure of the only row of an agent none of whose runs finished."""
-
-MEANS = "mean [95 % interval]"
-LEGEND = f"{MEANS}, share of solved seeds [exact one], median of times [exact one]"
 
 HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
 
@@ -156,101 +150,6 @@ def _cells(row: Row) -> list[Any]:
     e = row.estimate
     numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
     return [row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note]
-
-
-def text(rows: Sequence[Row]) -> str:
-    """The table for a terminal: under each curriculum and agent a line for each measure."""
-    return "\n\n".join([LEGEND, *map(_text, pages(rows))])
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """A table in Markdown for each curriculum."""
-    return "\n\n".join(map(_markdown, pages(rows)))
-
-
-def latex(rows: Sequence[Row]) -> str:
-    """A table in LaTeX for each curriculum, for the package ``booktabs``."""
-    return "\n\n".join(map(_latex, pages(rows)))
-
-
-FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
-SENTENCES: dict[str, Callable[[str], str]] = {
-    **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
-}
-
-
-class Line(NamedTuple):
-    """A row as it is shown."""
-
-    agent: str
-    measure: str
-    value: str
-    n: str
-    mark: str  # number of its note, or nothing
-
-
-class Page(NamedTuple):
-    """The lines of a curriculum, and their notes in the order of their numbers."""
-
-    curriculum: str
-    lines: list[Line]
-    notes: list[str]
-
-
-def pages(rows: Sequence[Row]) -> Iterator[Page]:
-    """The rows as they are shown, for each curriculum."""
-    for curriculum in dict.fromkeys(row.curriculum for row in rows):
-        its = [row for row in rows if row.curriculum == curriculum]
-        notes = list(dict.fromkeys(row.note for row in its if row.note))
-        yield Page(curriculum, [_line(row, notes) for row in its], notes)
-
-
-def _line(row: Row, notes: list[str]) -> Line:
-    value, _, n = str(row.estimate).partition(" n = ")
-    mark = str(notes.index(row.note) + 1) if row.note else ""
-    return Line(row.agent, row.measure.replace("_", " "), value, n, mark)
-
-
-def _text(page: Page) -> str:
-    lines = [Line(*map(terminal_text, line)) for line in page.lines]
-    measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
-    shown, agent = [terminal_text(page.curriculum)], None
-    for line in lines:
-        if line.agent != agent:
-            agent = line.agent
-            shown.append(f"  {agent}")
-        note = f"({line.mark})" if line.mark else ""
-        shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
-    notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
-    shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
-    return "\n".join(shown)
-
-
-def _markdown(page: Page) -> str:
-    columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
-    head = [f"### {markdown_text(page.curriculum)}", "", LEGEND, "", *columns]
-    lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
-    notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
-    return "\n".join([*head, *lines, *([""] if notes else []), *notes])
-
-
-def _latex(page: Page) -> str:
-    caption = rf"\caption{{{latex_text(page.curriculum)}: {latex_text(LEGEND)}}}"
-    columns = r"agent & measure & over seeds & $n$ \\"
-    head = [r"\begin{table}", caption, r"\begin{tabular}{llll}", r"\toprule", columns, r"\midrule"]
-    notes = [rf"\par\footnotesize $^{{{number}}}$ {latex_text(note)}" for number, note in enumerate(page.notes, 1)]
-    lines = map(_latex_line, page.lines)
-    return "\n".join([*head, *lines, r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"])
-
-
-def _latex_line(line: Line) -> str:
-    mark = rf"$^{{{line.mark}}}$" if line.mark else ""
-    return rf"{latex_text(line.agent)} & {latex_text(line.measure)} & {latex_value(line.value)}{mark} & {line.n} \\"
-
-
-def latex_value(value: str) -> str:
-    """A number and its interval with signs, or a dash for none."""
-    return "--" if value == "-" else value.replace("-", "$-$").replace("inf", r"$\infty$")
 
 
 def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:

@@ -14,6 +14,7 @@ from itertools import accumulate, pairwise, zip_longest
 from typing import NamedTuple
 
 from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
+from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
@@ -133,7 +134,7 @@ class Section:
         for run in self.runs:
             for metric in run.metrics.values():
                 known[metric["definition"]] = (metric.get("formula", ""), metric.get("source", ""))
-        names = {row.definition: row.measure.split(" ")[0] for row in self.rows if row.definition}
+        names = {row.definition: measure_name(row.measure.split(" ")[0]) for row in self.rows if row.definition}
         return {which: (names[which], *known[which]) for which in names}
 
 

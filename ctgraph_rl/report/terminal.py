@@ -18,6 +18,7 @@ from rich.text import Text
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.provenance import NUMBERS
+from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
@@ -167,7 +168,7 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
     for name in (*ALWAYS, *(name for name in WITH_EXPERTS if metrics.get(name, {}).get("value") is not None)):
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
-        table.add_row(name.replace("_", " "), value, _text(metric["undefined"] or metric["formula"]))
+        table.add_row(measure_name(name), value, _text(metric["undefined"] or metric["formula"]))
     return table
 
 

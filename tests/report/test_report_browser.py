@@ -80,7 +80,7 @@ def test_every_figure_is_decoded_and_nothing_is_fetched(report, tmp_path):
 
     widths = [int(width) for width in body["data-widths"].split()]
     assert POLICY.search(html)
-    assert count == 4
+    assert count == 5
     assert len(widths) == count and min(widths) > 500
     assert body["data-fetched"] == ""
 

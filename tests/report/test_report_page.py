@@ -222,8 +222,8 @@ def test_any_number_of_tasks_has_its_figures(tmp_path, tasks):
 
     assert html.count("<figure>") == 4
     assert ("The first 32 of 40 tasks are shown." in html) == (tasks == 40)
-    columns = "l" * (tasks + 1)
-    assert (rf"\begin{{tabular}}{{{columns}}}" in (tmp_path / "out" / "tables.tex").read_text()) == (tasks <= 10)
+    paper = (tmp_path / "out" / "tables.tex").read_text()
+    assert (": Mean return after each block;" in paper) == (tasks <= 10)
 
 
 def test_a_missing_package_names_the_extra_before_any_work(tmp_path, monkeypatch):

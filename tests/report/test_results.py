@@ -12,7 +12,7 @@ from helpers.made_runs import all_runs, line, make_run
 
 from ctgraph_rl import metrics
 from ctgraph_rl.log.run_log import write_metrics
-from ctgraph_rl.report import results
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.results import comparisons, selected, table
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.read import Problem, find_runs, grouped
@@ -317,7 +317,7 @@ def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
         ("every_metric", "- n = 0/1", "seed 0: unfinished; no seed has a value")
     ]
     assert selected(rows) == selected(rows, ["regret"]) == rows
-    assert results.text(rows).splitlines()[2:] == [
+    assert formats.text(rows).splitlines()[2:] == [
         *("two", "  PPO", "    every metric  -  n = 0/1  (1)", "  (1) seed 0: unfinished; no seed has a value")
     ]
 

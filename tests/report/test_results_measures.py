@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 from helpers.made_runs import all_runs, line, make_run
 
-from ctgraph_rl.report import results
+from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.results import selected, table
 from ctgraph_rl.runs.read import grouped
 
@@ -26,10 +26,10 @@ def test_one_fingerprint_is_one_curriculum_though_one_name_says_modified(tmp_pat
     assert (row.curriculum, row.estimate.n) == ("two", 2)
 
 
-def test_six_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_path):
+def test_five_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_path):
     path = make_run(tmp_path, 0)
     always = ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
-    at_the_end = ["mean_final_return", "solved_rate"]
+    at_the_end = ["solved_rate"]
     first = [row.measure for row in selected(table(all_runs([path])))]
     scores = json.loads((path / "metrics.json").read_text())
     for name, value in (("relative_performance", 1.5), ("sample_efficiency", None), ("regret", 2.0)):
@@ -61,8 +61,8 @@ def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
         make_run(tmp_path, seed, (seed / 2, 1.0), curriculum="a_b", name="ppo|x")
     rows = selected(table(all_runs([tmp_path])), ["backward_transfer", "forward_transfer"])
 
-    page = results.markdown(rows).splitlines()
-    paper = results.latex(rows).splitlines()
+    page = formats.markdown(rows).splitlines()
+    paper = formats.latex(rows).splitlines()
 
     assert page[0] == "### a_b" and page[4] == "| agent | measure | over seeds | n | note |"
     assert page[6:] == [
@@ -70,11 +70,13 @@ def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
         "| PPO | backward transfer | -0.75 [-3.93, 2.43] | 2 |  |",
         *("", "1. all seeds are equal: no spread to estimate"),
     ]
-    assert paper[1].startswith(r"\caption{a\_b: mean {[}95 \% interval]")
-    assert paper[6:8] == [
-        r"PPO & forward transfer & 0.00$^{1}$ & 2 \\",
-        r"PPO & backward transfer & $-$0.75 [$-$3.93, 2.43] & 2 \\",
+    assert [line for line in paper if line.startswith(("PPO", " & ", r"\caption"))] == [
+        r"\caption{a\_b: mean {[}95 \% interval], share of solved seeds {[}exact one], "
+        r"median of times {[}exact one]; n: seeds with a value / seeds expected.}",
+        r"PPO & 2 & 0.00\rlap{\textsuperscript{a}} & $-$0.75 \\",
+        r" &  &  & {\scriptsize [$-$3.93, 2.43]} \\",
     ]
+    assert r"\textsuperscript{a} all seeds are equal: no spread to estimate" in "\n".join(paper)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +116,7 @@ def test_what_is_left_out_is_named_after_the_table_with_exit_code_1(tmp_path, mo
 def test_html_and_pipes_of_a_name_are_text_in_a_markdown_table(tmp_path):
     path = make_run(tmp_path, 0, curriculum="<b>x|y")
 
-    page = results.markdown(table(all_runs([path])))
+    page = formats.markdown(table(all_runs([path])))
 
     assert page.startswith("### &lt;b&gt;x\\|y\n")
     assert "<b>" not in page

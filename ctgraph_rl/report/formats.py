@@ -1,0 +1,150 @@
+"""Tables of measures for readers: text for a terminal, Markdown and LaTeX, and agents by measures for a report."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from ctgraph_rl.log.escape import markdown_text, terminal_text
+from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table
+from ctgraph_rl.report.latex import latex as latex_table
+
+if TYPE_CHECKING:
+    from ctgraph_rl.report.results import Row
+
+NO_RUN_FINISHED = "every_metric"
+"""The measure of the only row of an agent none of whose runs finished."""
+
+MEANS = "mean [95 % interval]"
+LEGEND = f"{MEANS}, share of solved seeds [exact one], median of times [exact one]"
+
+
+def text(rows: Sequence[Row]) -> str:
+    """The table for a terminal: under each curriculum and agent a line for each measure."""
+    return "\n\n".join([LEGEND, *map(_text, pages(rows))])
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A table in Markdown for each curriculum."""
+    return "\n\n".join(map(_markdown, pages(rows)))
+
+
+def latex(rows: Sequence[Row]) -> str:
+    """A table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
+    labels = Labels()
+    return "\n\n".join([PREAMBLE, *(as_latex(each, labels) for each in matrices(rows))])
+
+
+def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
+    """Return the table of agents and measures of each curriculum; the first column is the agents' number of seeds."""
+    for curriculum in dict.fromkeys(row.curriculum for row in rows):
+        its = [row for row in rows if row.curriculum == curriculum]
+        cells = {(row.agent, measure_name(row.measure)): row for row in its if row.measure != NO_RUN_FINISHED}
+        notes = list(dict.fromkeys(row.note for row in its if row.note))
+        measures = list(dict.fromkeys(measure for _, measure in cells))
+        agents = {
+            agent: _seeds([row for row in its if row.agent == agent])
+            for agent in dict.fromkeys(row.agent for row in its)
+        }
+        lines = [
+            (agent, (Cell(n), *(_as_cell(cells.get((agent, measure)), notes) for measure in measures)))
+            for agent, n in agents.items()
+        ]
+        yield Matrix(curriculum, ("n", *measures), lines, notes)
+
+
+def _as_cell(row: Row | None, notes: Sequence[str]) -> Cell:
+    """Return a row as a cell of the table of agents and measures."""
+    if row is None:
+        return Cell("-")
+    value, _, interval = str(row.estimate).partition(" n = ")[0].partition(" ")
+    return Cell(value, interval, notes.index(row.note) + 1 if row.note else 0)
+
+
+def _seeds(rows: Sequence[Row]) -> str:
+    """Return the number of an agent's seeds with a value, as ``9/10`` where others have none."""
+    most = max((row.estimate for row in rows), key=lambda estimate: estimate.n)
+    return str(most).rpartition(" n = ")[2]
+
+
+def measure_name(measure: str) -> str:
+    """Return the one name of a measure for readers, such as ``average performance``."""
+    return measure.replace("_", " ")
+
+
+def as_latex(matrix: Matrix, labels: Labels) -> str:
+    """Return the table of agents and measures of a curriculum in LaTeX."""
+    caption = f"{matrix.curriculum}: {LEGEND}; n: seeds with a value / seeds expected."
+    label = labels.new(matrix.curriculum, "measures")
+    return latex_table(Table(caption, label, "agent", matrix.head, rows=matrix.rows, notes=matrix.notes))
+
+
+FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
+SENTENCES: dict[str, Callable[[str], str]] = {
+    **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
+}
+
+
+class Line(NamedTuple):
+    """A row as it is shown."""
+
+    agent: str
+    measure: str
+    value: str
+    n: str
+    mark: str  # number of its note, or nothing
+
+
+class Matrix(NamedTuple):
+    """Agents by measures of a curriculum: headings, each agent with its cells, and notes by their numbers, from 1."""
+
+    curriculum: str
+    head: Sequence[str]
+    rows: Sequence[tuple[str, Sequence[Cell]]]
+    notes: Sequence[str]
+
+
+class Page(NamedTuple):
+    """The lines of a curriculum, and their notes in the order of their numbers."""
+
+    curriculum: str
+    lines: list[Line]
+    notes: list[str]
+
+
+def pages(rows: Sequence[Row]) -> Iterator[Page]:
+    """The rows as they are shown, for each curriculum."""
+    for curriculum in dict.fromkeys(row.curriculum for row in rows):
+        its = [row for row in rows if row.curriculum == curriculum]
+        notes = list(dict.fromkeys(row.note for row in its if row.note))
+        yield Page(curriculum, [_line(row, notes) for row in its], notes)
+
+
+def _line(row: Row, notes: list[str]) -> Line:
+    value, _, n = str(row.estimate).partition(" n = ")
+    mark = str(notes.index(row.note) + 1) if row.note else ""
+    return Line(row.agent, measure_name(row.measure), value, n, mark)
+
+
+def _text(page: Page) -> str:
+    lines = [Line(*map(terminal_text, line)) for line in page.lines]
+    measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
+    shown, agent = [terminal_text(page.curriculum)], None
+    for line in lines:
+        if line.agent != agent:
+            agent = line.agent
+            shown.append(f"  {agent}")
+        note = f"({line.mark})" if line.mark else ""
+        shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
+    notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
+    shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
+    return "\n".join(shown)
+
+
+def _markdown(page: Page) -> str:
+    columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
+    head = [f"### {markdown_text(page.curriculum)}", "", LEGEND, "", *columns]
+    lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
+    notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
+    return "\n".join([*head, *lines, *([""] if notes else []), *notes])
