@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.report.names import AGENT_OPTION
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_problems, print_summary
 
@@ -17,11 +18,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="ctgraph-rl report", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
+    parser.add_argument("--agent", **AGENT_OPTION)
     arguments = parser.parse_args()
     try:
         if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
-        report = write_report(arguments.runs, arguments.out)
+        report = write_report(arguments.runs, arguments.out, arguments.agent)
     except (OSError, ValueError, ModuleNotFoundError) as error:
         parser.error(terminal_lines(error))
     incomplete = print_problems(report.problems, report.runs)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
+from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.runs.read import Run, grouped
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -63,9 +65,9 @@ def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
 
 
 def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
-    """Return the bounds of runs of one curriculum, from the first of them whose directory has the curriculum."""
+    """Return the bounds of runs of one curriculum, from the first of them of which the curriculum is known."""
     for run in runs:
-        curriculum = _curriculum(run)
+        curriculum = curriculum_of(run)
         if curriculum is not None and run.history is not None:
             returns = {
                 label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
@@ -81,10 +83,20 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
     return NO_BOUNDS
 
 
-def _curriculum(run: Run) -> Curriculum | None:
-    """Return what a run learned; None where its directory does not say, or says another one."""
+def curriculum_of(run: Run) -> Curriculum | None:
+    """Return what a run learned, from its directory or as it is published; None where neither has its fingerprint."""
+    found: Curriculum | None
     try:
         found = Curriculum.from_json(run.path / CURRICULUM)
     except (OSError, ValueError):
+        found = published(run.group[0])
+    return found if found is not None and found.fingerprint == run.about["fingerprint"] else None
+
+
+@cache
+def published(name: str) -> Curriculum | None:
+    """Return the published curriculum of a name; None if there is none."""
+    try:
+        return curriculum_named(name)
+    except ValueError:
         return None
-    return found if found.fingerprint == run.about["fingerprint"] else None

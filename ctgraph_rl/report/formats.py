@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.log.escape import markdown_text, terminal_text
@@ -16,24 +16,30 @@ if TYPE_CHECKING:
 NO_RUN_FINISHED = "every_metric"
 """The measure of the only row of an agent none of whose runs finished."""
 
+Modified = Mapping[str, str]
+"""What differs from the published curriculum, by the name of a modified one; see `ctgraph_rl.report.names`."""
+
+NOT_MODIFIED: Modified = {}
+
 MEANS = "mean [95 % interval]"
 LEGEND = f"{MEANS}, share of solved seeds [exact one], median of times [exact one]"
 
 
-def text(rows: Sequence[Row]) -> str:
-    """The table for a terminal: under each curriculum and agent a line for each measure."""
-    return "\n\n".join([LEGEND, *map(_text, pages(rows))])
+def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+    """Return the table for a terminal: under each curriculum and agent a line for each measure."""
+    return "\n\n".join([LEGEND, *(_text(page, modified.get(page.curriculum)) for page in pages(rows))])
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """A table in Markdown for each curriculum."""
-    return "\n\n".join(map(_markdown, pages(rows)))
+def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+    """Return a table in Markdown for each curriculum."""
+    return "\n\n".join(_markdown(page, modified.get(page.curriculum)) for page in pages(rows))
 
 
-def latex(rows: Sequence[Row]) -> str:
-    """A table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
+def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+    """Return a table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
     labels = Labels()
-    return "\n\n".join([PREAMBLE, *(as_latex(each, labels) for each in matrices(rows))])
+    tables = (as_latex(each, labels, modified.get(each.curriculum)) for each in matrices(rows))
+    return "\n\n".join([PREAMBLE, *tables])
 
 
 def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
@@ -73,14 +79,15 @@ def measure_name(measure: str) -> str:
     return measure.replace("_", " ")
 
 
-def as_latex(matrix: Matrix, labels: Labels) -> str:
+def as_latex(matrix: Matrix, labels: Labels, modified: str | None = None) -> str:
     """Return the table of agents and measures of a curriculum in LaTeX."""
-    caption = f"{matrix.curriculum}: {LEGEND}; n: seeds with a value / seeds expected."
+    what = f" Modified: {modified}." if modified else ""
+    caption = f"{matrix.curriculum}: {LEGEND}; n: seeds with a value / seeds expected.{what}"
     label = labels.new(matrix.curriculum, "measures")
     return latex_table(Table(caption, label, "agent", matrix.head, rows=matrix.rows, notes=matrix.notes))
 
 
-FORMATS: dict[str, Callable[[Sequence[Row]], str]] = {"text": text, "markdown": markdown, "latex": latex}
+FORMATS: dict[str, Callable[[Sequence[Row], Modified], str]] = {"text": text, "markdown": markdown, "latex": latex}
 SENTENCES: dict[str, Callable[[str], str]] = {
     **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
 }
@@ -127,10 +134,13 @@ def _line(row: Row, notes: list[str]) -> Line:
     return Line(row.agent, measure_name(row.measure), value, n, mark)
 
 
-def _text(page: Page) -> str:
+def _text(page: Page, modified: str | None) -> str:
     lines = [Line(*map(terminal_text, line)) for line in page.lines]
     measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
     shown, agent = [terminal_text(page.curriculum)], None
+    if modified:
+        about = terminal_text(f"modified: {modified}")
+        shown.append(textwrap.fill(about, 80, initial_indent="  ", subsequent_indent="    "))
     for line in lines:
         if line.agent != agent:
             agent = line.agent
@@ -142,9 +152,10 @@ def _text(page: Page) -> str:
     return "\n".join(shown)
 
 
-def _markdown(page: Page) -> str:
+def _markdown(page: Page, modified: str | None) -> str:
     columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
-    head = [f"### {markdown_text(page.curriculum)}", "", LEGEND, "", *columns]
+    about = ["", f"Modified: {markdown_text(modified)}"] if modified else []
+    head = [f"### {markdown_text(page.curriculum)}", *about, "", LEGEND, "", *columns]
     lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
     notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
     return "\n".join([*head, *lines, *([""] if notes else []), *notes])

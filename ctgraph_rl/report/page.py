@@ -17,6 +17,7 @@ from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table, latex
+from ctgraph_rl.report.names import displayed
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
@@ -87,13 +88,14 @@ class Part(NamedTuple):
         return ("agent", *self.matrix.head), lines
 
 
-def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) -> Report:
+def write_report(paths: Sequence[Path | str], folder: Path | str | None = None, agents: Sequence[str] = ()) -> Report:
     """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
 
     Args:
         paths: run directories, or folders that hold them.
         folder: where the report goes; None: ``report`` within the one path, or, of several or a read-only one, within
             the working directory.
+        agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
@@ -102,6 +104,7 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None) 
     require_packages()
     runs, problems = find_runs(paths)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
+    runs = displayed(runs, agents)
     if folder is None:
         within = len(paths) == 1 and is_writable(paths[0])
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
@@ -170,6 +173,8 @@ def facts(section: Section) -> Iterator[tuple[str, Any]]:
     """Return the facts of the curriculum that was learned."""
     about = section.one.about
     yield "curriculum", about["curriculum"]
+    if section.modified:
+        yield "modified", section.modified
     for name in ("version", "fingerprint", "source"):
         yield name, about.get(name, "not said")
     yield "tasks", len(section.labels)
@@ -253,7 +258,7 @@ def _latex(parts: Sequence[Part]) -> str:
     """Return tables for papers: the measures of each curriculum, and each agent's matrices."""
     labels, found = Labels(), [PREAMBLE]
     for part in parts:
-        found += [formats.as_latex(part.matrix, labels)]
+        found += [formats.as_latex(part.matrix, labels, part.section.modified)]
         for agent in part.agents:
             for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
                 who = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n})"

@@ -25,6 +25,7 @@ from ctgraph_rl.log.escape import csv_text, terminal_lines
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, NO_RUN_FINISHED, SENTENCES
+from ctgraph_rl.report.names import AGENT_OPTION, displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.report.terminal import print_problems
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
@@ -249,10 +250,11 @@ def main() -> None:
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
         runs, problems = find_runs(arguments.runs)
         require((bool(runs), "; ".join(problem.reason for problem in problems)))
+        runs = displayed(runs, arguments.agent)
         pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
         rows = table(runs)
         names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
-        print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names)))
+        print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names), modifications(runs)))
         if arguments.csv is not None:
             write_csv(arguments.csv, rows)
         for pair, found in pairs.items():
@@ -273,6 +275,7 @@ def _parser() -> argparse.ArgumentParser:
     which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
     parser.add_argument("--format", choices=FORMATS, default="text", help="of what is printed (default: text)")
     parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
+    parser.add_argument("--agent", **AGENT_OPTION)
     parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
     parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
     return parser

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
+from ctgraph_rl.report.names import modifications
 from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped
@@ -96,11 +97,13 @@ class Section:
         name: the curriculum's, different from that of every other section.
         results: an agent each.
         rows: the table of measures.
+        modified: what differs from the published curriculum; empty for that itself.
     """
 
     name: str
     results: tuple[Result, ...]
     rows: list[Row]
+    modified: str = ""
 
     @property
     def runs(self) -> list[Run]:
@@ -147,7 +150,8 @@ def sections(runs: Sequence[Run]) -> list[Section]:
     rows: dict[str, list[Row]] = {}
     for row in table(runs):
         rows.setdefault(row.curriculum, []).append(row)
-    return [Section(name, tuple(results), rows[name]) for name, results in agents.items()]
+    modified = modifications(runs)
+    return [Section(name, tuple(results), rows[name], modified.get(name, "")) for name, results in agents.items()]
 
 
 def evaluation_curve(runs: Iterable[Run], label: str, bounds: Bounds = UNBOUNDED) -> list[Point]:

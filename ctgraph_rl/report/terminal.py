@@ -19,6 +19,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.provenance import NUMBERS
 from ctgraph_rl.report.formats import measure_name
+from ctgraph_rl.report.names import modification
 from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
@@ -56,6 +57,9 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     tables = [_matrix(name, run.history), _curves(sparklines(run.history.evaluations, bars))]
     if any(_width(table) > console.width for table in tables):
         tables = [_task_table(name, run.history, bars, console.width)]
+    modified = modification(run)
+    if modified:
+        console.print(_text(f"{run.curriculum[0]}: {modified}"))
     for table in (*tables, metrics_table(run.metrics)):
         console.print(table)
 

@@ -71,6 +71,7 @@ class Run:
         returns: mean return on each task in the same way.
         tasks: labels of the tasks that are not held out.
         history: curves and performance; None if the log cannot be read.
+        shown: place and name that tables and figures give its agent; None: as `grouped` finds them.
     """
 
     path: Path
@@ -84,6 +85,7 @@ class Run:
     returns: Mapping[str, float | None] = field(default_factory=dict)
     tasks: Sequence[str] = ()
     history: History | None = None
+    shown: tuple[int, str] | None = None
 
     @property
     def curriculum(self) -> tuple[str, str]:
@@ -305,8 +307,14 @@ def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]
     found: dict[tuple[str, str], dict[int, Run | None]] = {}
     for one, agent, by_seed in zip(one_each, agents, groups.values(), strict=True):
         seeds = sorted(by_seed if one.agent is None else expected[one.group])
-        found[curricula[one.group], agent] = {seed: by_seed.get(seed) for seed in seeds}
-    return found
+        name = agent if one.shown is None else one.shown[1]
+        found[curricula[one.group], name] = {seed: by_seed.get(seed) for seed in seeds}
+    return dict(sorted(found.items(), key=lambda item: min(map(_place, item[1].values()))))
+
+
+def _place(run: Run | None) -> float:
+    """Return the place of a run's agent; agents without one are behind all others, in their order."""
+    return math.inf if run is None or run.shown is None else run.shown[0]
 
 
 def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:

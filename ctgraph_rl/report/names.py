@@ -1,0 +1,118 @@
+"""How tables and figures call curricula and agents: what of a curriculum was modified, and names that are given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ctgraph_rl.checks import did_you_mean, require
+from ctgraph_rl.report.bounds import curriculum_of, published
+from ctgraph_rl.runs.read import MODIFIED, Run, grouped
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
+"""Keys of a curriculum's JSON that do not change what is learned."""
+
+MOST_CHANGES, MOST_VALUES = 6, 3
+"""Changes that are named, and different values of one that are."""
+
+AGENT_OPTION: dict[str, Any] = {
+    "action": "append",
+    "default": [],
+    "metavar": "NAME[=SHOWN]",
+    "help": "show this agent next, by another name if one is given; repeat it for each agent, others follow",
+}
+"""Of ``ctgraph-rl report`` and ``ctgraph-rl results``: names and order of agents."""
+
+
+def modifications(runs: Sequence[Run]) -> dict[str, str]:
+    """Return what differs from the published curriculum, for each modified one by its name in tables."""
+    found = {}
+    for (name, _), by_seed in grouped(runs).items():
+        its = [run for run in by_seed.values() if run is not None]
+        if name not in found and any(run.curriculum[0].endswith(MODIFIED) for run in its):
+            found[name] = next((said for run in its if (said := modification(run))), "")
+    return {name: said for name, said in found.items() if said}
+
+
+def modification(run: Run) -> str:
+    """Return in words what of a run's curriculum differs from the published one; empty if that is unknown."""
+    learned = curriculum_of(run) if run.curriculum[0].endswith(MODIFIED) else None
+    original = published(run.group[0])
+    return "" if learned is None or original is None else ", ".join(_changes(original, learned))
+
+
+def _changes(published: Curriculum, learned: Curriculum) -> Iterator[str]:
+    """Yield the settings that differ, such as ``blocks.num_frames=8192 instead of 51200``."""
+    before, now = (_settings(curriculum.to_json()) for curriculum in (published, learned))
+    differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    for key in differing[:MOST_CHANGES]:
+        yield f"{key}={_values(now.get(key, []))} instead of {_values(before.get(key, []))}"
+    if len(differing) > MOST_CHANGES:
+        yield f"and {len(differing) - MOST_CHANGES} more settings"
+
+
+def _settings(value: Any) -> dict[str, list[Any]]:
+    """Return the values of nested JSON by dotted names, in their order; the places in lists are left out."""
+    found: dict[str, list[Any]] = {}
+    for key, each in _leaves(value):
+        if key.partition(".")[0] not in NOT_COMPARED:
+            found.setdefault(key, []).append(each)
+    return found
+
+
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the plain values of nested JSON, lists of plain values among them, with their dotted names."""
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _leaves(inner, f"{key}.{name}".lstrip("."))
+    elif isinstance(value, list) and any(isinstance(inner, (Mapping, list)) for inner in value):
+        for inner in value:
+            yield from _leaves(inner, key)
+    else:
+        yield key, value
+
+
+def _values(values: Iterable[Any]) -> str:
+    """Return different values in words, and nothing for none."""
+    known = list(dict.fromkeys(map(str, values)))
+    more = f" and {len(known) - MOST_VALUES} others" if len(known) > MOST_VALUES else ""
+    return "/".join(known[:MOST_VALUES]) + more or "nothing"
+
+
+def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
+    """Return runs with other names of their agents and in another order; agents that are not named follow.
+
+    Args:
+        runs: any runs.
+        agents: the agents in their order, each as its name in tables, or as ``NAME=SHOWN`` with the name to show.
+
+    Raises:
+        ValueError: for an unknown agent, with the one that was probably meant, and for a name of two agents.
+    """
+    known = list(dict.fromkeys(agent for _, agent in grouped(runs)))
+    chosen = dict(_choice(each, known) for each in agents)
+    shown = [*chosen.values(), *(agent for agent in known if agent not in chosen)]
+    twice = sorted({name for name in shown if shown.count(name) > 1})
+    require((len(chosen) == len(agents), "--agent names an agent twice; give each once"))
+    require((not twice, f"--agent gives the name {', '.join(twice)} to two agents; choose different ones"))
+    places = {agent: (place, name) for place, (agent, name) in enumerate(chosen.items())}
+    return [
+        replace(run, shown=places.get(agent))
+        for (_, agent), by_seed in grouped(runs).items()
+        for run in by_seed.values()
+        if run is not None
+    ]
+
+
+def _choice(given: str, known: Sequence[str]) -> tuple[str, str]:
+    """Return an agent's name in tables and the one to show; settings in names have the sign of equality, too."""
+    if given in known:
+        return given, given
+    fits = [name for name in known if given.startswith(f"{name}=")]
+    name = max(fits, key=len, default="")
+    shown = given[len(name) + 1 :].strip()
+    unknown = f"--agent: there is no agent {given.partition('=')[0]!r}: {did_you_mean(given.partition('=')[0], known)}"
+    require((bool(fits), unknown), (not fits or bool(shown), f"--agent {given!r} must have a name after the sign"))
+    return name, shown
