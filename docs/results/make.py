@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import comparison
 import pairs
+import search
+from alone import INSTANCES, MEMORY, instances_change, memory_verdict
 from raw import HERE, Raw, groups, machine_of, machines, mean_of, read, share_of, table, write
 
 if TYPE_CHECKING:
@@ -28,6 +30,12 @@ PAGE = HERE / "baselines.md"
 LIFELONG = HERE / "lifelong.md"
 AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
 """Tables of agents that each learned one task."""
+
+SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
+"""The configurations of which each goal was learned alone."""
+
+BY_FIVES = (INSTANCES, MEMORY)
+"""Tables that only have cells of five seeds that finished, as they may be collected before all are run."""
 
 REWARDS_MET = "rewards_met"
 OLDER = "ppo_published"
@@ -48,7 +56,13 @@ def collect(name: str, folder: Path) -> None:
     lines.sort(
         key=lambda line: [str(line[key]) for key in ("configuration", "depth", "task", "agent")] + [line["seed"]]
     )
-    write(name, lines)
+    write(name, five_seeds(lines) if name in BY_FIVES else lines)
+
+
+def five_seeds(lines: Raw) -> Raw:
+    """Return the lines of cells of which five seeds finished."""
+    done = groups([line for line in lines if not line["failed"]], "configuration", "task", "agent")
+    return [line for cell in done.values() if len(cell) >= search.SEEDS for line in cell]
 
 
 def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
@@ -101,7 +115,7 @@ def cell(lines: Raw, column: str, bounds: tuple[float, float] = (0.0, 1.0)) -> s
     return mean_of([None if line.get("failed") else float(line[column]) for line in lines], bounds)
 
 
-def by_goal(raw: Raw, configuration: str) -> str:
+def by_goal(raw: Raw, configuration: str, title: str = "") -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
     from baselines.catalogue import catalogue
     from ctgraph_rl.tasks.values import open_loop_ceiling
@@ -119,7 +133,21 @@ def by_goal(raw: Raw, configuration: str) -> str:
             rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
             blind = (open_loop_ceiling(task_of(configuration, goal)) for goal in goals)
             rows.append(["*ceiling without observations*", *(f"*{value:.2f}*" for value in blind)])
-    return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
+    return table([title or configuration, *(f"goal {goal}" for goal in goals)], rows)
+
+
+def remembering() -> Raw:
+    """The cells of agents with memory, those of LSTM-PPO on the same goals first."""
+    others = read(MEMORY)
+    goals = {(line["configuration"], line["task"]) for line in others}
+    known = [line for line in read("baselines_b1") if line["agent"] == "lstm_ppo"]
+    return [line for line in known if (line["configuration"], line["task"]) in goals] + others
+
+
+def memory_tables() -> str:
+    """A table for each configuration on which other agents with memory were run."""
+    raw = remembering()
+    return "\n\n".join(by_goal(raw, name) for name in dict.fromkeys(line["configuration"] for line in raw))
 
 
 def both_ways(lines: Raw, configuration: str, goal: str) -> str:
@@ -221,6 +249,17 @@ def learned_and_met() -> dict[str, str]:
     return found
 
 
+def verdicts() -> dict[str, str]:
+    """Return what the page says first of instances, of other agents with memory and of the search."""
+    depth_2 = [line for line in read(search.NAME) if line["depth"] == "2"]
+    found = search.searching(depth_2)
+    return {
+        "instances_change": instances_change(),
+        "memory_verdict": memory_verdict(),
+        "searching": f"{sum(found)} of {len(found)}",
+    }
+
+
 def rerun() -> dict[str, str]:
     """What the page says of the cells that were run again, and of those of an earlier revision."""
     again = read("reruns")
@@ -241,14 +280,19 @@ def rerun() -> dict[str, str]:
 def page() -> str:
     """The page: the template with its tables."""
     small = read("baselines_b1")
-    tables = {name: by_goal(small, name) for name in ("fo_b1", "su_b1", "co_b1", "posr_b1")}
+    tables = {name: by_goal(small, name) for name in SMALL}
+    instances = read(INSTANCES)
+    tables |= {f"{name}_instances": by_goal(instances, name, f"{name}, instances") for name in SMALL}
+    tables |= {"memory": memory_tables(), "observability": search.observability_table()}
+    tables |= {f"search_{depth}": search.search_table(depth) for depth in (2, 3)}
     tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
     return template.substitute(
         tables,
         main_job=main_job(read("main_job")),
-        machines=machines("main_job", *AGENTS),
+        machines=machines("main_job", *AGENTS, *BY_FIVES, search.NAME),
         **learned_and_met(),
+        **verdicts(),
         **rerun(),
     )
 
@@ -290,13 +334,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     collecting = commands.add_parser("collect", help="raw results from runs")
-    names = ("main_job", *AGENTS, REWARDS_MET, *comparison.EXPERIMENTS)
+    names = ("main_job", *AGENTS, *BY_FIVES, search.NAME, REWARDS_MET, *comparison.EXPERIMENTS)
     collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()
     if options.command == "collect":
         of = {
             "main_job": lambda name, runs: collect_main_job(runs),
+            search.NAME: lambda name, runs: write(name, search.collect(runs)),
             **dict.fromkeys(comparison.EXPERIMENTS, comparison.collect),
         }
         try:

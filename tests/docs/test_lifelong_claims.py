@@ -354,6 +354,8 @@ NO_DATA = {
     "The goals are nested and their trees share images: at each image that two of `00`, `000`, `0000` and `00000` "
     "share, the same actions are best (`ctgraph_rl.tasks.similarity.observation_agreement` is 1).",  # tests/tasks
     "So tasks 5 and 7 say little about exploration; 6 and 8, the same way with another last decision, say more.",
+    "(They explore by chance. `ppo_count` learns depth 5 from scratch in every seed, in as many frames: "
+    "[the depth ladder](baselines.md#the-depth-ladder).)",  # tests/docs/test_results_claims.py
     "How the paper's own runs did task by task is not known here.",
     "It begins a task with equal shares of old and new masks, Mask BLC with one half for the new one, which "
     "may be why.",
@@ -374,8 +376,8 @@ def tables():
 
 
 def sentences_of_the_readings() -> list[str]:
-    """The sentences from "How to read it." to the next command or table."""
-    readings = re.findall(r"How to read it\. (.*?)\n(?:Raw:|\|)", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    """The sentences from "What came out." to the next figure."""
+    readings = re.findall(r"\*\*What came out\.\*\* (.*?)\n!\[", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     text = " ".join(" ".join(readings).split())
     return re.split(r"(?<=\.)\s+(?=[A-Z(])|(?<=\.\))\s+", text)
 

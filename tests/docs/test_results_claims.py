@@ -25,7 +25,7 @@ def make():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
         yield __import__("make")
-        for name in ("make", "comparison", "raw", "reruns"):
+        for name in ("make", "alone", "comparison", "raw", "reruns", "search"):
             sys.modules.pop(name, None)
 
 
@@ -73,6 +73,63 @@ def test_a2c_on_fo_b2_learns_one_goal_in_some_seeds_and_meets_the_other(make):
     assert "One of its greedy policies is right by chance: sampled, it reaches the goal once in 1,000" in RESULTS
 
 
+def test_instances_cost_nothing_greedily_and_serve_dqn_as_dice(make):
+    alone = sys.modules["alone"]
+    greedy, sampled = alone.changes("greedy"), alone.changes("sampled")
+    two = {key for key in greedy if key[0] != "fo_b1" and key[1] in ("1.2", "2.1")}
+
+    cells = make.groups(make.read(alone.INSTANCES), "configuration", "task", "agent")
+    assert {len(lines) for lines in cells.values()} == {5} and len(cells) == 4 * 4 * 4
+    assert min(greedy.values()) == 0
+    assert min(sampled, key=sampled.__getitem__) == ("posr_b1", "2.2", "a2c")
+    assert (
+        sorted(float(line["sampled_return"]) >= 0.99 for line in cells["posr_b1", "2.2", "a2c"]) == [False] + [True] * 4
+    )
+    gains = [greedy[key] for key in two if key[2] == "dqn"]
+    assert (len(gains), round(min(gains), 2), round(max(gains), 2)) == (6, 0.07, 0.2)
+    assert "no cell has a lower mean than with constant images. Sampled, the largest loss is 0.06" in RESULTS
+    assert "DQN even gains 0.07 to 0.20 on the goals that take two different decisions" in RESULTS
+
+
+def test_with_instances_no_policy_without_memory_is_above_the_ceiling_of_any(make):
+    for line in make.read("baselines_b1_instances"):
+        ceiling = make.task_of(line["configuration"], line["task"]).memoryless_ceiling()
+        spread = (ceiling * (1 - ceiling) / make.EPISODES) ** 0.5
+        if line["agent"] != "lstm_ppo":
+            assert max(float(line["greedy_return"]), float(line["sampled_return"])) <= ceiling + 5 * spread, line
+
+
+def test_the_experiment_of_instances_is_that_of_constant_images_with_noise_and_rotation(compose):
+    cell = ["curriculum.configuration=co_b1", "curriculum.goals=[[1,2]]", "agent=dqn", "seed=3"]
+
+    named = compose("experiment=instances_b1", *cell)
+    by_hand = compose("experiment=baselines_b1", *cell, "curriculum.read_noise=10", "curriculum.read_rotation=5")
+
+    assert {**named, "experiment": None} == {**by_hand, "experiment": None}
+
+
+def test_rl2_searches_as_the_best_policy_does_at_depth_2_in_four_of_five_seeds(make):
+    search = sys.modules["search"]
+    lines = [line for line in make.read(search.NAME) if line["depth"] == "2"]
+    seeds = {
+        seed: [float(line["greedy_success"]) for line in each] for (seed,), each in make.groups(lines, "seed").items()
+    }
+
+    assert [seed for seed, curve in seeds.items() if curve == search.best_search(4)] == ["0", "1", "2", "3"]
+    assert seeds["4"] == [0.25] * 4
+    assert {line["frames"] for line in lines} == {"3072000"}
+    assert "RL^2 with 3,072,000 frames at depth 2 does in 4 of 5 seeds what the best search does" in RESULTS
+
+
+def test_a_seed_or_cell_that_is_missing_is_no_table(make, monkeypatch):
+    search, lines = sys.modules["search"], make.read("baselines_b1_instances")
+
+    assert search.whole([{"seed": str(seed)} for seed in (0, 1, 2, 3, 3)]) == []
+    assert make.five_seeds(lines[:4]) == [] and make.five_seeds(lines[:7]) == lines[:5]
+    monkeypatch.setattr(search, "read", lambda name: [])
+    assert search.search_table(3) == "Depth 3 has no five seeds yet."
+
+
 def test_rewards_met_are_those_of_the_runs_of_the_table(make):
     of = {name: {line["fingerprint"] for line in make.read(name)} for name in ("baselines_fo_b2", "rewards_met")}
 
@@ -104,6 +161,11 @@ def test_the_published_settings_solve_depth_2_and_3_depth_4_once_and_not_5(make)
     solved = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo_published", depth]) for depth in "2345"]
 
     assert solved == [5, 5, 1, 0]
+    by_count = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo_count", depth]) for depth in "2345"]
+    plain = [sum(float(line["greedy_success"]) >= 0.9 for line in cells["ppo", depth]) for depth in "2345"]
+    assert (by_count, plain) == ([5, 5, 5, 5], [5, 5, 2, 0])
+    assert "`ppo_count` solves every depth in every seed." in RESULTS
+    assert "`ppo_count` learns depth 5 from scratch in every seed, in as many frames" in LIFELONG
     assert "it solves depth 2 and 3 in every seed, depth 4 in one of five, and depth 5 in none." in RESULTS
 
 
