@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -12,6 +11,7 @@ from typing import NamedTuple
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import nearest
 from ctgraph_rl.log.escape import terminal_lines
+from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import command, conf_dir
 
 
@@ -70,28 +70,9 @@ options:
 
 
 def main() -> None:
-    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; settings alone are for `ctgraph_rl.run`.
-
-    Ends quietly if its output is no longer read, as in ``ctgraph-rl results | head``.
-    """
-    try:
+    """``ctgraph-rl COMMAND ...`` for one of `COMMANDS`; settings alone are for `ctgraph_rl.run`."""
+    with quiet_where_nobody_reads():
         _call()
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        if _has_reader():
-            raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
-        sys.exit(1)
-
-
-def _has_reader() -> bool:
-    """Whether it was another pipe that broke than standard output's; an empty line there finds out."""
-    try:
-        print(flush=True)
-    except BrokenPipeError:
-        return False
-    return True
 
 
 def _call() -> None:

@@ -17,6 +17,7 @@ import torch
 from ctgraph_rl.checks import is_real, positive, require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
@@ -55,20 +56,23 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
         ValueError: for a directory without a run, and a log or weights that cannot be read.
     """
     logs = [_log(path) for path in (one, other)]
-    first = [log[0] for log in logs]
-    found = [list(map(_measured, log[1:])) for log in logs]
+    first = [log.measurements[0] for log in logs]
+    found = [list(map(_measured, log.measurements[1:])) for log in logs]
     code, verdict = _verdict(found, bound)
     weights = _weights(one, other)
     if code == EQUAL and weights.startswith("different"):
         code, verdict = DIFFERENT, "different: all measurements are equal, the agents' weights are not"
-    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first)])
+    torn = [path for path, log in zip((one, other), logs, strict=True) if log.torn_lines]
+    notes = [f"note: the last line of {path / LOG} is torn and not compared" for path in torn]
+    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *notes])
 
 
-def _log(path: Path) -> list[dict[str, Any]]:
-    """Return the measurements of a run, of which the first says what was run."""
+def _log(path: Path) -> RunLog:
+    """Return the log of a run, whose first measurement says what was run."""
     require(((path / LOG).is_file(), f"{path} holds no run: there is no {LOG}"))
-    log = RunLog.read(path / LOG).measurements
-    require((bool(log) and log[0]["kind"] == "run", f"{path / LOG} does not say what was run in its first line"))
+    log = RunLog.read(path / LOG)
+    begins = bool(log.measurements) and log.measurements[0]["kind"] == "run"
+    require((begins, f"{path / LOG} does not say what was run in its first line"))
     return log
 
 
@@ -208,11 +212,9 @@ def main() -> None:
     )
     parser.add_argument("--bound", type=float, default=BOUND, help=within)
     arguments = parser.parse_args()
-    try:
+    with refused_by(parser):
         require(*positive(bound=arguments.bound))
         found = compare(arguments.one, arguments.other, arguments.bound)
-    except (OSError, ValueError) as error:
-        parser.error(terminal_lines(error))
     print(terminal_lines("\n".join(found.lines)))
     sys.exit(found.code)
 

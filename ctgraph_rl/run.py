@@ -9,19 +9,23 @@ import io
 import os
 import shlex
 import sys
-from contextlib import nullcontext, redirect_stdout, suppress
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, sweepable
+from ctgraph_rl.runs.settings import in_digits
 
 
 def run(cfg: DictConfig, run_dir: Path) -> None:
@@ -59,6 +63,23 @@ def show(run_dir: Path, report: bool) -> None:
     print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
 
 
+ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError)
+"""What a user can cause, and is told in one message."""
+
+
+class Stop(BaseException):
+    """Takes an error past Hydra, which would print the settings before it.
+
+    Args:
+        error: what stopped the run.
+        message: about it, for the user.
+    """
+
+    def __init__(self, error: Exception, message: str) -> None:
+        super().__init__(message)
+        self.error, self.message = error, message
+
+
 @hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
@@ -66,14 +87,24 @@ def _job(cfg: DictConfig) -> None:
         check_one_cell()
         if cfg.portable is True and not in_sweep():
             become_portable()
-        with redirect_stdout(io.StringIO()) if in_sweep() else nullcontext():
+        with redirect_stdout(io.StringIO()) if in_sweep() else quiet_where_nobody_reads():
             run(cfg, run_dir)
     except BaseException as error:
-        with suppress(OSError):
-            run_dir.rmdir()  # only a directory that nothing was written into
+        remove_empty(run_dir)
         if in_sweep() and isinstance(error, Exception):  # not every exception can travel between processes
-            raise RuntimeError(f"{type(error).__name__}: {explain(error)}") from None
+            raise RuntimeError(f"{type(error).__name__}: {explain(error, cfg)}") from None
+        if isinstance(error, ERRORS):
+            raise Stop(error, explain(error, cfg)) from error
         raise
+
+
+def remove_empty(run_dir: Path) -> None:
+    """Remove a run directory without a file, and folders above it within the working directory that then are empty."""
+    here = Path.cwd()
+    with suppress(OSError):
+        for folder in (run_dir, *run_dir.parents):
+            if folder == run_dir or (folder != here and folder.is_relative_to(here)):
+                folder.rmdir()
 
 
 def main() -> None:
@@ -81,21 +112,33 @@ def main() -> None:
     environment, arguments = dict(os.environ), sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
-    sys.argv[1:] = sweepable(sys.argv[1:])
+    sys.argv = ["ctgraph-rl", *sweepable(in_digits(arguments))]
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
-        try:
+        with quiet_where_nobody_reads():
+            _check_options(arguments)
             _job()
-        except Restart:
-            restart(environment, arguments)
-    except (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError) as error:
+    except Restart:
+        restart(environment, arguments)
+    except (Stop, *ERRORS) as error:
+        cause, message = (error.error, error.message) if isinstance(error, Stop) else (error, explain(error))
         if full_error:
-            raise
-        print(f"error: {terminal_lines(explain(error))}", file=sys.stderr)
+            raise cause from cause.__cause__
+        print(f"error: {terminal_lines(message)}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)
         sys.exit(130)
+
+
+def _check_options(arguments: Sequence[str]) -> None:
+    """Refuse an option that Hydra does not know, with exit code 2."""
+    _, unknown = get_args_parser().parse_known_args(arguments)
+    for option in (word for word in unknown if word.startswith("-")):
+        setting = option.lstrip("-").partition("=")[0].replace("-", "_")
+        how = f"settings are written without dashes, as {setting}=VALUE; ctgraph-rl --help names options"
+        print(f"error: unknown option {terminal_text(option)}: {terminal_text(how)}", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":  # not this module's own: other processes of a sweep import what is in it

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.made_runs import write_run
 
 import curricula
 from ctgraph_rl import cli
@@ -132,33 +131,6 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
 
     assert code == 2
     assert f"ctgraph-rl {command}" in err and str(tmp_path) in err
-
-
-def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):
-    def breaks() -> None:
-        raise BrokenPipeError("another pipe")
-
-    monkeypatch.setattr(cli, "_call", breaks)
-
-    with pytest.raises(BrokenPipeError, match="another pipe"):
-        cli.main()
-
-
-@pytest.mark.parametrize("words", ["agents", "results RUNS"])
-def test_a_reader_that_goes_away_ends_a_command_quietly(checkout, tmp_path, words):
-    write_run(tmp_path / "run")
-    call = [
-        sys.executable,
-        "-c",
-        "from ctgraph_rl.cli import main; main()",
-        *words.replace("RUNS", str(tmp_path)).split(),
-    ]
-    command = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=checkout)
-
-    command.stdout.close()
-
-    assert command.stderr.read() == ""
-    assert command.wait() == 1
 
 
 def in_a_folder_that_shadows(checkout, tmp_path, path, code):

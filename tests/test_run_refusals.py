@@ -12,19 +12,18 @@ from helpers.sweeping import command_line, files_in
 
 from ctgraph_rl import Block, Curriculum
 from ctgraph_rl.run import run
-from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
 
 
 REFUSED = [
-    (["curriculum=su_b2"], ["Could not find 'curriculum/su_b2'", "su_b1_4tasks"]),
-    (["agent=sarsa"], ["Could not find 'agent/sarsa'", "dqn", "lstm_ppo"]),
-    (["sed=1"], ["sed", "Choices: ", "seed", "num_threads", "overwrite"]),
-    (["agent.hidden=8"], ["hidden", "Choices: ", "hidden_size", "num_envs"]),
+    (["curriculum=su_b2"], ["error: unknown curriculum 'su_b2': there are 76, ctgraph-rl curricula lists them\n"]),
+    (["agent=sarsa"], ["error: unknown agent 'sarsa': choices: a2c, dqn, drqn, lstm_ppo, ppo, "]),
+    (["sed=1"], ["error: unknown setting 'sed': did you mean 'seed'?\n"]),
+    (["agent.hidden=8"], ["error: unknown setting 'agent.hidden': did you mean 'agent.hidden_size'?\n"]),
     (["+agent.foo=1"], ["agent has no foo", "choices: ", "hidden_size"]),
-    (["+curriculum.foo=1"], ["curriculum has no foo", "choices: num_frames, image_seed"]),
+    (["+curriculum.foo=1"], ["curriculum has no foo: choices: curriculum.num_frames, curriculum.image_seed"]),
     (["seed=-1"], ["seed must be an integer in [0, 2**63), got -1"]),
     (["seed=abc"], ["seed must be an integer in [0, 2**63), got 'abc'"]),
     (["seed=1.5"], ["seed must be an integer in [0, 2**63), got 1.5"]),
@@ -33,22 +32,27 @@ REFUSED = [
     (["overwrite=1"], ["overwrite must be true, false or stale, got 1"]),
     (
         ["curriculum.num_frames=1000"],
-        ["num_frames=1000 of block 1, 2, 3, 4 must be a multiple of num_envs=64", "960 or 1024"],
+        ["curriculum.num_frames=1000 of block 1, 2, 3, 4 must be a multiple of agent.num_envs=64", "960 or 1024"],
     ),
-    (["curriculum.num_frames=0"], ["num_frames must be an integer >= 1, got 0"]),
+    (["curriculum.num_frames=0"], ["error: curriculum.num_frames must be an integer >= 1, got 0\n"]),
     (["curriculum.image_seed=abc"], ["seed", "'abc'"]),
-    (["agent.gamma=2"], ["gamma must be in [0, 1], got 2"]),
+    (["agent.gamma=2"], ["error: agent.gamma must be in [0, 1], got 2\n"]),
     (["agent._target_=torch.nn.Module"], ["agent has no"]),
     (["experts_dir=null"], ["experts_dir must be the path of a folder, got None"]),
     (["evaluation=null"], ["evaluation must have keys, such as evaluation.every=5120, got None"]),
-    (["protocol.task_id=shown"], ["task_id must be one of hidden, one_hot, at_boundaries, got 'shown'"]),
-    (["agent.hidden_size=wide"], ["hidden_size must be an integer >= 1, got 'wide'"]),
+    (
+        ["protocol.task_id=shown"],
+        ["error: protocol.task_id must be one of hidden, one_hot, at_boundaries, got 'shown'\n"],
+    ),
+    (["agent.hidden_size=wide"], ["error: agent.hidden_size must be an integer >= 1, got 'wide'\n"]),
+    (["curriculum=axes", "curriculum.depth=0"], ["error: curriculum.depth must be an integer"]),
+    (["hydra/launcher=joblib"], ["error: hydra/launcher=joblib runs the cells of a sweep: add -m, or leave it out\n"]),
     (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
 ]
 
 
 @pytest.mark.parametrize(("overrides", "said"), REFUSED, ids=[" ".join(overrides) for overrides, _ in REFUSED])
-def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_results(
+def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_file_and_no_folder(
     monkeypatch, capsys, tmp_path, overrides, said
 ):
     monkeypatch.chdir(tmp_path)
@@ -58,8 +62,8 @@ def test_a_wrong_value_is_one_message_and_exit_code_1_and_leaves_no_results(
     error = capsys.readouterr().err
     assert code == 1
     assert all(part in error for part in said), error
-    assert "Traceback" not in error
-    assert not any(Path(path).name in RESULTS for path in files_in(tmp_path))
+    assert "Traceback" not in error and "Error executing job" not in error
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_argument_that_is_missing_is_one_message(monkeypatch, capsys, tmp_path):

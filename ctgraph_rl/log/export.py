@@ -18,8 +18,8 @@ from pathlib import Path
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
-from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.log.files import LOG, no_run
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.metrics import Regime
@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--format", choices=FORMATS, default=FORMATS[0], help="the format to write")
     parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
     arguments = parser.parse_args()
-    try:
+    with refused_by(parser):
         require(((arguments.run / LOG).is_file(), no_run(arguments.run)))
         log = RunLog.read(arguments.run / LOG)
         measured = any(measurement["kind"] != "run" for measurement in log.measurements)
@@ -112,8 +112,6 @@ def main() -> None:
             write_tables(log, arguments.out, parquet=True)
         else:
             write_l2logger(log.regimes(), arguments.out)
-    except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
     print(f"{arguments.format}: {arguments.out}")
 
 

@@ -1,8 +1,10 @@
-"""How a command refuses what its user asked for."""
+"""How commands end: with a message on what the user asked for, or quietly where nobody reads what they print."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -21,3 +23,26 @@ def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
         raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
         parser.error(terminal_lines(error))
+
+
+@contextmanager
+def quiet_where_nobody_reads() -> Iterator[None]:
+    """Exit with code 1 and without a word once standard output has no reader, as in ``ctgraph-rl results | head``."""
+    try:
+        yield
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if _has_reader():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has nowhere to go
+        sys.exit(1)
+
+
+def _has_reader() -> bool:
+    """Return whether it was another pipe that broke than standard output's; an empty line there finds out."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return False
+    return True

@@ -6,8 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.report.names import AGENT_OPTION
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_problems, print_summary
@@ -20,12 +21,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
     parser.add_argument("--agent", **AGENT_OPTION)
     arguments = parser.parse_args()
-    try:
+    with refused_by(parser):
         if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
         report = write_report(arguments.runs, arguments.out, arguments.agent)
-    except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
     incomplete = print_problems(report.problems, report.runs)
     print(f"report of {len(report.runs)} runs: {terminal_text(report.page)}")
     if incomplete:

@@ -21,7 +21,8 @@ from typing import Any
 from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
-from ctgraph_rl.log.escape import csv_text, terminal_lines
+from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, NO_RUN_FINISHED, SENTENCES
@@ -246,7 +247,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.difference is not None and arguments.compare is None:
         parser.error("--difference is of the metric that --compare names; give both")
-    try:
+    with refused_by(parser):
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
         runs, problems = find_runs(arguments.runs)
         require((bool(runs), "; ".join(problem.reason for problem in problems)))
@@ -259,10 +260,6 @@ def main() -> None:
             write_csv(arguments.csv, rows)
         for pair, found in pairs.items():
             print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
-    except BrokenPipeError:
-        raise
-    except (OSError, ValueError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
     if print_problems(problems, runs):
         sys.exit(1)
 

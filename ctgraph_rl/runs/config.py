@@ -16,16 +16,16 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import did_you_mean, is_int, positive, require
+from ctgraph_rl.checks import did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
 from ctgraph_rl.portable import check_portable
-from ctgraph_rl.runs.settings import digest, parameters_of
+from ctgraph_rl.runs.settings import as_typed, digest, flat, parameters_of
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
@@ -40,6 +40,18 @@ RESUME = ("warn", "strict")
 
 STALE = "stale"
 """Of ``overwrite``: what was run with other code alone is run again."""
+
+SAID = (
+    (
+        re.compile(r"Ambiguous value for argument '(.*)'"),
+        "{0} has several values: add -m to run each; a list is written in brackets, a text in quotes",
+    ),
+    (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
+)
+"""Beginnings of messages of Hydra, and what is said in their place."""
+
+MOST_CHOICES = 20
+"""Names that a message lists at most."""
 
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
 """Configurations that come with other packages, and the extras that install these."""
@@ -82,7 +94,9 @@ def check_one_cell() -> None:
     given = {setting.partition("=")[0].lstrip("+") for setting in chosen.overrides.task}
     swept = {key: value for key, value in (chosen.sweeper.get("params") or {}).items() if key not in given}
     shown = " ".join(f"{key}={value}" for key, value in swept.items())
+    launcher = chosen.runtime.choices["hydra/launcher"]
     require(
+        (launcher == "basic", f"hydra/launcher={launcher} runs the cells of a sweep: add -m, or leave it out"),
         (not swept, f"this configuration is a sweep, {shown}: add -m to run it, or give one value of each"),
         (not chosen.sweeper.get("status"), "hydra.sweeper.status=true lists a sweep's cells: add -m"),
     )
@@ -262,19 +276,53 @@ def save_yaml(settings: Any, path: Path) -> None:
     write_whole(path, buffer.getvalue(), synced=False)
 
 
-def explain(error: BaseException) -> str:
-    """Return one message for a user's error: its cause within Hydra's errors, and the choices for an unknown key."""
+def explain(error: BaseException, cfg: DictConfig | None = None) -> str:
+    """Return one message for a user's error: its cause within Hydra's errors, and what was probably meant.
+
+    Args:
+        error: what was raised.
+        cfg: the configuration of the run that raised it; None: there was none yet.
+    """
     cause = error
     while cause.__cause__ is not None and not _says_what_to_do(cause):
         cause = cause.__cause__
-    message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
-    extra = LAUNCHERS.get(cause.missing_cfg_file or "") if isinstance(cause, MissingConfigException) else None
-    if extra is not None:
-        return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
+    if cfg is not None and isinstance(cause, ValueError):
+        typed = (setting.partition("=")[0].lstrip("+~") for setting in HydraConfig.get().overrides.task)
+        return as_typed(str(cause).strip(), plain(cfg), typed)
+    if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+        group, _, name = cause.missing_cfg_file.rpartition("/")
+        return _unknown_file(group, name, cause.options or ())
+    if isinstance(cause, OverrideParseException):
+        is_value = "=" in str(cause.override)
+        how = "quote a value with brackets, commas or spaces" if is_value else "settings are written as in seed=1"
+        return f"cannot read {cause.override!r}: {how}"
     node = getattr(cause, "parent_node", None)
     if isinstance(node, DictConfig):
-        message += f"\nChoices: {', '.join(sorted(map(str, node)))}"
-    return message
+        return _unknown_setting(str(getattr(cause, "full_key", "")), node)
+    message = str(error if isinstance(cause, OmegaConfBaseException) else cause).strip()
+    return next((text.format(*found.groups()) for rule, text in SAID if (found := rule.match(message))), message)
+
+
+def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
+    """Return why a group of the configuration has no file of a name."""
+    extra = LAUNCHERS.get(f"{group}/{name}")
+    if extra is not None:
+        return f"this launcher is another package: pip install 'ctgraph_rl[{extra}]'"
+    is_long = len(choices) > MOST_CHOICES and nearest(name, choices) is None
+    hint = f"there are {len(choices)}, ctgraph-rl curricula lists them" if is_long else did_you_mean(name, choices)
+    return f"unknown {group or 'configuration'} {name!r}: {hint}"
+
+
+def _unknown_setting(asked: str, node: DictConfig) -> str:
+    """Return why a setting is none, and what was probably meant: a key beside it or, of the whole run, any below."""
+    group, _, key = asked.rpartition(".")
+    beside = [f"{group}.{name}".lstrip(".") for name in map(str, node) if name not in ("_target_", "hydra")]
+    groups = [] if group else [path.name for path in Path(conf_dir()).iterdir() if path.is_dir()]
+    below = [] if group else [name for name, _ in flat(plain(node))]
+    ends = {name.rpartition(".")[2]: name for name in (*reversed(below), *groups, *beside)}  # the last one counts
+    near = nearest(key, set(ends) - {"_target_", "hydra"})
+    hint = f"choices: {', '.join(beside) or 'none'}" if near is None else f"did you mean {ends[near]!r}?"
+    return f"unknown setting {asked!r}: {hint}"
 
 
 def _says_what_to_do(error: BaseException) -> bool:

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from decimal import Decimal
 from inspect import Parameter, signature
+from pathlib import Path
 from typing import Any
+
+import yaml
+
+from ctgraph_rl.checks import LARGEST_INT
+from ctgraph_rl.packages import conf_dir
 
 ADDED: dict[str, dict[str, Any]] = {
     "run": {"portable": False},
@@ -19,6 +27,9 @@ by their dotted names under ``run``, as ``{"run": {"meta.enabled": False}}``. Wi
 run name and of no comparison, and stored runs without it have it. So a setting that is added to a yaml file needs an
 entry here, and then no earlier run is lost.
 """
+
+
+_WITH_EXPONENT = re.compile(r"(?<![\w.])\d+(?:\.\d+)?[eE]\+?\d{1,2}(?![\w.])")
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -85,3 +96,60 @@ def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str
 
     pairs = {key: (value_of(key, before), value_of(key, now)) for key in sorted({*before, *now})}
     return [f"{key}={old!r} instead of {new!r}" for key, (old, new) in pairs.items() if old != new]
+
+
+def in_digits(arguments: Sequence[str]) -> list[str]:
+    """Write whole numbers such as ``1e5`` in digits, in the arguments of a command line.
+
+    Settings that have a fraction or a text in a file of ``conf`` are left as they are.
+    """
+    return [_in_digits(*each.partition("=")) if _WITH_EXPONENT.search(each) else each for each in arguments]
+
+
+def _in_digits(name: str, sign: str, value: str) -> str:
+    known = list(_defaults(name.lstrip("+")))
+    is_count = bool(known) and all(each is None or type(each) is int for each in known)
+    return f"{name}{sign}{_WITH_EXPONENT.sub(_whole, value) if is_count else value}"
+
+
+def _whole(number: re.Match[str]) -> str:
+    value = Decimal(number[0])
+    return str(int(value)) if value == int(value) <= LARGEST_INT else number[0]
+
+
+def _defaults(name: str) -> Iterator[Any]:
+    """Yield the values that a setting has in the files of ``conf``."""
+    group, _, key = name.rpartition(".")
+    folder = Path(conf_dir(), group)
+    for path in folder.glob("*.yaml") if group and folder.is_dir() else (Path(conf_dir(), "config.yaml"),):
+        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+        settings = settings if not group or folder.is_dir() else settings.get(group)
+        if isinstance(settings, Mapping) and key in settings:
+            yield settings[key]
+
+
+def as_typed(message: str, settings: Mapping[str, Any], typed: Iterable[str]) -> str:
+    """Return a message about values with the names of settings as they are typed: ``curriculum.depth`` for ``depth``.
+
+    A word that is no name elsewhere is one only where a rule begins, as in ``depth must be``, and before a ``=``.
+
+    Args:
+        message: that objects gave, which do not know by which setting they were made.
+        settings: all settings of the run.
+        typed: full names of those that were given, which decide where several have the same last part.
+    """
+    homes: dict[str, list[str]] = {}
+    for name, _ in flat(settings):
+        homes.setdefault(name.rpartition(".")[2], []).append(name)
+    given = set(typed)
+    for key, names in homes.items():
+        meant = names if len(names) == 1 else [name for name in names if name in given]
+        if len(meant) == 1:
+            message = re.sub(_mention(key), meant[0], message)
+    return message
+
+
+def _mention(key: str) -> str:
+    """Return the pattern of a setting's name in a message."""
+    name = rf"(?<![\w.'\"/(-]){re.escape(key)}"
+    return rf"{name}(?![\w.'\"/(-])" if "_" in key else rf"{name}(?==)|(?:(?<=^)|(?<=; )){re.escape(key)}(?= must )"

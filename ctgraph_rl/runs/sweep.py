@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import ConfigCompositionException, MissingConfigException
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,7 +24,7 @@ from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import become_portable
-from ctgraph_rl.runs.config import check_overwrite, save_yaml
+from ctgraph_rl.runs.config import check_overwrite, explain, save_yaml
 from ctgraph_rl.runs.status import (
     DONE,
     MISSING,
@@ -141,7 +142,7 @@ class Sweeper(Base):
             values = {setting: self._value(setting) for setting in overrides}
             choices = tuple(setting for setting, value in values.items() if value is None)
             if choices not in composed:
-                composed[choices] = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+                composed[choices] = self._composed(overrides, choices)
             for key, value in filter(None, values.values()):
                 OmegaConf.update(composed[choices], key, value)
             sweep = composed[choices].hydra.sweep
@@ -150,6 +151,21 @@ class Sweeper(Base):
                 self._compare(composed[choices], folder)
             found.setdefault(folder, overrides)
         return found
+
+    def _composed(self, overrides: Overrides, choices: Overrides) -> DictConfig:
+        """Return the configuration of a cell.
+
+        Raises:
+            ValueError: for a setting that is unknown there; names what the cell chooses.
+        """
+        assert self.config is not None and self.hydra_context is not None
+        try:
+            return self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+        except MissingConfigException:
+            raise
+        except ConfigCompositionException as error:
+            cell = f"with {' '.join(choices)}: " if choices else ""
+            raise ValueError(f"{cell}{explain(error)}") from error
 
     def _compare(self, cfg: DictConfig, folder: Path) -> None:
         """Keep in words what code has changed since a cell was run, if it was, or that this is unknown."""

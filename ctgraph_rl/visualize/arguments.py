@@ -98,8 +98,11 @@ def select(arguments: argparse.Namespace) -> Selection:
 
 
 def decisions(text: str) -> tuple[int, ...]:
-    """Read ``1.2`` as a goal."""
-    return tuple(map(int, text.split(".")))
+    """Read ``1.2``, or ``1,2``, as a goal."""
+    parts = text.replace(",", ".").split(".")
+    if not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"a goal is the decisions on the way to it, such as 1.2, got {text!r}")
+    return tuple(map(int, parts))
 
 
 def _named(name: str | None, number: int, changes: dict[str, Any], config_dir: Path | None) -> Selection:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.disk import write_named
-from ctgraph_rl.log.escape import terminal_lines
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.dot import to_dot
 from ctgraph_rl.visualize.gif import save_gif
@@ -24,14 +24,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     if not (arguments.figure or arguments.dot or arguments.gif):
         parser.error("nothing to write: name a --figure, --dot or --gif")
-    try:
+    with refused_by(parser):
         _write(select(arguments), arguments)
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description="Draw a task; with a policy, what it does there.")
+    parser = argparse.ArgumentParser(
+        prog="ctgraph-rl draw", description="Draw a task; with a policy, what it does there."
+    )
     add_arguments(parser)
     what = "what a figure has: observation ids in the states, their kinds, or the images"
     parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")

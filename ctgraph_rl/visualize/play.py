@@ -24,7 +24,7 @@ from rich.tree import Tree
 from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import StateType
-from ctgraph_rl.log.escape import terminal_lines
+from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
@@ -252,18 +252,17 @@ def watch(game: Game, episodes: int, delay: float) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line, ``ctgraph-rl play``."""
-    parser = argparse.ArgumentParser(description="Play a CT-graph in the terminal, or watch a policy play it.")
+    about = "Play a CT-graph in the terminal, or watch a policy play it."
+    parser = argparse.ArgumentParser(prog="ctgraph-rl play", description=about)
     add_arguments(parser)
     parser.add_argument("--episodes", type=int, default=3, help="of a policy; default: 3")
     parser.add_argument("--delay", type=float, default=0.5, help="seconds between a policy's steps; default: 0.5")
     arguments = parser.parse_args(argv)
-    try:
+    with refused_by(parser):
         delay_rule = f"--delay must be seconds >= 0, got {arguments.delay}"
         require((is_real(arguments.delay, 0), delay_rule), *at_least_one(episodes=arguments.episodes))
         selection = select(arguments)
         game = Game(selection.player(arguments.seed, not arguments.sampled), Console(highlight=False))
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
     try:
         _run(game, selection, arguments)
     except KeyboardInterrupt:

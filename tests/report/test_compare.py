@@ -190,3 +190,13 @@ def test_no_path_is_obeyed_by_a_terminal(pair, said, tmp_path):
 
     assert "\x1b" not in "\n".join(said(run, pair[1])[1])
     assert "\x1b" not in said(run / "no", pair[1])[2]
+
+
+def test_a_torn_last_line_is_told(pair, said):
+    with (pair[1] / LOG).open("a") as file:
+        file.write('{"kind": "trai')
+
+    code, lines, _ = said(*pair)
+
+    assert code == 0
+    assert lines[-1] == f"note: the last line of {pair[1] / LOG} is torn and not compared"

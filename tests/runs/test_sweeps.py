@@ -209,7 +209,7 @@ def test_what_cannot_be_composed_is_refused_before_anything_runs(learned, monkey
 
     errors = capsys.readouterr().err
     assert codes == [1, 1, 1] and learned == []
-    assert "Could not find 'agent/dqm'" in errors and "'agent.foo'" in errors and "'sed'" in errors
+    assert "unknown agent 'dqm': did you mean 'dqn'?" in errors and "'agent.foo'" in errors and "'sed'" in errors
 
 
 def test_directories_that_are_not_named_after_the_configuration_are_refused(learned, monkeypatch, capsys):
