@@ -6,9 +6,10 @@ import hashlib
 import json
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
+from html import escape
 from itertools import accumulate
 from os import PathLike
 from typing import Any
@@ -20,6 +21,9 @@ from ctgraph_rl.tasks.task import Task
 
 FINGERPRINT_SCHEMA = 1
 """Raised when the way a fingerprint is computed changes."""
+
+SHOWN = 20
+"""Blocks, and tasks of a block, that a notebook shows at most."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,23 @@ class Curriculum:
         )
         self.protocol.ids(len(self.tasks))
         require(*self._task_rules())
+
+    def __repr__(self) -> str:
+        return f"<Curriculum {self._summary}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: a table of the first blocks."""
+        labels = dict(zip(self.tasks, self.labels, strict=True))
+        head = "".join(f"<th>{name}</th>" for name in ("block", "tasks", "b, d, p", "frames"))
+        rows = [_block_html(number, block, labels) for number, block in enumerate(self.blocks[:SHOWN], 1)]
+        more = f"<p>and {len(self.blocks) - SHOWN:,} more blocks</p>" if len(self.blocks) > SHOWN else ""
+        source = escape(f"{self._summary}. {self.source}")
+        return f"<p>{source}</p><table><tr>{head}</tr>{''.join(rows)}</table>{more}"
+
+    @property
+    def _summary(self) -> str:
+        sizes = f"tasks: {len(self.tasks):,}, blocks: {len(self.blocks):,}, frames: {self.num_frames:,}"
+        return f"{self.name!r}, version {self.version}, {sizes}"
 
     def _task_rules(self) -> list[tuple[bool, str]]:
         everything = (*self.tasks, *self.evaluation.held_out)
@@ -181,6 +202,21 @@ class Curriculum:
         content = _canonical(replace(self, name="-", source="-"))
         text = json.dumps([FINGERPRINT_SCHEMA, content], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _block_html(number: int, block: Block, labels: Mapping[Task, str]) -> str:
+    """Return a row of the table of a notebook."""
+    tasks = list(dict.fromkeys(block.tasks))
+    graphs = dict.fromkeys((task.graph.branching_factor, task.graph.depth, task.graph.wait_prob) for task in tasks)
+    shapes = [f"{b}, {d}, {p:g}" for b, d, p in graphs]
+    cells = (str(number), _some([labels[task] for task in tasks]), _some(shapes, "; "), f"{block.num_frames:,}")
+    return f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
+
+
+def _some(names: Sequence[str], between: str = ", ") -> str:
+    """Return the first names in one text, and how many more there are."""
+    more = [f"{len(names) - SHOWN:,} more"] if len(names) > SHOWN else []
+    return between.join([*names[:SHOWN], *more])
 
 
 def _canonical(value: Any) -> Any:
