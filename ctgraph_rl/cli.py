@@ -48,8 +48,11 @@ SETTINGS = {
 }
 """Settings of a run that are often changed, each with a line about it."""
 
-PARTS = {part: f"curricula {part}" for part in ("describe", "list", "probabilities")}
-"""Words that follow a command."""
+PARTS = {
+    **{part: f"curricula {part}" for part in ("describe", "list", "probabilities")},
+    **{option: f"--{option}" for option in ("help", "version")},
+}
+"""Words that are no commands but part of one, or options."""
 
 USAGE = """usage: ctgraph-rl COMMAND ...         each command has --help
        ctgraph-rl SETTING=VALUE ...    one run, such as ctgraph-rl curriculum=su_b1_4tasks agent=dqn

@@ -135,9 +135,10 @@ def _check_options(arguments: Sequence[str]) -> None:
     """Refuse an option that Hydra does not know, with exit code 2."""
     _, unknown = get_args_parser().parse_known_args(arguments)
     for option in (word for word in unknown if word.startswith("-")):
-        setting = option.lstrip("-").partition("=")[0].replace("-", "_")
-        how = f"settings are written without dashes, as {setting}=VALUE; ctgraph-rl --help names options"
-        print(f"error: unknown option {terminal_text(option)}: {terminal_text(how)}", file=sys.stderr)
+        setting = option.strip("-").partition("=")[0].replace("-", "_")
+        as_setting = f"a setting is written without dashes, {setting}=VALUE; " if option.startswith("--") else ""
+        said = f"error: unknown option {option}: {as_setting}ctgraph-rl --help names the options"
+        print(terminal_text(said), file=sys.stderr)
         sys.exit(2)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import did_you_mean, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Gradient
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, ct_su_b1
@@ -52,7 +52,8 @@ def configured(configuration: str, image_seed: int = 1) -> Task:
     Raises:
         ValueError: for an unknown configuration; lists the choices.
     """
-    require((configuration in KINDS, f"configuration must be one of {', '.join(KINDS)}, got {configuration!r}"))
+    unknown = f"unknown configuration {configuration!r}: {did_you_mean(str(configuration), KINDS)}"
+    require((configuration in KINDS, unknown))
     return CONFIGURATIONS[f"CT-{configuration.replace('_', '-').upper()}"](image_seed=image_seed)
 
 

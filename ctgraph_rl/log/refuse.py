@@ -13,7 +13,7 @@ from ctgraph_rl.log.escape import terminal_lines
 
 @contextmanager
 def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
-    """Turn an error of the user into the usage, one message and exit code 2.
+    """Turn an error of the user into one message and exit code 2.
 
     A broken pipe is no such error.
     """
@@ -22,7 +22,7 @@ def refused_by(parser: argparse.ArgumentParser) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        parser.error(terminal_lines(error))
+        parser.exit(2, f"{parser.prog}: error: {terminal_lines(error)}\n")
 
 
 @contextmanager

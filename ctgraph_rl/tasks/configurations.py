@@ -12,7 +12,7 @@ from inspect import signature
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import did_you_mean, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -174,7 +174,8 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
         shape = {name: changes.pop(name) for name in signature(ct_graph).parameters if name in changes}
         return _changed(ct_graph(**shape), changes)
     if isinstance(task, str):
-        require((task in CONFIGURATIONS, f"task must be one of {', '.join(CONFIGURATIONS)}, got {task!r}"))
+        unknown = f"unknown configuration {task!r}: {did_you_mean(task, CONFIGURATIONS)}"
+        require((task in CONFIGURATIONS, unknown))
         task = CONFIGURATIONS[task]()
     require((isinstance(task, Task), f"task must be a Task or the name of a configuration, got {task!r}"))
     return _changed(task, changes)

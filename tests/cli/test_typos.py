@@ -56,7 +56,7 @@ def test_a_setting_with_dashes_is_answered_with_how_it_is_written(monkeypatch, c
     (said,) = capsys.readouterr().err.splitlines()
     name = "seed" if "seed" in words[0] else "learning_rate"
     assert code == 2
-    assert f"settings are written without dashes, as {name}=VALUE; ctgraph-rl --help" in said
+    assert said.endswith(f": a setting is written without dashes, {name}=VALUE; ctgraph-rl --help names the options")
 
 
 def test_folders_that_hold_something_or_are_elsewhere_stay(monkeypatch, tmp_path):

@@ -90,6 +90,7 @@ def test_the_version_is_its_own_with_those_of_what_it_is_built_on(call):
         ("Curricula", "curricula"),
         ("RUN", "run"),
         ("describe", "curricula describe"),
+        ("help", "--help"),
         ("curriculum", "curriculum=NAME"),
         ("PPO", "agent=ppo"),
         ("su-b1-4tasks", "curriculum=su_b1_4tasks"),

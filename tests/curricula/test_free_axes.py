@@ -103,7 +103,7 @@ def test_a_switch_makes_one_block_of_all_tasks(switch, expected):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"configuration": "su_b2"}, "configuration must be one of fo_b1, fo_b2, su_b1, co_b1, posr_b1, got 'su_b2'"),
+        ({"configuration": "su_b2"}, "unknown configuration 'su_b2': did you mean 'su_b1'"),
         ({"goals": "some"}, "goals must be one of all, random, nested, or a list of goals, got 'some'"),
         ({"goals": 3}, r"goals must be one of all, random, nested, or a list such as \[\[1, 2\]\], got 3"),
         ({"goals": [[1, 1, 1]]}, r"goals must have as many decisions as the depths, \[2\], and some for each"),

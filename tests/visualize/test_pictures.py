@@ -260,7 +260,7 @@ def test_names_on_the_command_line(tmp_path, monkeypatch):
     ("words", "message"),
     [
         ([], "nothing to write: name a --figure, --dot or --gif"),
-        (["CT-FO-B3", "--dot", "a"], "task must be one of CT-FO-B1"),
+        (["CT-FO-B3", "--dot", "a"], "unknown configuration 'CT-FO-B3': did you mean 'CT-FO-B2'?"),
         (["ct88", "--dot", "a"], "unknown curriculum 'ct88'; did you mean 'ct8'?"),
         (["ct8", "--task", "9", "--dot", "a"], "--task must be in 1..8, the tasks of ct8, got 9"),
         (["ct8", "--depth", "2", "--dot", "a"], "the tasks of a curriculum are as they are: ct8 takes no depth"),

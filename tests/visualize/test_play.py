@@ -193,7 +193,7 @@ def test_a_game_is_told_on_the_console_it_is_given():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["CT-XX-B1"], "task must be one of CT-FO-B1"),
+        (["CT-XX-B1"], "unknown configuration 'CT-XX-B1': did you mean 'CT-SU-B1'?"),
         (["CT-FO-B1", "--policy", "optimal", "--delay", "-1"], "--delay must be seconds >= 0, got -1.0"),
         (["CT-FO-B1", "--policy", "optimal", "--episodes", "0"], "episodes must be an integer >= 1, got 0"),
         (["CT-FO-B1", "--seed", "-1"], "seed must be"),
