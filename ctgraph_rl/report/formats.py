@@ -21,8 +21,11 @@ Modified = Mapping[str, str]
 
 NOT_MODIFIED: Modified = {}
 
+WIDTH = 80
+"""Characters of a line on a terminal."""
+
 MEANS = "mean [95 % interval]"
-LEGEND = f"{MEANS}, share of solved seeds [exact one], median of times [exact one]"
+LEGEND = f"{MEANS}, share of solved seeds [exact], median of times [exact]"
 
 
 def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
@@ -137,18 +140,22 @@ def _line(row: Row, notes: list[str]) -> Line:
 def _text(page: Page, modified: str | None) -> str:
     lines = [Line(*map(terminal_text, line)) for line in page.lines]
     measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
+    widest = sum((measures, values, counts)) + len("      n =     (9)")
+    gap = "  " if widest < WIDTH else " "
     shown, agent = [terminal_text(page.curriculum)], None
     if modified:
         about = terminal_text(f"modified: {modified}")
-        shown.append(textwrap.fill(about, 80, initial_indent="  ", subsequent_indent="    "))
+        shown.append(textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="    "))
     for line in lines:
         if line.agent != agent:
             agent = line.agent
             shown.append(f"  {agent}")
         note = f"({line.mark})" if line.mark else ""
-        shown.append(f"    {line.measure:{measures}}  {line.value:{values}}  n = {line.n:{counts}}  {note}".rstrip())
+        shown.append(
+            f"    {line.measure:{measures}}{gap}{line.value:{values}}{gap}n = {line.n:{counts}}{gap}{note}".rstrip()
+        )
     notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
-    shown += [textwrap.fill(note, 100, initial_indent="  ", subsequent_indent="      ") for note in notes]
+    shown += [textwrap.fill(note, WIDTH, initial_indent="  ", subsequent_indent="      ") for note in notes]
     return "\n".join(shown)
 
 

@@ -71,8 +71,8 @@ def test_tables_for_papers_have_a_line_for_each_measure(tmp_path):
         *("", "1. all seeds are equal: no spread to estimate"),
     ]
     assert [line for line in paper if line.startswith(("PPO", " & ", r"\caption"))] == [
-        r"\caption{a\_b: mean {[}95 \% interval], share of solved seeds {[}exact one], "
-        r"median of times {[}exact one]; n: seeds with a value / seeds expected.}",
+        r"\caption{a\_b: mean {[}95 \% interval], share of solved seeds {[}exact], "
+        r"median of times {[}exact]; n: seeds with a value / seeds expected.}",
         r"PPO & 2 & 0.00\rlap{\textsuperscript{a}} & $-$0.75 \\",
         r" &  &  & {\scriptsize [$-$3.93, 2.43]} \\",
     ]
@@ -131,3 +131,17 @@ def test_many_configurations_are_named_in_a_time_that_grows_with_their_number(tm
 
     assert time.process_time() - start < 2
     assert list(groups)[1999] == ("two", "PPO gamma=1999")
+
+
+def test_the_table_on_a_terminal_has_80_columns_with_every_measure_and_long_notes(tmp_path):
+    for seed, performance in enumerate(((0.25, 1.0), (1.0, 0.5))):
+        path = make_run(tmp_path, seed, performance)
+        scores = json.loads((path / "metrics.json").read_text())
+        scores["continual_world_forward_transfer"] = {"value": -seed, "definition": "x", "undefined": None}
+        (path / "metrics.json").write_text(json.dumps(scores))
+    make_run(tmp_path, 2, finished=False)
+
+    lines = formats.text(table(all_runs([tmp_path]))).splitlines()
+
+    assert max(map(len, lines)) <= 80
+    assert any(line.startswith("    continual world forward transfer") for line in lines)
