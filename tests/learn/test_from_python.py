@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.paths import CHECKOUT
 from helpers.scripted import ONE, TWO
 from helpers.scripted import curriculum as scripted_curriculum
 
@@ -100,6 +102,17 @@ def test_files_of_the_user_are_agents_and_methods_too(tmp_path):
     agent = make_agent("mine", TASKS, config_dir=tmp_path, num_envs=16)
 
     assert agent.num_envs == 16 and any(5 in weights.shape for weights in agent.parameters())
+
+
+def test_the_python_of_its_page_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (CHECKOUT / "docs" / "how-to" / "train_in_python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+
+    exec("\n".join(blocks), {})
+
+    assert "tensor(" in capsys.readouterr().out
+    assert Path("runs/mine/metrics.json").exists() and Path("runs/mine/tracker").is_dir()
 
 
 @pytest.mark.parametrize(
