@@ -20,8 +20,15 @@ def tracked() -> list[Path]:
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=CHECKOUT, capture_output=True, text=True
     )
-    paths = [CHECKOUT / line for line in listed.stdout.splitlines()] or list(CHECKOUT.rglob("*"))
-    return [path for path in paths if path.suffix in TEXTS and path.is_file()]
+    paths = [CHECKOUT / line for line in listed.stdout.splitlines()] or sorted(CHECKOUT.rglob("*"))
+    return [path for path in paths if path.suffix in TEXTS and path.is_file() and not is_made(path)]
+
+
+def is_made(path: Path) -> bool:
+    """Whether a file is none of the sources, where there is no git to ask, as in an archive."""
+    parts = path.relative_to(CHECKOUT).parts
+    made = any(part.startswith(".") or part in ("generated", "_build") for part in parts[:-1])
+    return made or parts[0] in ("build", "dist", "runs")
 
 
 def prose(path: Path) -> str:
