@@ -66,6 +66,12 @@ class CTGraphEnv(EnvBase):
     Raises:
         ValueError: for no tasks, values out of range, observations of different shapes, and what a required kernel
             cannot run.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> env = CTGraphEnv([ct_su_b1(goal=(1, 1)), ct_su_b1(goal=(1, 2))], seed=0)
+        >>> env.rollout(10)["observation"].shape[2:]
+        torch.Size([1, 12, 12])
     """
 
     batch_locked = True

@@ -53,7 +53,14 @@ class NavigationPolicy(RandomPolicy):
 
 
 class OptimalPolicy(NavigationPolicy):
-    """Goes straight to the goal: return 1 in 2(d+1) steps at p = 0."""
+    """Goes straight to the goal: return 1 in 2(d+1) steps at p = 0.
+
+    Example:
+        >>> from ctgraph_rl import evaluate
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> evaluate(OptimalPolicy, [ct_su_b1()], num_episodes=1)["step_count"].item()
+        6
+    """
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
         """What a row decides if it is at a decision state, in 1..b."""

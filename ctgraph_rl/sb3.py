@@ -28,6 +28,11 @@ class SB3VecEnv(VecEnv):
         num_envs: number of rows.
         task: see `CTGraphVectorEnv`, as for all others but the autoreset mode.
         kwargs: see `CTGraphVectorEnv`.
+
+    Example:
+        >>> envs = SB3VecEnv(256, "CT-SU-B1")
+        >>> envs.reset().shape
+        (256, 1, 12, 12)
     """
 
     def __init__(self, num_envs: int, task: Any = None, **kwargs: Any) -> None:

@@ -37,6 +37,11 @@ def load(name: str, **arguments: Any) -> Curriculum:
 
     Raises:
         ValueError: for an unknown name or argument; lists the choices.
+
+    Example:
+        >>> curriculum = load("ct8", num_frames=1024)
+        >>> len(curriculum.tasks), curriculum.num_frames
+        (8, 8192)
     """
     function = _function(name)
     choices = list(signature(function).parameters)

@@ -48,7 +48,14 @@ def concatenate(*sequences: OneOrMore) -> Tasks:
 
 
 def interleave(*sequences: OneOrMore) -> Tasks:
-    """The first task of each sequence, then the second of each; a sequence that has ended is left out."""
+    """The first task of each sequence, then the second of each; a sequence that has ended is left out.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> a, b, c = (ct_su_b1(goal=goal) for goal in ((1, 1), (1, 2), (2, 1)))
+        >>> [task.goal for task in interleave((a, b), c)]
+        [(1, 1), (2, 1), (1, 2)]
+    """
     rounds = itertools.zip_longest(*map(as_tasks, sequences))
     return tuple(task for turn in rounds for task in turn if task is not None)
 

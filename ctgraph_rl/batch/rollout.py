@@ -67,6 +67,13 @@ def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, kernel: str = "au
     Raises:
         ValueError: for buffers of another shape, actions of a wrong shape, dtype or range, and what a required kernel
             cannot run; the rows stay where they were.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> rows = Rows([ct_su_b1()] * 64, seed=0)
+        >>> steps = rollout(rows, torch.zeros(16, 64, dtype=torch.int64), Steps.empty(rows, 16))  # wait, 16 times
+        >>> steps.observation.shape, steps.reward.shape
+        (torch.Size([17, 64, 1, 12, 12]), torch.Size([16, 64]))
     """
     _check_buffers(rows, steps)
     require(

@@ -41,6 +41,13 @@ class CTGraph:
 
     Raises:
         ValueError: for values out of range and for a tree whose states do not fit int64.
+
+    Example:
+        >>> graph = CTGraph(branching_factor=2, depth=2, wait_prob=0.5)
+        >>> graph.num_states, graph.num_end_states
+        (16, 4)
+        >>> graph.reward_prob_navigation
+        0.25
     """
 
     branching_factor: int

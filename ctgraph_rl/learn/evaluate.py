@@ -62,6 +62,12 @@ def evaluate(
     Raises:
         ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy that
             was built on another environment, and a module that gives no logits.
+
+    Example:
+        >>> from ctgraph_rl.policies import OptimalPolicy
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> evaluate(OptimalPolicy, [ct_su_b1()], num_episodes=10)["episode_reward"].mean().item()
+        1.0
     """
     tasks = require_all(Task, "tasks", tasks)
     Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)

@@ -79,6 +79,14 @@ def learn_curriculum(
         ValueError: before any work, if frames are not a multiple of the agent's environments, or it reads task ids that
             are not shown.
         FloatingPointError: if a loss or weight is not finite; names it, block and frames.
+
+    Example:
+        >>> import curricula
+        >>> from ctgraph_rl import make_agent
+        >>> curriculum = curricula.load("ct2_interfering", num_frames=4096)
+        >>> log = learn_curriculum(curriculum, make_agent("ppo", curriculum))
+        >>> log.performance(2).shape  # before training and after each of two blocks, on two tasks
+        torch.Size([3, 2])
     """
     log = RunLog() if log is None else log
     device = checked_device(device)

@@ -33,6 +33,14 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 
     Raises:
         ValueError: for the log of another curriculum, by its fingerprint, and another number of experts.
+
+    Example:
+        >>> import curricula
+        >>> from ctgraph_rl import learn_curriculum, make_agent
+        >>> curriculum = curricula.load("ct2_interfering", num_frames=4096)
+        >>> log = learn_curriculum(curriculum, make_agent("ppo", curriculum))
+        >>> scores(log, curriculum)["backward_transfer"].formula
+        '1/(T-1) sum_{j=1..T-1} (R[T,j] - R[j,j])'
     """
     _check_same(log, curriculum)
     count = len(curriculum.tasks)

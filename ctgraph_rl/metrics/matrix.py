@@ -54,6 +54,11 @@ def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Te
 
     The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
     Undefined for a single task, and unless each task is trained once, alone, in order.
+
+    Example:
+        >>> R = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]])
+        >>> backward_transfer(R, [[0], [1]]).value
+        -0.5
     """
     _several_in_order(performance, trained)
     own = performance[1:].diagonal()

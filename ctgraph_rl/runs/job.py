@@ -165,6 +165,12 @@ def make_agent(
     Raises:
         ValueError: for unknown names and settings, with the one that was probably meant; for values out of range, an
             agent that cannot learn the curriculum, and a method that learns another curriculum in its place.
+
+    Example:
+        >>> import curricula
+        >>> agent = make_agent("lstm_ppo", curricula.load("su_b1_4tasks"), method="ewc", learning_rate=0.001)
+        >>> agent.num_envs
+        256
     """
     require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
     cfg = config.with_names({"agent": name, "method": method}, None if config_dir is None else Path(config_dir))

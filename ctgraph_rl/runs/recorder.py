@@ -82,6 +82,20 @@ class Recorder:
             that has changed would be resumed.
         FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it;
             or if the run to resume is finished.
+
+    Example:
+        >>> import curricula
+        >>> curriculum = curricula.load("su_b1_4tasks")
+        >>> with Recorder(curriculum) as recorder:
+        ...     for frames in (0, *curriculum.ends):  # learn a block before each but the first
+        ...         recorder.evaluate(lambda observation: np.zeros(len(observation), dtype=np.int64), frames)
+        {'goal1.1': 0.0, 'goal1.2': 0.0, 'goal2.1': 0.0, 'goal2.2': 0.0}
+        {'goal1.1': 0.0, 'goal1.2': 0.0, 'goal2.1': 0.0, 'goal2.2': 0.0}
+        {'goal1.1': 0.0, 'goal1.2': 0.0, 'goal2.1': 0.0, 'goal2.2': 0.0}
+        {'goal1.1': 0.0, 'goal1.2': 0.0, 'goal2.1': 0.0, 'goal2.2': 0.0}
+        {'goal1.1': 0.0, 'goal1.2': 0.0, 'goal2.1': 0.0, 'goal2.2': 0.0}
+        >>> recorder.log.performance(4).shape
+        torch.Size([5, 4])
     """
 
     def __init__(

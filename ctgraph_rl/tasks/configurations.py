@@ -106,6 +106,10 @@ def ct_su_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:
     Args:
         goal: two decisions in 1..2.
         image_seed: seed of the image set.
+
+    Example:
+        >>> ct_su_b1(goal=(2, 1)).memoryless_ceiling()
+        0.25
     """
     return ct_graph(2, 2, 0.0, goal, fully_observable=False, image_seed=image_seed)
 
@@ -166,6 +170,10 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
     Raises:
         UnknownFieldError: a ``ValueError``, for changes that are no fields.
         ValueError: for unknown names, and values out of range.
+
+    Example:
+        >>> make_task("CT-FO-B2", goal=(1, 2, 1)).graph.depth
+        3
     """
     require((task is None or config is None, "give a task or a config, not both"))
     if config is not None:

@@ -34,6 +34,11 @@ class Block:
 
     Raises:
         ValueError: for no tasks, a budget below 1, or a switch with one task.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> Block(ct_su_b1(), num_frames=1024).num_frames
+        1024
     """
 
     tasks: tuple[Task, ...]

@@ -46,6 +46,11 @@ def shared_decisions(tasks: Sequence[Task]) -> Tensor:
 
     (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3. 1 means that the goal of the smaller graph is on
     the way to that of the larger one.
+
+    Example:
+        >>> import curricula
+        >>> shared_decisions(curricula.load("ct2_interfering").tasks).tolist()
+        [[1.0, 0.0], [0.0, 1.0]]
     """
 
     def share(one: Task, other: Task) -> float:

@@ -57,6 +57,16 @@ class Task:
 
     Raises:
         ValueError: names every field that breaks a rule.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from ctgraph_rl import PaperImages
+        >>> x = Observations(wait_ids=(2, 2), decision_ids=(3, 3), end_ids=(4, 4))
+        >>> task = Task(CTGraph(2, 2), goal=(1, 2), observations=x, images=PaperImages(5))
+        >>> task.optimal_value(1.0)
+        1.0
+        >>> replace(task, goal=(2, 2)).goal
+        (2, 2)
     """
 
     graph: CTGraph

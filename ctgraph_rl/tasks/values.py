@@ -50,6 +50,11 @@ def optimal_value(task: Task, gamma: float) -> float:
 
     Raises:
         ValueError: for a gamma out of range, and rewards other than `Needle` beyond `MAX_ENUMERATED_STATES` states.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> round(optimal_value(ct_su_b1(), gamma=0.9), 5)  # 0.9^5
+        0.59049
     """
     require(*fraction(gamma=gamma))
     tree = _GoalAndAnother(task) if is_needle(task) else smallest_tree(task, False)
@@ -176,6 +181,11 @@ def random_frames_to_goal(task: Task) -> float:
 
     Episodes are independent, so this is `random_episode_length` over P_R (Wald's identity), less the step after the
     goal with an ``extra_end_step``. A goal that changes alters nothing, as the policy prefers none. inf beyond floats.
+
+    Example:
+        >>> from ctgraph_rl.tasks.configurations import ct_su_b1
+        >>> round(random_frames_to_goal(ct_su_b1()))
+        651
     """
     frames = _random_episode_length(task) / task.graph.exact_reward_prob_random - task.extra_end_step
     try:

@@ -49,7 +49,7 @@ def test_every_page_of_docs_that_a_file_names_exists():
     named = {
         (path.relative_to(CHECKOUT).as_posix(), name)
         for path in FILES
-        for name in re.findall(r"\bdocs/[\w/.-]+\.(?:md|ipynb|py|png|csv)\b", path.read_text(encoding="utf-8"))
+        for name in re.findall(r"(?<![\w/])docs/[\w/.-]+\.(?:md|ipynb|py|png|csv)\b", path.read_text(encoding="utf-8"))
     }
 
     assert len(named) > 50
