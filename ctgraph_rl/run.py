@@ -64,7 +64,7 @@ def show(run_dir: Path, report: bool) -> None:
 
 
 ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError)
-"""What a user can cause, and is told in one message."""
+"""Errors that a user can cause, each answered with one message."""
 
 
 class Stop(BaseException):

@@ -1,4 +1,4 @@
-"""How commands end: with a message on what the user asked for, or quietly where nobody reads what they print."""
+"""How commands end: with a message on what the user asked for, or quietly once their output has no reader."""
 
 from __future__ import annotations
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.paths import CHECKOUT
+from helpers.sweeping import command_line
 
 import curricula
 from baselines.methods.ewc import EWC
 from baselines.methods.mask_lc import MaskLC
-from ctgraph_rl import CTGraph, CTGraphEnv, Evaluation, Observations, PaperImages, Protocol, Task, metrics
-from ctgraph_rl.checks import require
+from ctgraph_rl import CTGraph, CTGraphEnv, Observations, PaperImages, Protocol, Task, metrics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.gym import CTGraphGymEnv
 from ctgraph_rl.log.scores import NO_EXPERTS
@@ -65,12 +65,19 @@ RAISED: list[Callable[[], object]] = [
     act_after_the_end,
     lambda: CTGraphEnv([ct_su_b1()]).set_tasks([ct_fo_b1()]),
     lambda: checked_device("cuda"),
-    lambda: require(curricula.load("su_b1_4tasks", num_frames=5000).blocks[0].frame_rule(256, "block 1, 2, 3, 4")),
-    lambda: require(Evaluation(every=100).every_rule(256)),
     lambda: prepared(MaskLC()),
     lambda: prepared(EWC(1.0, False, 0.5, "policy", num_samples=1024, heads="auto"), boundaries="hidden"),
-    lambda: curricula.load("su_b1_4task"),
 ]
+
+TYPED = (
+    "curriculum.num_frames=5000",
+    "evaluation.every=100",
+    "curriculum=su_b1_4task",
+    "agent.lr=1",
+    "-m method=finetune,ewc method.coeff=1,2",
+    "hydra/launcher=joblib",
+)
+"""Settings of runs that are refused."""
 
 
 def matches(quoted: str, message: str) -> bool:
@@ -78,8 +85,11 @@ def matches(quoted: str, message: str) -> bool:
     return re.fullmatch(".*".join(map(re.escape, quoted.split("..."))), message, re.DOTALL) is not None
 
 
-def test_every_message_that_the_page_quotes_is_raised():
-    messages = []
+def test_every_message_that_the_page_quotes_is_raised(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for words in TYPED:
+        assert command_line(monkeypatch, *words.split()) == 1
+    messages = [line.removeprefix("error: ") for line in capsys.readouterr().err.splitlines()]
     for raised in RAISED:
         with pytest.raises(ValueError) as refusal:
             raised()
@@ -92,6 +102,7 @@ def test_every_message_that_the_page_quotes_is_raised():
 
     said = [*messages, *filter(None, of_metrics)]
     assert len(QUOTED) >= 25
+    assert len(messages) == len(TYPED) + len(RAISED)
     assert [
         quoted
         for quoted in QUOTED

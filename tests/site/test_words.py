@@ -31,8 +31,7 @@ ALLOWED: dict[str, str] = {}
 """Texts in which a word is right, by the file that has them."""
 
 FOLDERS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins", "conf", "docs")
-FILES = ("CONTRIBUTING.md", "SECURITY.md")
-"""README and the results pages are looked after by the tests of their own pages."""
+FILES = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
 
 TOKENS = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
 WORDS = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
