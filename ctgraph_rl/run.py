@@ -115,11 +115,12 @@ def main() -> None:
     sys.argv = ["ctgraph-rl", *sweepable(in_digits(arguments))]
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
-        with quiet_where_nobody_reads():
-            _check_options(arguments)
-            _job()
-    except Restart:
-        restart(environment, arguments)
+        try:
+            with quiet_where_nobody_reads():
+                _check_options(arguments)
+                _job()
+        except Restart:
+            restart(environment, arguments)
     except (Stop, *ERRORS) as error:
         cause, message = (error.error, error.message) if isinstance(error, Stop) else (error, explain(error))
         if full_error:
