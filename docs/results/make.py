@@ -265,15 +265,11 @@ def rerun() -> dict[str, str]:
     again = read("reruns")
     changed = [line for line in again if line["agent"] == OLDER and line["table"] == "depth_ladder"]
     others = [line for line in again if line not in changed]
-    rerun_again = {(line["depth"], line["seed"]) for line in changed}
     cells = [line for line in read("depth_ladder") if line["agent"] == OLDER]
-    older = groups([line for line in cells if (line["depth"], line["seed"]) not in rerun_again], "depth")
-    left = (f"depth {depth} ({len(lines)} of 5 seeds)" for (depth,), lines in older.items())
     return {
         "rerun": str(len(others)),
         "rerun_equal": str(sum(line["equal"] == line["numbers"] for line in others)),
         "changed": f"{len(changed)} of {len(cells)}",
-        "older": ", ".join(left) or "none",
     }
 
 
