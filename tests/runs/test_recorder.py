@@ -195,6 +195,8 @@ def test_a_run_that_was_stopped_is_resumed_and_ends_as_if_it_had_never_been(tmp_
 
     with Recorder(TASKS, tmp_path / "run", resume=True) as recorder:
         reached = recorder.frames, recorder.saved
+        with pytest.raises(ValueError, match=f"frames must grow: {stop} comes after {stop}"):
+            recorder.training(stop)
         Learner().learn(recorder)
 
     whole, run = (RunLog.read(tmp_path / name / "run.jsonl").measurements for name in ("whole", "run"))
