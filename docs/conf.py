@@ -22,7 +22,7 @@ author = copyright = "the ctgraph_rl developers"
 version = release = __version__
 repository = PROJECT.get("urls", {}).get("Repository", "")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "generate"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "generate", "llms"]
 exclude_patterns = ["_build", "results/*template.md"]
 templates_path: list[str] = []
 nitpicky = True

@@ -10,6 +10,7 @@ from baseline_cards import baseline_cards
 from command_pages import command_pages
 from curriculum_cards import curriculum_cards
 from figures import draw_all
+from gallery import gallery_page
 from links import OUTSIDE, relocated
 from metric_cards import metric_cards
 from sphinx.application import Sphinx
@@ -30,6 +31,7 @@ def generate(app: Sphinx) -> None:
     figures = draw_all(folder / "figures")
     made = (api_pages(), command_pages(), baseline_cards(), metric_cards(), curriculum_cards(figures))
     pages = {folder / path: text for path, text in chain(*made)}
+    pages[folder / "gallery.md"] = gallery_page(folder / "figures")
     pages |= {folder.parents[1] / page: _copy(app, name, page) for name, page in OUTSIDE.items() if FOLDER in page}
     for path, text in pages.items():
         write(path, text)

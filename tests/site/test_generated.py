@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+from types import SimpleNamespace
 
 import pytest
 from helpers.paths import CHECKOUT
@@ -108,3 +109,26 @@ def test_links_to_files_beside_docs_lead_to_their_pages(site):
         "[c](../../baselines/ppo.py)", "docs/how-to/resume.md", "docs/how-to/resume.md", "https://host/repository"
     )
     assert there == "[c](https://host/repository/blob/main/baselines/ppo.py)"
+
+
+def test_every_tile_of_the_gallery_has_its_command_and_its_figure(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(site("gallery"), "DRAWN", {"A task": "draw CT-FO-B1 --figure FIGURE"})
+
+    page = site("gallery").gallery_page(tmp_path / "figures")
+
+    commands = re.findall(r"```bash\n(.*)\n```", page)
+    figures = re.findall(r"!\[.*?\]\((.*?)\)", page)
+    assert len(commands) == len(figures) >= 15
+    assert [each for each in figures if not (tmp_path if each[0] != "." else EXTENSIONS).joinpath(each).is_file()] == []
+
+
+def test_the_index_for_language_models_has_a_line_for_each_page(site, tmp_path):
+    (tmp_path / "a.md").write_text("# A\n\nWhat it is. More.\n", encoding="utf-8")
+    titles = {"a": SimpleNamespace(astext=lambda: "A")}
+    environment = SimpleNamespace(titles=titles, found_docs={"a"}, doc2path=lambda name: tmp_path / f"{name}.md")
+    app = SimpleNamespace(env=environment, outdir=tmp_path, builder=SimpleNamespace(format="html"))
+
+    site("llms").write_index(app, None)
+
+    assert "- [A](a.html): What it is\n" in (tmp_path / "llms.txt").read_text(encoding="utf-8")
+    assert "More." in (tmp_path / "llms-full.txt").read_text(encoding="utf-8")

@@ -60,5 +60,6 @@ def test_every_page_of_docs_that_a_file_names_exists():
 def test_every_link_of_a_page_leads_to_a_file(page):
     folder = CHECKOUT / "docs" / TEMPLATES[page.name] if page.name in TEMPLATES else page.parent
     links = re.findall(r"\]\((?!\w+:)([^)\s#]+)", prose(page))
+    links = [link for link in links if "generated/" not in link]  # the strict build checks those
 
     assert [link for link in links if not (folder / link).exists()] == []

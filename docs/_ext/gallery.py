@@ -1,0 +1,86 @@
+"""The gallery: figures, each with the command that makes it; those of `DRAWN` are drawn when the site is built."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+from ctgraph_rl import cli
+
+DOCS = Path(__file__).resolve().parents[1]
+SHELL = re.compile(r"```bash\n(.*?)```", re.DOTALL)
+
+
+class Tile(NamedTuple):
+    """A figure: a title, the command, and the path of the figure from ``docs/generated``."""
+
+    title: str
+    command: str
+    figure: str
+
+
+DRAWN = {
+    "The graphs and goals of a curriculum": "curricula describe fo_b1_depth2to5 --figure FIGURE",
+    "How alike the tasks of a curriculum are": "curricula describe su_b1_depth2to5 --similarity FIGURE",
+    "A task of twenty-seven end states": "draw --branching-factor 3 --depth 3 --goal 2.1.3 --figure FIGURE",
+    "What the optimal policy does": "draw CT-SU-B1 --goal 2.1 --policy optimal --figure FIGURE",
+    "A policy that waits and decides at random": "draw CT-CO-B1 --policy navigation --figure FIGURE",
+    "The images of a fully observable task": "draw CT-FO-B1 --show images --figure FIGURE",
+}
+"""Commands of figures that are drawn here."""
+
+RESULTS = {
+    "main_job-training.png": "LSTM-PPO learns four goals one after the other",
+    "main_job-transfer.png": "Its performance matrix, and what each block changed",
+    "baselines_b1.png": "Seven agents on four configurations",
+    "masks_ct8.png": "Modulating masks on CT8",
+    "methods.png": "All methods on four agents",
+}
+"""Figures of the results, which ``docs/results/make.py`` draws from the raw results."""
+
+
+def gallery_page(folder: Path) -> str:
+    """Draw the figures of commands into a folder, and return the page of all tiles in Markdown."""
+    tiles = [*_drawn(folder), *_of_page("how-to/draw_and_play.md"), *_of_results()]
+    parts = ["# Gallery", "Every figure with the command that makes it.", "::::{container} gallery"]
+    return "\n\n".join([*parts, *map(_markdown, tiles), "::::"]) + "\n"
+
+
+def _markdown(tile: Tile) -> str:
+    figure = f"![{tile.title}]({tile.figure})"
+    return f":::{{container}} tile\n**{tile.title}**\n\n{figure}\n\n```bash\n{tile.command}\n```\n:::"
+
+
+def _drawn(folder: Path) -> list[Tile]:
+    folder.mkdir(parents=True, exist_ok=True)
+    tiles = []
+    for number, (title, command) in enumerate(DRAWN.items(), 1):
+        path = folder / f"gallery{number}.png"
+        if not path.is_file():
+            _run(shlex.split(command.replace("FIGURE", str(path))))
+        tiles.append(Tile(title, f"ctgraph-rl {command.replace('FIGURE', 'figure.png')}", f"figures/{path.name}"))
+    return tiles
+
+
+def _run(words: list[str]) -> None:
+    argv = mock.patch.object(sys, "argv", ["ctgraph-rl", *words])
+    with argv, contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        cli.main()
+
+
+def _of_page(name: str) -> list[Tile]:
+    """Return a tile for each stored figure of a page whose commands a test compares with it."""
+    lines = [line for block in SHELL.findall((DOCS / name).read_text(encoding="utf-8")) for line in block.splitlines()]
+    figures = {line.split()[-1]: line for line in lines if (DOCS / "pictures" / line.split()[-1]).is_file()}
+    return [Tile(figure.rpartition(".")[0], line, f"../pictures/{figure}") for figure, line in figures.items()]
+
+
+def _of_results() -> list[Tile]:
+    found = {name: title for name, title in RESULTS.items() if (DOCS / "results" / name).is_file()}
+    return [Tile(title, "python docs/results/make.py", f"../results/{name}") for name, title in found.items()]
