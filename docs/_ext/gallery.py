@@ -27,13 +27,26 @@ class Tile(NamedTuple):
 
 DRAWN = {
     "The graphs and goals of a curriculum": "curricula describe fo_b1_depth2to5 --figure FIGURE",
-    "How alike the tasks of a curriculum are": "curricula describe su_b1_depth2to5 --similarity FIGURE",
+    "How alike the tasks of a curriculum are": "curricula describe su_b1_4tasks --similarity FIGURE",
     "A task of twenty-seven end states": "draw --branching-factor 3 --depth 3 --goal 2.1.3 --figure FIGURE",
     "What the optimal policy does": "draw CT-SU-B1 --goal 2.1 --policy optimal --figure FIGURE",
     "A policy that waits and decides at random": "draw CT-CO-B1 --policy navigation --figure FIGURE",
     "The images of a fully observable task": "draw CT-FO-B1 --show images --figure FIGURE",
 }
 """Commands of figures that are drawn here."""
+
+TITLES = {
+    "b2d3": "Two branches, depth 3",
+    "b3d2": "Three branches, depth 2, waiting that may last",
+    "confounding": "Confounding: a wait state shows any of many images",
+    "episode": "An episode of the optimal policy",
+    "full": "Fully observable: each state has its image",
+    "images": "Images with noise and rotation",
+    "large": "The way to the goal in a deep tree",
+    "surjective": "Surjective: an image for each kind of state",
+    "visits": "Where a random policy goes",
+}
+"""What the figures of the page on drawing show."""
 
 RESULTS = {
     "main_job-training.png": "LSTM-PPO learns four goals one after the other",
@@ -78,7 +91,9 @@ def _of_page(name: str) -> list[Tile]:
     """Return a tile for each stored figure of a page whose commands a test compares with it."""
     lines = [line for block in SHELL.findall((DOCS / name).read_text(encoding="utf-8")) for line in block.splitlines()]
     figures = {line.split()[-1]: line for line in lines if (DOCS / "pictures" / line.split()[-1]).is_file()}
-    return [Tile(figure.rpartition(".")[0], line, f"../pictures/{figure}") for figure, line in figures.items()]
+    return [
+        Tile(TITLES.get(Path(figure).stem, figure), line, f"../pictures/{figure}") for figure, line in figures.items()
+    ]
 
 
 def _of_results() -> list[Tile]:
