@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,8 +15,15 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.observability import POLICIES, state_entropy
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.tasks.values import optimal_value, random_frames_to_goal, worst_value
+from ctgraph_rl.tasks.values import (
+    memoryless_ceiling,
+    open_loop_ceiling,
+    optimal_value,
+    random_frames_to_goal,
+    worst_value,
+)
 
 NO_EXPERTS = "no experts were given"
 
@@ -60,6 +68,7 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         "mastered_returns": mastered_returns(curriculum.tasks),
         "best": best,
         "zero": torch.tensor([task.fail_reward for task in curriculum.tasks], dtype=torch.float64),
+        **ceilings(curriculum.tasks),
         "end_rates": log.last("end_rate", count),
         "success_rates": log.last("success_rate", count),
         "episodes": log.training("episodes"),
@@ -91,6 +100,24 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
 def optimal_values(tasks: Sequence[Task]) -> Tensor:
     """Each task's best mean return, float64 [tasks]; NaN where a graph is too large to know."""
     return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64)
+
+
+def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
+    """Return exact ceilings of each task and what its observations tell, float64 [tasks], or why one is not known."""
+    found: dict[str, Callable[[Task], float]] = {
+        "open_loop_ceilings": open_loop_ceiling,
+        "memoryless_ceilings": memoryless_ceiling,
+        **{f"{policy}_entropies": partial(state_entropy, policy=policy) for policy in POLICIES},
+    }
+    return {name: _of_each(value, tasks) for name, value in found.items()}
+
+
+def _of_each(value: Callable[[Task], float], tasks: Sequence[Task]) -> Tensor | Undefined:
+    """Return a value of each task; the reason of the first that has none."""
+    try:
+        return torch.tensor([value(task) for task in tasks], dtype=torch.float64)
+    except ValueError as error:
+        return Undefined(str(error))
 
 
 def mastered_returns(tasks: Sequence[Task]) -> Tensor:

@@ -25,7 +25,7 @@ from ctgraph_rl.metrics.transfer import check_experts, mean_area, stage_areas, t
 SUMMARY = (average_performance, forward_transfer, backward_transfer, forgetting)
 """The metrics that every run shows."""
 
-ORDER = ("matrix", "curves", "optimum", "lifetime", "transfer")
+ORDER = ("matrix", "curves", "optimum", "ceilings", "lifetime", "transfer")
 """Modules in the order in which their metrics are listed; those of others follow."""
 
 for _found in iter_modules(__path__):

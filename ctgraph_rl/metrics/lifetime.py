@@ -33,6 +33,7 @@ from ctgraph_rl.metrics.record import defined
 from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 
 NEW = "New et al. 2022, Lifelong learning metrics (arXiv 2201.08278), as in l2metrics 3.1.0"
+BAKER = f"{NEW}; Baker et al. 2023 (arXiv 2301.07799)"
 SCALE, OFFSET = 100.0, 1.0
 LONGEST_WINDOW = 100
 UNSATURATED_SHARE = 0.2
@@ -162,7 +163,7 @@ def _contrasts(before: Any, after: Any) -> Any:
 
 of_pairs = partial(
     defined,
-    source=NEW,
+    source=BAKER,
     partial=True,
     missing="a pair of tasks has no evaluations around a training of one task alone, or none that are positive",
 )

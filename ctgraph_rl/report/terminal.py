@@ -24,6 +24,11 @@ from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
 from ctgraph_rl.runs.settings import as_before
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
+LIFELONG = {
+    "forward_transfer_ratio": "forward transfer, Baker et al. 2023",
+    "backward_transfer_ratio": "backward transfer, Baker et al. 2023",
+}
+"""Transfer as ratios of terminal performance around a training, under its authors' name."""
 WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
 """Metrics that are shown; the others are in the file."""
 
@@ -169,10 +174,13 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in (*ALWAYS, *(name for name in WITH_EXPERTS if metrics.get(name, {}).get("value") is not None)):
+    for name in (
+        *ALWAYS,
+        *(name for name in (*LIFELONG, *WITH_EXPERTS) if metrics.get(name, {}).get("value") is not None),
+    ):
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
-        table.add_row(measure_name(name), value, _text(metric["undefined"] or metric["formula"]))
+        table.add_row(LIFELONG.get(name, measure_name(name)), value, _text(metric["undefined"] or metric["formula"]))
     return table
 
 

@@ -121,6 +121,18 @@ def test_rl2_searches_as_the_best_policy_does_at_depth_2_in_four_of_five_seeds(m
     assert "RL^2 with 3,072,000 frames at depth 2 does in 4 of 5 seeds what the best search does" in RESULTS
 
 
+def test_the_other_agents_with_memory_solve_what_they_were_run_on_in_every_seed(make):
+    cells = make.groups(make.read("memory_b1"), "configuration", "task", "agent")
+
+    assert {agent for _, _, agent in cells} == {"drqn", "qrdqn_lstm", "rl2"}
+    for (name, goal, agent), lines in cells.items():
+        assert [line["seed"] for line in lines] == list("01234")
+        assert all(float(line["greedy_success"]) >= 0.9 for line in lines)
+        assert make.task_of(name, goal).memoryless_ceiling(deterministic=True) == 0
+        assert f"`{agent}` solves" in RESULTS
+        assert f"goal {goal} of CT-{name.upper().replace('_', '-')} in 5 of 5" in RESULTS
+
+
 def test_a_seed_or_cell_that_is_missing_is_no_table(make, monkeypatch):
     search, lines = sys.modules["search"], make.read("baselines_b1_instances")
 

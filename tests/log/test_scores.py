@@ -7,10 +7,17 @@ from dataclasses import replace
 
 import pytest
 
-from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, metrics
+from ctgraph_rl import Block, Curriculum, Evaluation, Gradient, RunLog, metrics
 from ctgraph_rl.log.scores import inputs_of, optimal_values, scores
-from ctgraph_rl.tasks.configurations import ct_su_b1
-from ctgraph_rl.tasks.values import random_frames_to_goal
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
+from ctgraph_rl.tasks.observability import state_entropy
+from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
+
+OF_THE_TASKS = (
+    *("open_loop_ceiling", "memoryless_ceiling", "optimal_performance"),
+    *("state_entropy_random", "state_entropy_navigation", "state_entropy_optimal"),
+)
+"""Metrics that say what the tasks allow, whatever was learned."""
 
 TASKS = ct_su_b1((1, 1)), ct_su_b1((1, 2))
 CURRICULUM = Curriculum("two", 1, "here", (Block(TASKS[0], 200), Block(TASKS[1], 200)), Evaluation(every=100))
@@ -223,7 +230,7 @@ def test_a_log_that_stops_early_or_has_no_evaluation_has_scores():
 
     assert found["frames_to_first_reward"].terms[1] is None
     assert found["frames_to_first_reward"].terms[0] > 0
-    assert all(metric.value is None for name, metric in found.items() if name != "regret")
+    assert {name for name, metric in found.items() if metric.value is not None} == {"regret", *OF_THE_TASKS}
 
 
 def test_frames_count_from_where_the_curriculum_says_that_a_block_starts(log):
@@ -272,7 +279,7 @@ def test_a_run_that_was_hardly_evaluated_has_undefined_scores_and_does_not_fail(
     found = scores(log, CURRICULUM)
 
     defined = {name for name, metric in found.items() if metric.value is not None}
-    assert defined == {"regret", "frames_to_first_reward", "search_efficiency"}
+    assert defined == {"regret", "frames_to_first_reward", "search_efficiency", *OF_THE_TASKS}
     assert found["performance_recovery"].undefined == "lifelong metrics need an evaluation of every task"
     assert found["average_performance"].n_undefined == found["normalised_performance"].n_undefined == 2
 
@@ -308,3 +315,40 @@ def test_each_transfer_has_its_own_area():
     found = scores(uneven, alone, [flat])
 
     assert [found[name].value for name in TRANSFER] == [0.25, 0.1875]
+
+
+def test_ceilings_and_entropies_are_those_of_the_tasks_and_the_gap_is_closed_by_what_memory_gains():
+    tasks = [ct_su_b1((1, 1)), ct_su_b1((1, 2)), ct_co_b1((2, 1))]
+    learned = Curriculum("three", 1, "test", [Block(task, 100) for task in tasks])
+    log = RunLog()
+    for task, mean in enumerate((1.0, 0.25, 0.625), 1):
+        shares = {"return_mean": mean, "success_rate": mean, "end_rate": 1.0, "length_mean": 6.0}
+        log.append(
+            "evaluation", moment="after", block=3, frames=300, task=task, label=str(task), held_out=False, **shares
+        )
+
+    found = scores(log, learned)
+
+    assert found["open_loop_ceiling"].terms == (1.0, 1.0, pytest.approx(open_loop_ceiling(tasks[2])))
+    assert found["memoryless_ceiling"].terms == (1.0, 0.25, 0.25)
+    assert found["optimal_performance"].value == 1.0
+    gap = found["memory_gap_closed"]
+    assert gap.terms == (None, 0.0, 0.5)
+    assert (gap.value, gap.n_undefined) == (0.25, 1)
+    for policy in ("random", "navigation", "optimal"):
+        exact = tuple(state_entropy(task, policy) for task in tasks)
+        assert found[f"state_entropy_{policy}"].terms == pytest.approx(exact) and exact[0] > 0
+
+
+def test_ceilings_that_are_not_known_say_why_and_tasks_without_a_gap_close_none():
+    plain, gradient = ct_fo_b1(), replace(ct_su_b1(), reward_fn=Gradient())
+    log = RunLog()
+    log.append("run", trained=[[1]])
+    found = [scores(log, Curriculum("one", 1, "test", [Block(task, 100)])) for task in (plain, gradient)]
+
+    assert "memory gains nothing there" in (found[0]["memory_gap_closed"].undefined or "")
+    for name in ("memoryless_ceiling", "memory_gap_closed"):
+        reason = found[1][name].undefined or ""
+        assert reason.startswith("the memoryless ceiling is exact only for the Needle reward")
+    assert found[1]["open_loop_ceiling"].value == found[1]["optimal_performance"].value == 1.0
+    assert [each["state_entropy_random"].value for each in found] == [0.0, pytest.approx(state_entropy(gradient))]
