@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import require
 
 if TYPE_CHECKING:
+    from torch import Generator
+
+    from ctgraph_rl.agent import Agent
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 HERE = Path(__file__).resolve().parent
@@ -83,6 +86,26 @@ def is_published(curriculum: Curriculum) -> bool | None:
     if curriculum.name not in published.names():
         return None
     return published.load(curriculum.name).fingerprint == curriculum.fingerprint
+
+
+def why_agents_learn_alone(agent: Agent) -> str | None:
+    """Return why agents like this one cannot learn as one batch of seeds; None if they can.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    return import_module("baselines.together").why_not_together(agent)
+
+
+def agents_together(agents: Sequence[Agent], generators: Sequence[Generator]) -> Any:
+    """Return the `ctgraph_rl.learn.together.Group` of agents, each with what it draws from.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    return import_module("baselines.together").Group(agents, generators)
 
 
 def class_named(module: str, name: str) -> type | None:

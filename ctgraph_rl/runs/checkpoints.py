@@ -14,7 +14,7 @@ import pickle
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +76,14 @@ class Checkpoints:
             at_block_end: always save.
         """
         stop = self.interrupt.is_asked
-        if stop or at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds:
+        if stop or self.is_due(at_block_end):
             self.save(state())
         if stop:
             self.interrupt.exit()
+
+    def is_due(self, at_block_end: bool) -> bool:
+        """Return whether it is time to save."""
+        return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds
 
     def save(self, state: State) -> None:
         """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.
@@ -88,7 +92,7 @@ class Checkpoints:
             OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
             ValueError: if the first one cannot be read back, for it holds more than tensors and plain values.
         """
-        path, content = self.folder / f"{state['frames']:012d}.pt", encoded(state)
+        path, content = self.path_of(state["frames"]), encoded(state)
         if self._last is None:
             _require_plain(content)
         made_folder(self.folder)
@@ -103,6 +107,10 @@ class Checkpoints:
         here = files.index(path)
         for other in (*files[:here], *files[here + KEPT :]):
             other.unlink(missing_ok=True)
+
+    def path_of(self, frames: int) -> Path:
+        """Return the path of the checkpoint after so many frames."""
+        return self.folder / f"{frames:012d}.pt"
 
     def files(self) -> list[Path]:
         """Return the checkpoints, newest first.
@@ -140,6 +148,33 @@ class Checkpoints:
         require_no_link(self.folder)
         for part in self.folder.glob("*" + PART):
             part.unlink(missing_ok=True)
+
+
+def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[State]], at_block_end: bool) -> None:
+    """Save the states of runs that learn together as `Checkpoints.offer` does: all of them or none."""
+    first = checkpoints[0]
+    stop = first.interrupt.is_asked
+    if stop or first.is_due(at_block_end):
+        for each, state in zip(checkpoints, states(), strict=True):
+            each.save(state)
+    if stop:
+        first.interrupt.exit()
+
+
+def newest_of_all(checkpoints: Sequence[Checkpoints]) -> list[State] | None:
+    """Return the newest states of runs that learn together, all after as many frames; None if one has no checkpoint.
+
+    Raises:
+        BrokenCheckpoint: see `Checkpoints.newest`.
+        OSError: if a run has no checkpoint after as many frames as another's newest.
+    """
+    found = [each.newest() for each in checkpoints]
+    states = [state for state in found if state is not None]
+    if len(states) < len(found):
+        return None
+    frames = min(state["frames"] for state in states)
+    pairs = zip(checkpoints, states, strict=True)
+    return [state if state["frames"] == frames else decoded(each.path_of(frames)) for each, state in pairs]
 
 
 def encoded(state: State) -> bytes:

@@ -56,7 +56,7 @@ MOST_CHOICES = 20
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
 """Configurations that come with other packages, and the extras that install these."""
 
-NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report")
+NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report", "together")
 """Keys of the configuration that do not change results."""
 
 
@@ -68,10 +68,14 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 def run_name(*, _root_: DictConfig) -> str:
     """Name a run's directory: curriculum, agent, method if there is one, seed and a hash of the configuration."""
-    choices = _root_.hydra.runtime.choices
+    return name_of(_root_, _root_.hydra.runtime.choices)
+
+
+def name_of(cfg: DictConfig, choices: Any) -> str:
+    """Return the name of a configuration's run, given the chosen file of each group."""
     learner = "-".join([choices.agent, *([choices.method] if choices.method != "finetune" else [])])
-    seed = re.sub(r"\W", "_", str(_root_.seed))  # one that is refused later must not lead elsewhere
-    return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(_root_))}"
+    seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere
+    return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(cfg))}"
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
@@ -114,8 +118,10 @@ def check_values(cfg: DictConfig) -> None:
     require((is_int(cfg.num_threads, 1, cores), threads_rule))
     folder = cfg.experts_dir
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
-    for switch in ("experts", "report", "portable"):
+    for switch in ("experts", "report", "portable", "together"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
+    alone = "together=true trains the seeds of a sweep as one batch: add -m and several seeds, such as seed=range(20)"
+    require((in_sweep() or not cfg.together, alone))
     require(
         check_overwrite(cfg.overwrite),
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),
@@ -266,7 +272,10 @@ def write_configuration(cfg: DictConfig, folder: Path) -> None:
     save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():
         save_yaml(HydraConfig.instance().cfg, folder / "hydra.yaml")
-        save_yaml(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+        own = {"seed": cfg.seed, "together": "true"}  # those of a job for several seeds name the first and all
+        given = [setting.partition("=") for setting in HydraConfig.get().overrides.task]
+        settings = [f"{key}={own.get(key, value)}" if equals else key for key, equals, value in given]
+        save_yaml(settings, folder / "overrides.yaml")
 
 
 def save_yaml(settings: Any, path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, new_agent, remove_results, train, with_method
+from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
@@ -80,6 +80,18 @@ class Job:
 
     def learn(self, run_dir: Path) -> None:
         """Learn into a directory; the single-task experts first, where the configuration asks for them."""
+        with self.prepared(run_dir) as where:
+            more = {"experts": where.experts, "listeners": where.listeners}
+            self._train(self.curriculum, self.agent, run_dir, where.config, **more)
+
+    @contextmanager
+    def prepared(self, run_dir: Path, together: Sequence[int] = ()) -> Iterator[RunDirectory]:
+        """Prepare a directory: results that are replaced are removed, experts are found or trained, trackers opened.
+
+        Args:
+            run_dir: the directory.
+            together: the seeds of the group that the run is trained in, if it is not alone.
+        """
         cfg, saved = self.cfg, self._checkpoints(run_dir)
         with self._tracking(run_dir) as listeners:
             if self._replaces(run_dir):
@@ -88,7 +100,13 @@ class Job:
             config.write_configuration(cfg, run_dir / ".hydra")
             with torch.random.fork_rng():
                 experts = self._experts() if cfg.experts else None
-            self._train(self.curriculum, self.agent, run_dir, config.plain(cfg), experts=experts, listeners=listeners)
+            of_run = {"together": together, "experts": experts, "listeners": listeners, "console": self._console}
+            yield RunDirectory(run_dir, config.plain(cfg), saved, **of_run)
+
+    @property
+    def _console(self) -> Console | None:
+        """Where progress shows: a sweep shows none of its runs."""
+        return Console(quiet=True) if config.in_sweep() else None
 
     def _experts(self) -> list[Expert]:
         """Return the experts of the curriculum, found or trained with the run's own agent, seed and threads."""
@@ -106,9 +124,8 @@ class Job:
     def _train(
         self, curriculum: Curriculum, agent: Agent, run_dir: Path, settings: Mapping[str, Any], **more: Any
     ) -> None:
-        """Train into a directory, with checkpoints; a sweep shows no progress of its runs."""
-        console = Console(quiet=True) if config.in_sweep() else None
-        how = {"config": settings, "checkpoints": self._checkpoints(run_dir), "console": console, **more}
+        """Train into a directory, with checkpoints."""
+        how = {"config": settings, "checkpoints": self._checkpoints(run_dir), "console": self._console, **more}
         train(curriculum, agent, run_dir, self.cfg.seed, self.device, **how)
 
     def _checkpoints(self, run_dir: Path) -> Checkpoints:

@@ -90,7 +90,11 @@ class Sweeper(Base):
         """
         assert self.config is not None
         overwrite = self.config.overwrite
-        require(check_overwrite(overwrite))
+        together = self.config.together
+        require(
+            check_overwrite(overwrite),
+            (isinstance(together, bool), f"together must be true or false, got {together!r}"),
+        )
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables
         overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
@@ -104,7 +108,7 @@ class Sweeper(Base):
         try:
             if left and not self.status and (overwrite or not self._stale):
                 with sigterm_exits(), SweepProgress(before):
-                    self._launch({folder: cells[folder] for folder in left}, errors)
+                    self._launch(self._jobs({folder: cells[folder] for folder in left}), errors)
         finally:
             found = {folder: self._status(folder, before[folder], errors.get(folder)) for folder in cells}
             self._show(cells, found, len(batch) - len(cells))
@@ -196,22 +200,59 @@ class Sweeper(Base):
         is_file = self.hydra_context.config_loader.get_group_options(key) or key.startswith("hydra")
         return plain and not is_file
 
-    def _launch(self, cells: Mapping[Path, Overrides], errors: dict[Path, str]) -> None:
-        """Let the launcher run the cells; collect what they raise by directory."""
+    def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
+        """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
+
+        Cells that were begun together stay together, and a cell that was begun alone stays alone.
+        """
+        assert self.config is not None
+        if not self.config.together:
+            return {tuple(overrides): [folder] for folder, overrides in cells.items()}
+        groups: dict[Any, dict[str, Path]] = {}
+        for folder, overrides in cells.items():
+            [seed] = [setting.partition("=")[2] for setting in overrides if _key(setting) == "seed"] or [""]
+            others = tuple(setting for setting in overrides if _key(setting) not in ("seed", "together"))
+            begun = None if self.config.overwrite is True else _begun_with(folder)
+            alone = seed if begun == () or not seed else ""
+            groups.setdefault((others, begun, alone), {})[seed] = folder
+        return {_job(others, list(group)): list(group.values()) for (others, *_), group in groups.items()}
+
+    def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:
+        """Let the launcher run the jobs; collect what they raise by the directories of their cells."""
         assert self.config is not None and self.launcher is not None
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
         save_yaml(self.config, folder / "multirun.yaml")
-        folders, size = list(cells), self.max_batch_size or len(cells)
-        for first in range(0, len(folders), size):
-            batch = folders[first : first + size]
+        settings, size = list(jobs), self.max_batch_size or len(jobs)
+        for first in range(0, len(settings), size):
+            batch = settings[first : first + size]
             try:
-                jobs = self.launcher.launch([cells[cell] for cell in batch], initial_job_idx=first)
+                returned = self.launcher.launch(list(map(list, batch)), initial_job_idx=first)
             except Exception as error:  # such as a worker that was killed: the cells' directories say how far they are
                 print(f"the launcher stopped: {type(error).__name__}: {terminal_text(error)}", file=sys.stderr)
                 return
-            failed = [(cell, job) for cell, job in zip(batch, jobs, strict=True) if job.status == JobStatus.FAILED]
-            errors.update({cell: why(job) for cell, job in failed})
+            failed = [pair for pair in zip(batch, returned, strict=True) if pair[1].status == JobStatus.FAILED]
+            errors.update({cell: why(job) for of_job, job in failed for cell in jobs[of_job]})
+
+
+def _key(setting: str) -> str:
+    return setting.partition("=")[0]
+
+
+def _begun_with(folder: Path) -> tuple[int, ...] | None:
+    """Return the seeds with which the run of a directory was begun, none if it was alone; None for a new run."""
+    if not holds_results(folder):
+        return None
+    from ctgraph_rl.runs.job import first_line  # here: a sweep that begins needs no torch
+
+    about = first_line(folder)
+    return None if about is None else tuple(about.get("together", ()))
+
+
+def _job(others: Overrides, seeds: Sequence[str]) -> Overrides:
+    """Return the settings of a job that runs cells which differ in their seeds alone."""
+    own = [f"seed={seed}" for seed in seeds[:1] if seed]
+    return (*others, *own, *([f"together=[{','.join(seeds)}]"] if len(seeds) > 1 else []))
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,8 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import check_ids, check_rows, learn_curriculum
+from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.learn.together import Group, learn_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
@@ -27,9 +31,8 @@ from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_pe
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import RESULTS, write_sums
 from ctgraph_rl.log.tables import write_tables
-from ctgraph_rl.runs.checkpoints import Checkpoints, State
+from ctgraph_rl.runs.checkpoints import Checkpoints, State, newest_of_all, offer_all
 from ctgraph_rl.runs.experts import Expert
-from ctgraph_rl.runs.progress import ProgressBar
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
@@ -167,27 +170,100 @@ def train(
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
     checkpoints.tidy()
     saved = checkpoints.newest()
-    about = provenance(curriculum, learners(config, agent))
-    log = _new_log(run_dir) if saved is None else resumed_log(run_dir, saved, about, checkpoints.strict)
-    log.listeners.extend(listeners)
-    if saved is None:
-        log.append("run", **about, config=config)
-        if experts is not None:
-            log.append("experts", experts=[expert.about for expert in experts])
-        log.sync()
-        sync_folders(run_dir)
-    write_curriculum(curriculum, run_dir)
+    where = RunDirectory(run_dir, config, checkpoints, experts=experts, listeners=listeners, console=console)
+    log = where.begin(curriculum, agent, saved)
     done = 0 if saved is None else saved["frames"]
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
         learn_curriculum(
             curriculum, agent, seed, log, progress, device=device, saved=saved, checkpoint=checkpoints.offer
         )
-    log.close()
-    weights = io.BytesIO()
-    torch.save(agent.state_dict(), weights)
-    write_whole(run_dir / AGENT, weights.getvalue())
-    write_results(log, curriculum, run_dir, None if experts is None else [expert.log for expert in experts])
-    checkpoints.clear()
+    where.finish(curriculum, agent, log)
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """Where a run is written, and with what beside its measurements; see `train`."""
+
+    run_dir: Path
+    config: Mapping[str, Any]
+    checkpoints: Checkpoints
+    together: Sequence[int] = ()  # the seeds of the group that the run is trained in; none for one that is alone
+    experts: Sequence[Expert] | None = None
+    listeners: Sequence[Callable[[dict[str, Any]], object]] = ()
+    console: Console | None = None
+
+    def begin(self, curriculum: Curriculum, agent: Agent, saved: State | None) -> RunLog:
+        """Return the log of a run that begins, or that goes on from a saved state."""
+        run_dir, about = self.run_dir, provenance(curriculum, learners(self.config, agent))
+        about |= {"together": list(self.together)} if self.together else {}
+        if saved is None:
+            log = _new_log(run_dir)
+        else:
+            if saved["frames"] < curriculum.num_frames:
+                require(_same_group(run_dir, self.together))
+            log = resumed_log(run_dir, saved, about, self.checkpoints.strict)
+        log.listeners.extend(self.listeners)
+        if saved is None:
+            log.append("run", **about, config=self.config)
+            if self.experts is not None:
+                log.append("experts", experts=[expert.about for expert in self.experts])
+            log.sync()
+            sync_folders(run_dir)
+        write_curriculum(curriculum, run_dir)
+        return log
+
+    def finish(self, curriculum: Curriculum, agent: Agent, log: RunLog) -> None:
+        """Write the weights and the results of a run that has ended."""
+        log.close()
+        weights = io.BytesIO()
+        torch.save(agent.state_dict(), weights)
+        write_whole(self.run_dir / AGENT, weights.getvalue())
+        experts = None if self.experts is None else [expert.log for expert in self.experts]
+        write_results(log, curriculum, self.run_dir, experts)
+        self.checkpoints.clear()
+
+
+def train_together(
+    curriculum: Curriculum,
+    group: Group,
+    seeds: Sequence[int],
+    device: torch.device,
+    directories: Sequence[RunDirectory],
+) -> None:
+    """Let the agents of several seeds learn a curriculum as one batch; each is a run in a directory of its own.
+
+    Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
+
+    Args:
+        curriculum: what is learned.
+        group: the learners, just built.
+        seeds: of each.
+        device: where the environment lives, and the agents.
+        directories: of each.
+
+    Raises:
+        ValueError: before any work, for an agent that cannot learn the curriculum, and runs that cannot be resumed.
+    """
+    checkpoints = [each.checkpoints for each in directories]
+    for each in checkpoints:
+        each.tidy()
+    saved = newest_of_all(checkpoints)
+    members = list(zip(directories, group.agents, saved or [None] * len(seeds), strict=True))
+    logs = [directory.begin(curriculum, agent, state) for directory, agent, state in members]
+    done, console = 0 if saved is None else saved[0]["frames"], directories[0].console
+    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
+        offer = partial(offer_all, checkpoints)
+        learn_together(curriculum, group, seeds, logs, progress, device=device, saved=saved, checkpoint=offer)
+    for (directory, agent, _), log in zip(members, logs, strict=True):
+        directory.finish(curriculum, agent, log)
+
+
+def _same_group(run_dir: Path, together: Sequence[int]) -> tuple[bool, str]:
+    """The rule that a run is resumed with the seeds beside it with which it was begun, or alone if it was alone."""
+    before = (RunLog.begun(run_dir / LOG) or {}).get("together", [])
+    how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
+    began = f"{run_dir} was begun {f'with the seeds {before} together' if before else 'alone'}"
+    return before == list(together), f"{began}: resume it with {how}, or start again with overwrite=true"
 
 
 def write_curriculum(curriculum: Curriculum, run_dir: Path) -> None:

@@ -7,8 +7,8 @@ import io
 import pytest
 from rich.console import Console
 
-from ctgraph_rl.runs import progress
-from ctgraph_rl.runs.progress import ProgressBar
+from ctgraph_rl.learn import progress
+from ctgraph_rl.learn.progress import ProgressBar
 
 
 def written(terminal: bool) -> Console:

@@ -1,0 +1,113 @@
+"""The runs of several seeds as one job: their seeds learn as one batch, or one after the other where they cannot."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from copy import deepcopy
+from pathlib import Path
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from ctgraph_rl.learn.together import why_not_together
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import CHECKPOINTS, locked
+from ctgraph_rl.packages import agents_together, why_agents_learn_alone
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.interrupt import Interrupt
+from ctgraph_rl.runs.job import Job, is_finished, marked_if_it_fails, run_job
+from ctgraph_rl.runs.train import train_together
+
+
+def run_seeds(cfg: DictConfig, run_dir: Path) -> list[Path]:
+    """Run a configuration with each of the seeds in ``together``, each in the directory that it has alone.
+
+    Args:
+        cfg: the configuration of the first seed.
+        run_dir: its directory.
+
+    Returns:
+        The directories of all seeds.
+
+    Raises:
+        ValueError: before any work, for a value out of range.
+        RuntimeError: if seeds that learned one after the other have failed.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    runs = [_of_seed(cfg, seed, run_dir) for seed in cfg.together]
+    for each, folder in runs:
+        config.check_values(each)
+        folder.mkdir(parents=True, exist_ok=True)
+    reason = _why_one_after_the_other(cfg)
+    if reason is None:
+        _run_as_one(runs)
+    else:
+        print(f"note: seeds are trained one after the other, as {terminal_text(reason)}", file=sys.stderr)
+        _run_in_turn(runs)
+    return [folder for _, folder in runs]
+
+
+def _of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
+    """Return the configuration of a seed, and its directory beside that of the first."""
+    choices = HydraConfig.get().runtime.choices
+    folder = run_dir.parents[len(Path(config.name_of(cfg, choices)).parts) - 1]
+    own = deepcopy(cfg)
+    own.seed, own.together = seed, True
+    return own, folder / config.name_of(own, choices)
+
+
+def _why_one_after_the_other(cfg: DictConfig) -> str | None:
+    """Return why the seeds of a configuration cannot learn as one batch; None if they can."""
+    with torch.random.fork_rng():
+        job = Job.of(cfg, Interrupt())
+    if job.device.type != "cpu":
+        return f"those on {job.device} cannot be one batch"
+    return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent)
+
+
+def _run_in_turn(runs: Sequence[tuple[DictConfig, Path]]) -> None:
+    """Run each; one that fails stops no other."""
+    errors = []
+    for cfg, run_dir in runs:
+        try:
+            run_job(cfg, run_dir)
+        except Exception as error:
+            errors.append(f"seed {cfg.seed}: {type(error).__name__}: {config.explain(error)}")
+    if errors:
+        raise RuntimeError("; ".join(errors))
+
+
+def _run_as_one(runs: Sequence[tuple[DictConfig, Path]]) -> None:
+    """Run those that are not finished, as one batch."""
+    with ExitStack() as stack:
+        for _, run_dir in runs:
+            stack.enter_context(locked(run_dir))
+        finished = [is_finished(cfg, run_dir) for cfg, run_dir in runs]
+        left = [run for run, done in zip(runs, finished, strict=True) if not done]
+        for (_, run_dir), done in zip(runs, finished, strict=True):
+            if done:
+                shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+        if left:
+            interrupt = stack.enter_context(Interrupt())
+            for _, run_dir in left:
+                stack.enter_context(marked_if_it_fails(run_dir))
+            _learn(left, interrupt)
+
+
+def _learn(runs: Sequence[tuple[DictConfig, Path]], interrupt: Interrupt) -> None:
+    """Build the objects of all runs, and let them learn."""
+    jobs, generators = [], []
+    for cfg, _ in runs:
+        jobs.append(Job.of(cfg, interrupt))
+        generators.append(torch.Generator().set_state(torch.get_rng_state()))
+    seeds = [cfg.seed for cfg, _ in runs]
+    with ExitStack() as stack:
+        given = zip(jobs, runs, strict=True)
+        directories = [stack.enter_context(job.prepared(run_dir, seeds)) for job, (_, run_dir) in given]
+        group = agents_together([job.agent for job in jobs], generators)
+        train_together(jobs[0].curriculum, group, seeds, jobs[0].device, directories)
