@@ -100,8 +100,8 @@ class Job:
             config.write_configuration(cfg, run_dir / ".hydra")
             with torch.random.fork_rng():
                 experts = self._experts() if cfg.experts else None
-            of_run = {"together": together, "experts": experts, "listeners": listeners, "console": self._console}
-            yield RunDirectory(run_dir, config.plain(cfg), saved, **of_run)
+            of_run: dict[str, Any] = {"together": together, "experts": experts, "listeners": listeners}
+            yield RunDirectory(run_dir, config.plain(cfg), saved, **of_run, console=self._console)
 
     @property
     def _console(self) -> Console | None:

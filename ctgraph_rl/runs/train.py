@@ -248,13 +248,16 @@ def train_together(
     for each in checkpoints:
         each.tidy()
     saved = newest_of_all(checkpoints)
-    members = list(zip(directories, group.agents, saved or [None] * len(seeds), strict=True))
-    logs = [directory.begin(curriculum, agent, state) for directory, agent, state in members]
+    members = list(zip(directories, group.agents, strict=True))
+    logs = [
+        directory.begin(curriculum, agent, None if saved is None else saved[number])
+        for number, (directory, agent) in enumerate(members)
+    ]
     done, console = 0 if saved is None else saved[0]["frames"], directories[0].console
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
         offer = partial(offer_all, checkpoints)
         learn_together(curriculum, group, seeds, logs, progress, device=device, saved=saved, checkpoint=offer)
-    for (directory, agent, _), log in zip(members, logs, strict=True):
+    for (directory, agent), log in zip(members, logs, strict=True):
         directory.finish(curriculum, agent, log)
 
 

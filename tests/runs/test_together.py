@@ -1,0 +1,154 @@
+"""``together=true``: seeds of a sweep that one job trains; each leaves a run like any other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.kill_runs import equal
+from helpers.sweeping import command_line, sweep
+
+from ctgraph_rl import RunLog
+from ctgraph_rl.compare import compare
+from ctgraph_rl.runs import checkpoints, train
+from ctgraph_rl.runs.load import load
+
+TINY = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
+PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
+SEEDS = "seed=0,1,2"
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def runs(folder: str = "runs") -> list[Path]:
+    return sorted(path.parent for path in Path(folder).rglob("run.jsonl") if "experts" not in path.parts)
+
+
+def content(run_dir: Path) -> tuple:
+    """All measurements but their times, and the weights."""
+    lines = [{**line, "seconds": 0} for line in RunLog.read(run_dir / "run.jsonl").measurements]
+    return lines, torch.load(run_dir / "agent.pt", weights_only=True)
+
+
+def first_line(run_dir: Path) -> dict:
+    return json.loads((run_dir / "run.jsonl").read_text().splitlines()[0])
+
+
+def same(one: Path, other: Path) -> bool:
+    (lines, weights), (its_lines, its_weights) = content(one), content(other)
+    return lines == its_lines and equal(weights, its_weights)
+
+
+def stop_after(monkeypatch, count: int, module=train, name="offer_all") -> None:
+    """Let the process be killed after some checkpoints of a group."""
+    calls, original = [], getattr(module, name)
+
+    def killed(*given, **how):
+        original(*given, **how)
+        calls.append(given)
+        if len(calls) == count:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, name, killed)
+
+
+def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_beside_it(monkeypatch, capsys):
+    assert sweep(monkeypatch, SEEDS, "together=true", *PPO) == 0
+    assert "3 done" in capsys.readouterr().out
+    assert sweep(monkeypatch, SEEDS, "hydra.sweep.dir=alone", *PPO) == 0
+
+    for one, other in zip(runs(), runs("alone"), strict=True):
+        assert one.relative_to("runs") == other.relative_to("alone")
+        files = [{str(path.relative_to(each)) for path in each.rglob("*")} for each in (one, other)]
+        assert files[0] == files[1]
+        assert first_line(one)["config"] == first_line(other)["config"]
+        assert first_line(one)["together"] == [0, 1, 2] and "together" not in first_line(other)
+        assert load(one).agent.state_dict().keys() == load(other).agent.state_dict().keys()
+        assert f"seed={first_line(one)['config']['seed']}" in (one / ".hydra" / "overrides.yaml").read_text()
+        shown = compare(one, other).lines
+        assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
+
+
+@pytest.mark.parametrize("method", ["finetune", "ewc"])
+def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit(monkeypatch, method):
+    settings = (SEEDS, "together=true", f"method={method}", *PPO)
+    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
+
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3)
+        assert sweep(patch, *settings) == 130
+    with monkeypatch.context() as patch:  # between the saves of two seeds
+        stop_after(patch, 4, checkpoints.Checkpoints, "save")
+        assert sweep(patch, *settings) == 130
+    assert sweep(monkeypatch, *settings) == 0
+
+    assert len(runs()) == 3
+    assert all(same(one, other) for one, other in zip(runs(), runs("whole"), strict=True))
+    assert all((run / "restarts.jsonl").exists() for run in runs())
+
+
+def test_a_group_that_was_stopped_while_it_wrote_results_writes_the_others(monkeypatch):
+    settings = (SEEDS, "together=true", *PPO)
+    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
+
+    with monkeypatch.context() as patch:
+        stop_after(patch, 1, train.RunDirectory, "finish")
+        assert sweep(patch, *settings) == 130
+    assert [(run / "metrics.json").exists() for run in runs()] == [True, False, False]
+    assert sweep(monkeypatch, *settings) == 0
+
+    assert all(same(one, other) for one, other in zip(runs(), runs("whole"), strict=True))
+
+
+def test_seeds_that_were_begun_together_are_not_resumed_otherwise(monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3)
+        sweep(patch, SEEDS, "together=true", *PPO)
+    capsys.readouterr()
+
+    assert sweep(monkeypatch, "seed=1", *PPO) == 1
+    assert "was begun with the seeds [0, 1, 2] together: resume it with together=true and" in capsys.readouterr().out
+    assert sweep(monkeypatch, "seed=0,1,2,3,4", "together=true", *PPO) == 0
+    assert [first_line(run)["together"] for run in runs()] == 3 * [[0, 1, 2]] + 2 * [[3, 4]]
+
+
+def test_what_is_done_is_left_as_it_is_and_one_seed_is_trained_alone(monkeypatch):
+    sweep(monkeypatch, "seed=0,1", "together=true", *PPO)
+    before = [content(run) for run in runs()]
+
+    assert sweep(monkeypatch, SEEDS, "together=true", *PPO) == 0
+
+    assert [content(run)[0] for run in runs()[:2]] == [lines for lines, _ in before]
+    assert "together" not in first_line(runs()[2])
+
+
+def test_seeds_that_cannot_be_one_batch_are_trained_as_alone_one_after_the_other(monkeypatch, capsys):
+    settings = ("seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "agent.num_steps=8")
+
+    assert sweep(monkeypatch, *settings, "together=true") == 0
+    assert "note: seeds are trained one after the other, as LSTMPPO cannot be" in capsys.readouterr().err
+    sweep(monkeypatch, *settings, "hydra.sweep.dir=alone")
+
+    assert all(same(one, other) for one, other in zip(runs(), runs("alone"), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("seed=1", "together=true"),
+            "together=true trains the seeds of a sweep as one batch: add -m and",
+        ),
+        (("-m", "seed=0,1", "together=[0,1]"), "together must be true or false, got [0, 1]"),
+    ],
+)
+def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
+    assert command_line(monkeypatch, *arguments, *PPO) == 1
+
+    assert message in capsys.readouterr().err
+    assert not runs()
