@@ -28,9 +28,11 @@ BOUND = 1e-4
 EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
 """Exit codes."""
 
+TOGETHER = "seeds trained together"
+
 PARTS = {
     "curriculum": ("curriculum", "version", "fingerprint", "source", "tasks", "trained"),
-    "seeds that were trained together": ("together",),
+    TOGETHER: ("together",),
     "machine": ("machine", "num_threads", "cpu"),
 }
 """Keys of a log's first line by what they say; all others, but for the settings, say what the code was."""
@@ -199,10 +201,9 @@ def _origins(one: Line, other: Line) -> list[str]:
     known = {key for keys in PARTS.values() for key in keys} | {"kind", "seconds", "config"}
     parts = {name: [{key: line.get(key) for key in keys} for line in (one, other)] for name, keys in PARTS.items()}
     parts["code"] = [dict(flat({k: v for k, v in line.items() if k not in known})) for line in (one, other)]
-    known_of = {
-        name: pair for name, pair in parts.items() if any(v is not None for each in pair for v in each.values())
-    }
-    parts = {"settings": settings, **known_of}
+    if not (one.get("together") or other.get("together")):
+        del parts[TOGETHER]
+    parts = {"settings": settings, **parts}
     return [f"{name}: {'equal' if a == b else 'different, ' + _changes(a, b, 10)}" for name, (a, b) in parts.items()]
 
 

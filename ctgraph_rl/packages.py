@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, Any
 from ctgraph_rl.checks import require
 
 if TYPE_CHECKING:
-    from torch import Generator
-
-    from ctgraph_rl.agent import Agent
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 HERE = Path(__file__).resolve().parent
@@ -88,7 +85,7 @@ def is_published(curriculum: Curriculum) -> bool | None:
     return published.load(curriculum.name).fingerprint == curriculum.fingerprint
 
 
-def why_agents_learn_alone(agent: Agent) -> str | None:
+def why_agents_learn_alone(agent: object) -> str | None:
     """Return why agents like this one cannot learn as one batch of seeds; None if they can.
 
     Raises:
@@ -98,7 +95,7 @@ def why_agents_learn_alone(agent: Agent) -> str | None:
     return import_module("baselines.together").why_not_together(agent)
 
 
-def agents_together(agents: Sequence[Agent], generators: Sequence[Generator]) -> Any:
+def agents_together(agents: Sequence[object], generators: Sequence[object]) -> Any:
     """Return the `ctgraph_rl.learn.together.Group` of agents, each with what it draws from.
 
     Raises:

@@ -41,16 +41,11 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
     """
     check_packages()
     from ctgraph_rl.report.style import require_packages  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.runs.job import run_job  # here: as above
-    from ctgraph_rl.runs.together import run_seeds  # here: as above
+    from ctgraph_rl.runs.together import run_cells  # here: as above
 
     if cfg.report:
         require_packages()
-    if in_sweep() and not isinstance(cfg.together, bool):
-        run_dirs = run_seeds(cfg, run_dir)
-    else:
-        run_job(cfg, run_dir)
-        run_dirs = [run_dir]
+    run_dirs = run_cells(cfg, run_dir)
     if cfg.report or not in_sweep():
         for each in run_dirs:
             show(each, cfg.report)

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,6 +77,21 @@ def name_of(cfg: DictConfig, choices: Any) -> str:
     learner = "-".join([choices.agent, *([choices.method] if choices.method != "finetune" else [])])
     seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere
     return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(cfg))}"
+
+
+def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
+    """Return the configuration of one seed of a job for several, and its directory.
+
+    Args:
+        cfg: the configuration of the job, with its first seed.
+        seed: the seed.
+        run_dir: the directory of the first seed.
+    """
+    choices = HydraConfig.get().runtime.choices
+    folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
+    own = deepcopy(cfg)
+    own.seed, own.together = seed, True
+    return own, folder / name_of(own, choices)
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)

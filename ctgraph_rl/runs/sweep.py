@@ -68,6 +68,7 @@ class Sweeper(Base):
         self.status = status
         self._values: dict[str, tuple[str, Any] | None] = {}
         self._stale: dict[Path, str] = {}
+        self._begun: dict[Path, tuple[int, ...]] = {}
         self._known: dict[str, dict[str, Any]] = {}
         self._num_unknown = 0
 
@@ -176,9 +177,10 @@ class Sweeper(Base):
         if not holds_results(folder):
             return
         check_packages()
-        from ctgraph_rl.runs.job import changed_code  # here: a sweep that begins needs no torch
+        from ctgraph_rl.runs.job import changed_code, first_line  # here: a sweep that begins needs no torch
 
         try:
+            self._begun[folder] = tuple((first_line(folder) or {}).get("together", ()))
             changed, unknown = changed_code(cfg, folder, self._known)
         except Exception as error:  # of the code of a user, which may have changed so that it cannot be run
             changed, unknown = [f"what builds it, which now fails ({type(error).__name__}: {error}),"], False
@@ -203,7 +205,7 @@ class Sweeper(Base):
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
         """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
 
-        Cells that were begun together stay together, and a cell that was begun alone stays alone.
+        Cells that were begun together stay together, and one that was begun alone stays alone.
         """
         assert self.config is not None
         if not self.config.together:
@@ -212,7 +214,7 @@ class Sweeper(Base):
         for folder, overrides in cells.items():
             [seed] = [setting.partition("=")[2] for setting in overrides if _key(setting) == "seed"] or [""]
             others = tuple(setting for setting in overrides if _key(setting) not in ("seed", "together"))
-            begun = None if self.config.overwrite is True else _begun_with(folder)
+            begun = self._begun.get(folder)
             alone = seed if begun == () or not seed else ""
             groups.setdefault((others, begun, alone), {})[seed] = folder
         return {_job(others, list(group)): list(group.values()) for (others, *_), group in groups.items()}
@@ -237,16 +239,6 @@ class Sweeper(Base):
 
 def _key(setting: str) -> str:
     return setting.partition("=")[0]
-
-
-def _begun_with(folder: Path) -> tuple[int, ...] | None:
-    """Return the seeds with which the run of a directory was begun, none if it was alone; None for a new run."""
-    if not holds_results(folder):
-        return None
-    from ctgraph_rl.runs.job import first_line  # here: a sweep that begins needs no torch
-
-    about = first_line(folder)
-    return None if about is None else tuple(about.get("together", ()))
 
 
 def _job(others: Overrides, seeds: Sequence[str]) -> Overrides:

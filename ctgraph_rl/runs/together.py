@@ -7,12 +7,10 @@ import shutil
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import torch
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from ctgraph_rl.learn.together import why_not_together
 from ctgraph_rl.log.escape import terminal_text
@@ -23,12 +21,15 @@ from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job, is_finished, marked_if_it_fails, run_job
 from ctgraph_rl.runs.train import train_together
 
+Run = tuple[Any, Path]
+"""A composed configuration and its directory."""
 
-def run_seeds(cfg: DictConfig, run_dir: Path) -> list[Path]:
-    """Run a configuration with each of the seeds in ``together``, each in the directory that it has alone.
+
+def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
+    """Run a configuration, or where a sweep lists seeds in ``together`` it with each of them in a directory of its own.
 
     Args:
-        cfg: the configuration of the first seed.
+        cfg: the composed configuration, with the first seed.
         run_dir: its directory.
 
     Returns:
@@ -38,12 +39,15 @@ def run_seeds(cfg: DictConfig, run_dir: Path) -> list[Path]:
         ValueError: before any work, for a value out of range.
         RuntimeError: if seeds that learned one after the other have failed.
     """
+    if isinstance(cfg.together, bool) or not config.in_sweep():
+        run_job(cfg, run_dir)
+        return [run_dir]
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    runs = [_of_seed(cfg, seed, run_dir) for seed in cfg.together]
+    runs = [config.of_seed(cfg, seed, run_dir) for seed in cfg.together]
     for each, folder in runs:
         config.check_values(each)
         folder.mkdir(parents=True, exist_ok=True)
-    reason = _why_one_after_the_other(cfg)
+    reason = _why_one_after_the_other(runs[0][0])
     if reason is None:
         _run_as_one(runs)
     else:
@@ -52,16 +56,7 @@ def run_seeds(cfg: DictConfig, run_dir: Path) -> list[Path]:
     return [folder for _, folder in runs]
 
 
-def _of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path]:
-    """Return the configuration of a seed, and its directory beside that of the first."""
-    choices = HydraConfig.get().runtime.choices
-    folder = run_dir.parents[len(Path(config.name_of(cfg, choices)).parts) - 1]
-    own = deepcopy(cfg)
-    own.seed, own.together = seed, True
-    return own, folder / config.name_of(own, choices)
-
-
-def _why_one_after_the_other(cfg: DictConfig) -> str | None:
+def _why_one_after_the_other(cfg: Any) -> str | None:
     """Return why the seeds of a configuration cannot learn as one batch; None if they can."""
     with torch.random.fork_rng():
         job = Job.of(cfg, Interrupt())
@@ -70,7 +65,7 @@ def _why_one_after_the_other(cfg: DictConfig) -> str | None:
     return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent)
 
 
-def _run_in_turn(runs: Sequence[tuple[DictConfig, Path]]) -> None:
+def _run_in_turn(runs: Sequence[Run]) -> None:
     """Run each; one that fails stops no other."""
     errors = []
     for cfg, run_dir in runs:
@@ -82,7 +77,7 @@ def _run_in_turn(runs: Sequence[tuple[DictConfig, Path]]) -> None:
         raise RuntimeError("; ".join(errors))
 
 
-def _run_as_one(runs: Sequence[tuple[DictConfig, Path]]) -> None:
+def _run_as_one(runs: Sequence[Run]) -> None:
     """Run those that are not finished, as one batch."""
     with ExitStack() as stack:
         for _, run_dir in runs:
@@ -99,7 +94,7 @@ def _run_as_one(runs: Sequence[tuple[DictConfig, Path]]) -> None:
             _learn(left, interrupt)
 
 
-def _learn(runs: Sequence[tuple[DictConfig, Path]], interrupt: Interrupt) -> None:
+def _learn(runs: Sequence[Run], interrupt: Interrupt) -> None:
     """Build the objects of all runs, and let them learn."""
     jobs, generators = [], []
     for cfg, _ in runs:
