@@ -189,7 +189,10 @@ class Learner(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the optimiser's state, so that `state_dict` is complete."""
-        return {"optimiser": self.optimiser.state_dict()}
+        saved = self.optimiser.state_dict()
+        states = saved["state"].items()  # detached, tensors lack the marks of ``torch.compile``, which are not plain
+        saved["state"] = {place: {key: value.detach() for key, value in state.items()} for place, state in states}
+        return {"optimiser": saved}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""

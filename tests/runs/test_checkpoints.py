@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.scripted import ONE
+from helpers.small_agents import batches
 from helpers.stopped_runs import Bomb, bombs, flip_bit, with_header
 
 from ctgraph_rl.runs.checkpoints import KEPT, BrokenCheckpoint, Checkpoints, decoded, encoded
@@ -35,6 +37,17 @@ def test_what_is_saved_is_read_back_with_its_types(tmp_path):
     assert found["agent"]["w"].tolist() == list(range(64, 72)) and found["agent"]["w"].dtype == torch.int64
     assert {**found["agent"], "w": 0} == {"w": 0, "lr": 0.5, "name": "a", "none": None}
     assert found["frames"] == 64
+
+
+def test_an_agent_whose_optimiser_the_compiler_has_marked_is_saved_as_plain_tensors(small_agent, tmp_path):
+    agent = small_agent("a2c", [ONE])
+    agent.learn(batches(agent, ONE, 1)[0])
+    for kept in agent.optimiser.state.values():
+        kept["step"].mark = True  # as torch.compile leaves marks of its own
+
+    Checkpoints(tmp_path).save({"frames": 64, "agent": agent.state_dict()})
+
+    assert Checkpoints(tmp_path).newest()["frames"] == 64
 
 
 def test_without_a_checkpoint_there_is_none(tmp_path):
