@@ -193,7 +193,7 @@ class RunDirectory:
     console: Console | None = None
 
     def begin(self, curriculum: Curriculum, agent: Agent, saved: State | None) -> RunLog:
-        """Return the log of a run that begins, or that goes on from a saved state."""
+        """Return the log of a new run, or of one that is resumed from a saved state."""
         run_dir, about = self.run_dir, provenance(curriculum, learners(self.config, agent))
         about |= {"together": list(self.together)} if self.together else {}
         if saved is None:
