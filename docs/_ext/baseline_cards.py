@@ -26,7 +26,7 @@ def _index(group: str, entries: list[Entry]) -> str:
     rows = [f"| [`{entry.name}`]({entry.name}.md) | {escaped(entry.comment)} |" for entry in entries]
     words = f"Choose one with `{group}=NAME`. Each card has all settings with their defaults."
     listing = "\n".join([f"| `{group}=` | |", "|---|---|", *rows])
-    return f"# {group.title()}s\n\n{words}\n\n{listing}\n"
+    return f"# {group.title()} cards\n\n{words}\n\n{listing}\n"
 
 
 def _agent_facts(entry: Entry) -> dict[str, str]:

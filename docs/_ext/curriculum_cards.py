@@ -39,7 +39,7 @@ def _index(all_curricula: dict[str, Curriculum]) -> str:
     ]
     words = "Every curriculum with a name. Run one with `ctgraph-rl curriculum=NAME`."
     listing = "\n".join([*head, *rows])
-    return f"# Curricula\n\n{words}\n\n{listing}\n"
+    return f"# Curriculum cards\n\n{words}\n\n{listing}\n"
 
 
 def _purpose(name: str) -> str:

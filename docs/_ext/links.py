@@ -80,10 +80,18 @@ def as_text(app: Sphinx, what: str, name: str, obj: object, options: Any, lines:
         lines.insert(0, "\\ ")
 
 
+def with_plain_defaults(
+    app: Sphinx, what: str, name: str, obj: object, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Write a default that a factory makes as ``...``: the whole signature could not be parsed else."""
+    return signature and signature.replace("<factory>", "..."), returned
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect the handlers."""
     app.add_config_value("repository", "", "env")
     app.connect("source-read", lead_to_pages)
     app.connect("missing-reference", resolve_name)
     app.connect("autodoc-process-docstring", as_text, priority=400)
+    app.connect("autodoc-process-signature", with_plain_defaults)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -24,7 +24,7 @@ def metric_cards() -> Iterator[tuple[str, str]]:
     head = ["| metric | formula | source |", "|---|---|---|"]
     words = "Every metric of `metrics.json`. R is the performance matrix; tasks and blocks count from 1."
     listing = "\n".join([*head, *rows])
-    yield "metrics/index.md", f"# Metrics\n\n{words}\n\n{listing}\n"
+    yield "metrics/index.md", f"# Metric cards\n\n{words}\n\n{listing}\n"
     for name in found:
         yield f"metrics/{name}.md", _card(name, values.get(name))
 
