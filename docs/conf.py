@@ -26,7 +26,6 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "
 exclude_patterns = ["_build", "results/*template.md"]
 templates_path: list[str] = []
 nitpicky = True
-suppress_warnings = ["toc.empty_glob"]  # "*" at the end of a list is for pages to come
 
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
