@@ -121,6 +121,14 @@ def test_rl2_searches_as_the_best_policy_does_at_depth_2_in_four_of_five_seeds(m
     assert "RL^2 with 3,072,000 frames at depth 2 does in 4 of 5 seeds what the best search does" in RESULTS
 
 
+def test_rl2_does_not_search_at_depth_3_in_any_seed(make):
+    lines = [line for line in make.read("rl2_search") if line["depth"] == "3"]
+
+    assert len(lines) == 5 * 8 and {line["frames"] for line in lines} == {"3072000"}
+    assert {float(line["greedy_success"]) for line in lines} == {1 / 8}
+    assert "At depth 3, with as many frames, no seed learns to search: each finds the goal in an eighth" in RESULTS
+
+
 def test_the_other_agents_with_memory_solve_what_they_were_run_on_in_every_seed(make):
     cells = make.groups(make.read("memory_b1"), "configuration", "task", "agent")
 
