@@ -53,7 +53,8 @@ def test_every_page_of_docs_that_a_file_names_exists():
     }
 
     assert len(named) > 50
-    assert [pair for pair in sorted(named) if not (CHECKOUT / pair[1]).is_file()] == []
+    written = {pair for pair in named if not pair[1].startswith("docs/generated/")}
+    assert [pair for pair in sorted(written) if not (CHECKOUT / pair[1]).is_file()] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(CHECKOUT).as_posix() for path in PAGES])
