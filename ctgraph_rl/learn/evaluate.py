@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from inspect import Parameter, signature
 from typing import Any
 
@@ -108,8 +109,9 @@ class LogitsPolicy:
     """A plain module that maps observations to logits, as a policy: greedy, or sampling where exploration is on.
 
     The module is given observations with the values that the environment shows, 0 to 255 for images, in the type and on
-    the device of its first parameter: it scales and flattens them itself. Where the protocol shows task ids and its
-    ``forward`` takes two arguments, the one-hot task ids are the second.
+    the device of its first parameter: it scales and flattens them itself. It acts in evaluation mode, without dropout,
+    and is left in the mode that it had. Where the protocol shows task ids and its ``forward`` needs two arguments, or
+    names the second one ``task_id``, the one-hot task ids are the second.
 
     Args:
         module: maps float [n, 1, r, r] or [n, K] to float [n, num_actions].
@@ -118,7 +120,7 @@ class LogitsPolicy:
 
     def __init__(self, module: nn.Module, num_actions: int) -> None:
         self.module, self.num_actions = module, num_actions
-        self._takes_ids = _num_required(module.forward) == 2
+        self._takes_ids = _takes_ids(module.forward)
 
     def __call__(self, data: TensorDictBase) -> TensorDictBase:
         """Write ``action``, int64 [n]."""
@@ -141,7 +143,8 @@ class LogitsPolicy:
         like = next(self.module.parameters(), torch.zeros(()))
         keys = ["observation", "task_id"] if self._takes_ids and "task_id" in data.keys() else ["observation"]  # noqa: SIM118
         try:
-            logits = self.module(*(data[key].to(like.device, like.dtype) for key in keys))
+            with _evaluation_mode(self.module):
+                logits = self.module(*(data[key].to(like.device, like.dtype) for key in keys))
         except (RuntimeError, TypeError, IndexError, KeyError, AttributeError) as error:
             raise ValueError(
                 f"{wanted}; {name} fails with {type(error).__name__}: {str(error)[:200]}. Fix: {fix}"
@@ -150,13 +153,30 @@ class LogitsPolicy:
         fits = is_tensor and logits.is_floating_point() and list(logits.shape) == [shape[0], self.num_actions]
         got = f"{str(logits.dtype).removeprefix('torch.')} {list(logits.shape)}" if is_tensor else type(logits).__name__
         require((fits, f"{wanted}; {name} gives {got}. Fix: {fix}"))
+        require((not logits.isnan().any(), f"{name} gives logits that are nan: its weights left the range of floats"))
         return logits
 
 
-def _num_required(function: Any) -> int:
-    """Return how many positional arguments without a default a function takes."""
-    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in kinds and p.default is p.empty for p in signature(function).parameters.values())
+def _takes_ids(function: Any) -> bool:
+    """Return whether a function needs two positional arguments, or its second one is named ``task_id``."""
+    try:
+        parameters = signature(function).parameters.values()
+    except ValueError:  # of a traced module, which has none
+        return False
+    places = [p for p in parameters if p.kind in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)]
+    return sum(p.default is p.empty for p in places) == 2 or [p.name for p in places[1:2]] == ["task_id"]
+
+
+@contextmanager
+def _evaluation_mode(module: nn.Module) -> Iterator[None]:
+    """Let a module compute without dropout and without a change of its running means; its mode is restored."""
+    training = [each for each in module.modules() if each.training]
+    module.eval()
+    try:
+        yield
+    finally:
+        for each in training:
+            each.training = True
 
 
 def as_policy(policy: Policy | nn.Module, num_actions: int) -> Policy:

@@ -164,6 +164,8 @@ class Recorder:
         self._checkpoints.clear()
         if overwrite or stopped:
             remove_results(run_dir)
+        if begun is not None:
+            shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
         path.unlink(missing_ok=True)
         log = RunLog(path)
         log.append("run", **self._about)
@@ -183,12 +185,10 @@ class Recorder:
         )
 
     def _track(self, make_logger: Callable[[Path], Logger] | None, run_dir: Path) -> None:
-        """Let a logger have all measurements; without one, remove what was tracked of a run that is replaced."""
+        """Let a logger have all measurements."""
         if make_logger is not None:
             self._tracker = Tracker(make_logger, run_dir, dict(flat(self._about["config"])))
             self.log.listeners.append(self._tracker)
-        elif self.saved is None:
-            shutil.rmtree(run_dir / FOLDER, ignore_errors=True)
 
     def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.

@@ -34,8 +34,18 @@ class Told(nn.Module):
     """Takes the decision that the task id says."""
 
     def forward(self, observation, task_id):
+        return self.logits(observation, task_id)
+
+    def logits(self, observation, task_id):
         deciding = observation[:, DECISION_ID : DECISION_ID + 1]
         return torch.cat([1 - deciding, deciding * task_id], dim=1)
+
+
+class MayBeTold(Told):
+    """The same, without the need of a task id."""
+
+    def forward(self, observation, task_id=None):
+        return self.logits(observation, torch.zeros(1, 2) if task_id is None else task_id)
 
 
 def test_a_plain_module_plays_by_its_largest_logit_in_evaluate_and_recorder():
@@ -64,6 +74,39 @@ def test_a_plain_module_of_two_arguments_is_given_task_ids():
 
     assert Recorder(shown).evaluate(Told(), 0) == {"goal1": 1.0, "goal2": 1.0}
     assert Recorder(shown).evaluate(policy_for=lambda task: Fixed(task + 1)) == {"goal1": 1.0, "goal2": 1.0}
+
+
+def test_a_task_id_that_a_module_can_do_without_is_given_where_it_is_shown():
+    shown = replace(TASKS, protocol=Protocol("one_hot"))
+
+    assert Recorder(shown).evaluate(MayBeTold(), 0) == {"goal1": 1.0, "goal2": 1.0}
+    assert Recorder(TASKS).evaluate(MayBeTold(), 0) == {"goal1": 0.0, "goal2": 0.0}
+
+
+def test_a_module_in_training_mode_acts_without_dropout_and_keeps_its_running_means_and_its_mode():
+    module = nn.Sequential(nn.BatchNorm1d(5, dtype=torch.float64), nn.Dropout(1.0), Fixed(2)).train()
+    module[1].eval()
+    as_trained = nn.Sequential(nn.Dropout(1.0), Fixed(2)).train()
+
+    evaluate(module, [TWO], 5)
+
+    assert module[0].num_batches_tracked == 0
+    assert [each.training for each in module.children()] == [True, False, True]
+    assert evaluate(as_trained, [TWO], 5)["episode_reward"].mean() == 1
+
+
+def test_logits_that_are_nan_are_refused():
+    module = Fixed(2)
+    module.linear.bias.data.fill_(torch.nan)
+
+    with pytest.raises(ValueError, match="Fixed gives logits that are nan"):
+        evaluate(module, [TWO], 1)
+
+
+def test_a_traced_module_has_no_signature_and_plays():
+    traced = torch.jit.trace(Fixed(2), torch.zeros(1, 5, dtype=torch.float64))
+
+    assert evaluate(traced, [TWO], 5)["episode_reward"].mean() == 1
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,13 @@ import pytest
 import torch
 from torchrl.record.loggers.common import Logger
 
+from ctgraph_rl import Recorder
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.run import run
 from ctgraph_rl.runs.config import plain, run_name, target
 from ctgraph_rl.runs.read import flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker, csv_logger, scalars
+from curricula import su_b1_4tasks
 
 SHORT = ("agent=dqn", "curriculum.num_frames=256", "agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8")
 PACKAGES = ("tensorboard", "wandb", "mlflow", "trackio")
@@ -272,3 +274,15 @@ def test_the_page_names_every_tracker_and_every_key(checkout):
         keys = re.findall(r"^(\w+):.*  # ", path.read_text(encoding="utf-8"), re.MULTILINE)
         assert [key for key in keys if key != "_target_" and f"`logger.{key}" not in page] == []
     assert {path.stem for path in (checkout / "conf" / "logger").iterdir()} == {"csv", *PACKAGES}
+
+
+def test_a_recorder_removes_what_was_tracked_of_a_run_and_no_folder_of_the_user(tmp_path):
+    own = tmp_path / FOLDER / "mine.txt"
+    own.parent.mkdir()
+    own.touch()
+
+    with Recorder(su_b1_4tasks(num_frames=256), tmp_path):
+        assert own.exists()
+    Recorder(su_b1_4tasks(num_frames=256), tmp_path, overwrite=True).close()
+
+    assert not own.exists()
