@@ -50,6 +50,12 @@ CEILING_NOTES = (
     "observations.",
     "memoryless: an action for each observation, deterministic or stochastic.",
 )
+CHANGING_GOALS = (
+    "Goals change: the ceilings are those of a goal that is known and stays. A search needs memory over episodes."
+)
+NOISE_AS_DICE = (
+    "Noise and rotation on read may serve a deterministic policy as dice, up to the ceiling of stochastic ones."
+)
 SAME_DECISIONS = "although decision states look alike, as all decisions on the way to the goal are the same."
 
 OBSERVATION_NOTES = (
@@ -185,11 +191,23 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
         rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
         reasons += [f"{UNKNOWN}: {reason}" for _, reason in found if reason]
         (memoryless, _), (optimal, _) = found[1], found[3]
-        if not task.observations.unique_decisions and None not in (memoryless, optimal) and memoryless == optimal:
+        alike = not task.observations.unique_decisions and task.goal_change is None
+        if alike and None not in (memoryless, optimal) and memoryless == optimal:
             easy.append(label)
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
-    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *([f"{no_memory}{SAME_DECISIONS}"] if easy else []))
+    limits = ((CHANGING_GOALS, _changes_goals), (NOISE_AS_DICE, _varies_on_read))
+    limited = [note for note, applies in limits if any(map(applies, curriculum.tasks))]
+    easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
+    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *limited, *easily)
     return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
+
+
+def _changes_goals(task: Task) -> bool:
+    return task.goal_change is not None
+
+
+def _varies_on_read(task: Task) -> bool:
+    return bool(task.observations.read_noise or task.observations.read_rotation)
 
 
 def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None, str]:

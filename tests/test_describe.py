@@ -120,6 +120,16 @@ def test_tasks_have_their_closed_forms_and_ceilings():
     assert ceilings.notes[-1].startswith("No memory is needed for goal1.1: a deterministic policy without memory is")
 
 
+def test_goals_that_change_are_not_said_to_need_no_memory():
+    (*_, changing, _), (*_, instances, _), (*_, plain, _) = (
+        describe(curricula.load(name)) for name in ("su_b1_changing_goals", "su_b1_instances", "su_b1_4tasks")
+    )
+
+    assert changing.notes[-1].startswith("Goals change: the ceilings are those of a goal that is known and stays.")
+    assert instances.notes[-2].startswith("Noise and rotation on read may serve a deterministic policy as dice")
+    assert [len(sheet.notes) for sheet in (changing, instances, plain)] == [3, 4, 3]
+
+
 def test_fully_observable_tasks_are_not_said_to_need_no_memory():
     ceilings = describe(make(Block(fully_observable(), 1)))[3]
 

@@ -25,6 +25,7 @@ from ctgraph_rl.tasks.values import (
     worst_value,
 )
 
+GOAL_CHANGES = Undefined("ceilings are exact only for goals that stay, and a task has a goal_change")
 NO_EXPERTS = "no experts were given"
 
 
@@ -109,7 +110,10 @@ def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
         "memoryless_ceilings": memoryless_ceiling,
         **{f"{policy}_entropies": partial(state_entropy, policy=policy) for policy in POLICIES},
     }
-    return {name: _of_each(value, tasks) for name, value in found.items()}
+    known = {name: _of_each(value, tasks) for name, value in found.items()}
+    if any(task.goal_change is not None for task in tasks):
+        known |= dict.fromkeys(("open_loop_ceilings", "memoryless_ceilings"), GOAL_CHANGES)
+    return known
 
 
 def _of_each(value: Callable[[Task], float], tasks: Sequence[Task]) -> Tensor | Undefined:

@@ -44,7 +44,7 @@ def memoryless_ceiling(memoryless_ceilings: Tensor) -> Tensor:
     bounds=of_performance,
 )
 def optimal_performance(best: Tensor) -> Tensor:
-    """Mean over tasks of the best mean return of any policy.
+    """Mean over tasks of the best mean return of any policy, of one that knows the goal where goals change.
 
     Args:
         best: each task's `Task.optimal_value(1.0)`.

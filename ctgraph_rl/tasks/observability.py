@@ -1,9 +1,9 @@
 """How much of its state a task shows: states per observation, and the entropy of the state given the observation.
 
 Observations are ids: noise and rotation on read are left out. Every observation of an episode counts, the last one in
-the fail state or an end state, too. Ids of different kinds of states never overlap, so an observation says the kind of
-its state, and all that is open is the place in the tree. Levels count decisions: level k has b^k wait states and, below
-the depth, b^k decision states.
+the fail state or an end state, too, but not that of the home state after an ``extra_end_step``. Ids of different kinds
+of states never overlap, so an observation says the kind of its state, and all that is open is the place in the
+tree. Levels count decisions: level k has b^k wait states and, below the depth, b^k decision states.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ ON_THE_WAY, ELSEWHERE = 0, 1
 def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     """Decisions that two goals share from the first on, as a share of the shorter goal's; float64 [T, T].
 
-    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3. 1 means that the goal of the smaller graph is on
-    the way to that of the larger one.
+    (1, 2, 1) and (1, 2) share 1.0, (1, 2, 1) and (1, 1, 1) share 1/3. 1 means that the decisions
+    for the goal of the smaller graph are the first ones for that of the larger one.
 
     Example:
         >>> import curricula

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Gradient, RunLog, metrics
 from ctgraph_rl.log.scores import inputs_of, optimal_values, scores
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
@@ -350,5 +351,10 @@ def test_ceilings_that_are_not_known_say_why_and_tasks_without_a_gap_close_none(
     for name in ("memoryless_ceiling", "memory_gap_closed"):
         reason = found[1][name].undefined or ""
         assert reason.startswith("the memoryless ceiling is exact only for the Needle reward")
+    of_four = RunLog()
+    of_four.append("run", trained=[[1, 2, 3, 4]])
+    changing = scores(of_four, curricula.load("su_b1_changing_goals"))
+    for name in ("open_loop_ceiling", "memoryless_ceiling", "memory_gap_closed"):
+        assert (changing[name].undefined or "").startswith("ceilings are exact only for goals that stay")
     assert found[1]["open_loop_ceiling"].value == found[1]["optimal_performance"].value == 1.0
     assert [each["state_entropy_random"].value for each in found] == [0.0, pytest.approx(state_entropy(gradient))]
