@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from raw import Raw, groups, read, table
+from raw import groups, read, table
 
 INSTANCES, MEMORY = "baselines_b1_instances", "memory_b1"
 """Raw results with noise and rotation on read, and of the other agents with memory."""
@@ -28,22 +28,3 @@ def instances_change() -> str:
         spans = (f"{min(of):+.2f} to {max(of):+.2f}".replace("-0.00", "+0.00") for of in each)
         rows.append([agent, str(len(each[0])), *spans])
     return table(["agent", "goals", "change greedily", "change sampled"], rows)
-
-
-def memory_verdict() -> str:
-    """Return for each of the other agents with memory how many seeds solve each goal that was run."""
-    if not read(MEMORY):
-        return "No agent has five seeds yet."
-    words = []
-    for (agent,), lines in groups(read(MEMORY), "agent").items():
-        each = groups(lines, "configuration", "task").items()
-        parts = [
-            f"goal {goal} of CT-{name.upper().replace('_', '-')} in {num_solved(cell)}" for (name, goal), cell in each
-        ]
-        words.append(f"`{agent}` solves {', '.join(parts)}")
-    return "; ".join(words) + " seeds (a greedy success of at least 0.9)."
-
-
-def num_solved(lines: Raw) -> str:
-    """Return how many seeds have a greedy success of at least 0.9, such as ``4 of 5``."""
-    return f"{sum(float(line['greedy_success']) >= 0.9 for line in lines)} of {len(lines)}"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import comparison
 import pairs
 import search
-from alone import INSTANCES, MEMORY, instances_change, memory_verdict
+from alone import INSTANCES, MEMORY, instances_change
 from raw import HERE, Raw, groups, machine_of, machines, mean_of, read, share_of, table, write
 
 if TYPE_CHECKING:
@@ -255,7 +255,6 @@ def verdicts() -> dict[str, str]:
     found = search.searching(depth_2)
     return {
         "instances_change": instances_change(),
-        "memory_verdict": memory_verdict(),
         "searching": f"{sum(found)} of {len(found)}",
     }
 
