@@ -64,8 +64,8 @@ class Estimate:
 
     def __str__(self) -> str:
         """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``."""
-        value = "-" if self.value is None else f"{self.value:.2f}"
-        interval = "" if self.low is None or self.high is None else f" [{self.low:.2f}, {self.high:.2f}]"
+        value = "-" if self.value is None else f"{self.value:z.2f}"
+        interval = "" if self.low is None or self.high is None else f" [{self.low:z.2f}, {self.high:z.2f}]"
         missing = f"/{self.n + self.n_undefined}" if self.n_undefined else ""
         return f"{value}{interval} n = {self.n}{missing}"
 

@@ -166,7 +166,7 @@ def _blocks(history: History) -> list[tuple[int, list[float]]]:
 
 
 def _shown(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.2f}"
+    return "-" if math.isnan(value) else f"{value:z.2f}"
 
 
 def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -179,7 +179,7 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
         *(name for name in (*LIFELONG, *WITH_EXPERTS) if metrics.get(name, {}).get("value") is not None),
     ):
         metric = metrics[name]
-        value = "undefined" if metric["value"] is None else f"{metric['value']:.2f}"
+        value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"
         table.add_row(LIFELONG.get(name, measure_name(name)), value, _text(metric["undefined"] or metric["formula"]))
     return table
 

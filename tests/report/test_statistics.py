@@ -218,6 +218,10 @@ def test_the_interquartile_mean_is_of_the_middle_half_of_all_tasks_together():
     assert (estimate.n, estimate.n_undefined) == (10, 0)
 
 
+def test_a_value_that_rounds_to_zero_has_no_sign():
+    assert str(statistics.Estimate(-0.001, -0.004, 0.2, n=3, n_undefined=0, method="mean")) == "0.00 [0.00, 0.20] n = 3"
+
+
 def test_the_bootstrap_is_stratified_so_tasks_without_spread_stay_as_they_are():
     estimate = interquartile_mean([[0.0] * 10, [1.0] * 10])
 
