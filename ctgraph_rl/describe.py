@@ -31,8 +31,8 @@ SIZES = ("states", "ends")
 CLOSED_FORMS = ("P_R", "P_E", "P_RNP", "E[rho]", "E[kappa]", "random frames")
 CLOSED_FORM_NOTES = (
     "P_R: probability that a uniformly random policy over the b + 1 actions reaches the goal in an episode.",
-    "P_E: the same of any end state.",
-    "P_RNP: the same of the goal, for a policy that waits when it must and decides at random.",
+    "P_E: the same for any end state.",
+    "P_RNP: the same for the goal, under a policy that waits when it must and decides at random.",
     "E[rho]: mean steps of an episode that gets to an end state, of a policy that waits when it must.",
     "E[kappa]: mean episodes until the goal is found when end states are tried one by one.",
     "random frames: mean frames of the uniformly random policy until it reaches the goal for the first time, failed "

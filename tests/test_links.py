@@ -36,15 +36,16 @@ WRITING = {
 
 ALLOWED = {
     ("ctgraph_rl.benchmark.sizes", "TemporaryDirectory"): "a folder of its own",
-    ("ctgraph_rl.cli", "os.open"): "the null device, in place of a broken pipe",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",
     ("ctgraph_rl.log.export", "arguments.out.mkdir"): "named by the user",
     ("ctgraph_rl.log.export", "where.mkdir"): "in a folder that was empty",
     ("ctgraph_rl.log.files", "file.truncate"): "a file that open_own opened",
+    ("ctgraph_rl.log.refuse", "os.open"): "the null device, in place of a broken pipe",
     ("ctgraph_rl.log.run_log", "file.truncate"): "as above",
-    ("ctgraph_rl.runs.recorder", "path.parent.mkdir"): "named by the user",
+    ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
+    ("ctgraph_rl.runs.together", "folder.mkdir"): "as above",
     ("ctgraph_rl.runs.trackers", "folder.mkdir"): "after a link is refused",
 }
 """Calls outside of `ctgraph_rl.disk`, and why they follow no link of a stranger."""

@@ -26,7 +26,8 @@ def main() -> None:
             print_summary(arguments.runs[0])
         report = write_report(arguments.runs, arguments.out, arguments.agent)
     incomplete = print_problems(report.problems, report.runs)
-    print(f"report of {len(report.runs)} runs: {terminal_text(report.page)}")
+    count = len(report.runs)
+    print(f"report of {count} run{'s' * (count != 1)}: {terminal_text(report.page)}")
     if incomplete:
         sys.exit(1)
 

@@ -25,7 +25,7 @@ WIDTH = 80
 """Characters of a line on a terminal."""
 
 MEANS = "mean [95 % interval]"
-LEGEND = f"{MEANS}, share of solved seeds [exact], median of times [exact]"
+LEGEND = f"{MEANS}, solved seeds and median times [exact 95 % interval]"
 
 
 def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:

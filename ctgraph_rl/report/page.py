@@ -181,7 +181,10 @@ def facts(section: Section) -> Iterator[tuple[str, Any]]:
     yield "blocks", len(section.trained)
     yield "frames", f"{section.ends[-1]:,}"
     if section.results[0].bounds.one_episode:
-        yield "a sample", "a seed: the episodes of an evaluation are one, greedy and of tasks without chance"
+        yield (
+            "a sample",
+            "one seed: a greedy policy on deterministic tasks plays one episode again and again",
+        )
     for group in ("curriculum", "evaluation", "protocol"):
         given = about["config"].get(group)
         for key, value in flat(given if isinstance(given, Mapping) else {}, f"{group}."):

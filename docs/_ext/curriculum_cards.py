@@ -76,7 +76,7 @@ def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
         f'```python\nimport curricula\n\ncurriculum = curricula.load("{name}")\n```',
         "## Who can solve it",
         "\n".join(f"- {sentence}" for sentence in _who(curriculum)),
-        "## How alike its tasks are",
+        "## How similar its tasks are",
         f"![Similarity of the tasks of {name}](../figures/{similarity})",
         *_folded(sheets, len(curriculum.tasks)),
         *_settings(name),
@@ -116,7 +116,7 @@ def _who(curriculum: Curriculum) -> Iterator[str]:
     label = escaped(dict(zip(curriculum.tasks, curriculum.labels, strict=True))[hardest])
     yield (
         f"Exploration: on {label}, the hardest task for it, a random policy first reaches the goal after "
-        f"{_rounded(frames)} frames in the mean; the longest block has {longest:,}."
+        f"{_rounded(frames)} frames on average; the longest block has {longest:,}."
     )
     if curriculum.protocol.task_id == "hidden" and _conflicts(curriculum.tasks):
         yield (

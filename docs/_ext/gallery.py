@@ -27,7 +27,7 @@ class Tile(NamedTuple):
 
 DRAWN = {
     "The graphs and goals of a curriculum": "curricula describe fo_b1_depth2to5 --figure FIGURE",
-    "How alike the tasks of a curriculum are": "curricula describe su_b1_4tasks --similarity FIGURE",
+    "How similar the tasks of a curriculum are": "curricula describe su_b1_4tasks --similarity FIGURE",
     "A task of twenty-seven end states": "draw --branching-factor 3 --depth 3 --goal 2.1.3 --figure FIGURE",
     "What the optimal policy does": "draw CT-SU-B1 --goal 2.1 --policy optimal --figure FIGURE",
     "A policy that waits and decides at random": "draw CT-CO-B1 --policy navigation --figure FIGURE",

@@ -224,7 +224,7 @@ def test_the_transition_can_be_vmapped():
     tree = tree_params(b, d, len(states))._replace(extra_end_step=torch.arange(len(states)) % 2 == 0)
     arguments = (as_tensors(b, d, states), torch.tensor(actions), torch.tensor(stay), tree)
     in_dims = type(tree)(
-        *(None if field in ("next_kind", "decides", "width", "by_action") else 0 for field in tree._fields)
+        *(None if field in ("next_kind", "decides", "width", "by_action", "swap") else 0 for field in tree._fields)
     )
 
     mapped = torch.vmap(transition, in_dims=(0, 0, 0, in_dims))(*arguments)

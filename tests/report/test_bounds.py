@@ -135,7 +135,7 @@ def test_a_report_says_that_episodes_of_a_greedy_policy_without_chance_are_one(t
     (section,) = sections(of_known_curriculum(tmp_path, (0.0, 1.0)))
 
     facts = dict(page.facts(section))
-    assert facts["a sample"].startswith("a seed: the episodes of an evaluation are one, greedy")
+    assert facts["a sample"].startswith("one seed: a greedy policy on deterministic tasks plays one episode")
 
 
 def test_of_another_curriculum_than_the_run_learned_nothing_is_known(tmp_path):

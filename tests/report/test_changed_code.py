@@ -195,7 +195,7 @@ def test_a_finished_run_of_other_code_is_refused_and_not_shown(mine, ran, monkey
     assert said in shown and "average performance" not in shown
     advice = "overwrite=stale runs it again from the beginning, as overwrite=true does with any run\n"
     refused = "out holds a run of other code: " in shown and shown.endswith(advice)
-    assert "\nerror: " in shown and refused is (said != "no file")
+    assert shown.startswith("error: ") and refused is (said != "no file")
 
 
 def test_overwrite_stale_shows_a_run_whose_code_has_not_changed(mine, monkeypatch, capsys):

@@ -253,7 +253,7 @@ def test_the_command_prints_the_tables_of_one_run_and_where_the_report_is(tmp_pa
 
     assert (code, err) == (0, "")
     assert "average performance" in out
-    assert f"report of 1 runs: {run / 'report' / 'report.html'}" in out
+    assert f"report of 1 run: {run / 'report' / 'report.html'}" in out
 
 
 def test_what_is_left_out_has_exit_code_1_and_the_rest_is_reported(tmp_path, monkeypatch, capsys, no_figures):
@@ -265,7 +265,7 @@ def test_what_is_left_out_has_exit_code_1_and_the_rest_is_reported(tmp_path, mon
 
     file = tmp_path / "runs" / "foreign" / "run.jsonl"
     assert code == 1
-    assert "report of 1 runs" in out
+    assert "report of 1 run" in out
     assert err == f"left out: {file} does not say what was run: its first line is missing, or it is no log of ours\n"
     assert str(file) in (tmp_path / "runs" / "report" / "report.html").read_text()
 

@@ -50,7 +50,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
     caption = (
         f"Mean return on each task at every evaluation, over the frames learned from.{tasks} {_agents(section)} Lines: "
-        f"means over seeds, where each has a value; bands: {BANDS}; thin lines: single seeds, up to {MOST_SEEDS}. "
+        f"means over seeds, where all have a value; bands: {BANDS}; thin lines: single seeds, up to {MOST_SEEDS}. "
         "Grey: blocks that train the task; dashed: ends of blocks."
     )
     return CaptionedFigure("curves", "Learning curves", caption, draw_tasks(section))
@@ -62,7 +62,7 @@ def mean_curves(section: Section) -> CaptionedFigure | None:
         return None
     caption = (
         f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "
-        f"from. {_agents(section)} Lines: means over seeds, where each has a value; bands: {BANDS}; thin lines: single "
+        f"from. {_agents(section)} Lines: means over seeds, where all have a value; bands: {BANDS}; thin lines: single "
         f"seeds, up to {MOST_SEEDS}. Dashed: ends of blocks."
     )
     return CaptionedFigure("mean", "Mean return over all tasks", caption, draw_mean(section))

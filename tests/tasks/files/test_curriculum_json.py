@@ -107,7 +107,7 @@ def test_every_field_is_written_with_its_default_too(content):
         "images": {"type": "PaperImages", "num_images": 5, "seed": 1, "size": 12},
         "reward_fn": {"type": "Needle"},
         **{"goal_reward": 1.0, "fail_reward": 0.0, "step_reward": 0.0, "reward_std": 0.0, "reward_noise": "additive"},
-        **{"goal_change": None, "extra_end_step": False, "legacy_goal_change": False},
+        **{"goal_change": None, "extra_end_step": False, "legacy_goal_change": False, "swapped_branches": None},
     }
     assert content["blocks"][1]["switch"] == {"type": "Drift", "episodes": 100, "together": False}
 
