@@ -218,7 +218,7 @@ def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None
 
 
 def _observations(curriculum: Curriculum) -> Sheet:
-    """What an observation leaves open about the state, and what varies where it is read."""
+    """Return what an observation leaves open about the state, and what varies where it is read."""
     rows, reasons = [], []
     for task, label in _labelled(curriculum):
         try:

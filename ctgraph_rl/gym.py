@@ -248,7 +248,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         return shown, infos | self._infos(shown)
 
     def _infos(self, shown: Shown, mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-        """What a `CTGraphGymEnv` says in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
+        """Return what `CTGraphGymEnv` gives in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
         values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
         infos: dict[str, Any] = {}
         for key, value in values.items():

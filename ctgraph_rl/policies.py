@@ -48,7 +48,7 @@ class NavigationPolicy(RandomPolicy):
         return torch.where(decides, self.decision(tensordict), WAIT_ACTION)
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """What a row decides if it is at a decision state, in 1..b."""
+        """Return the decision of each row, in 1..b, for rows at a decision state."""
         return 1 + self._random_below(self.env.branching_factor)
 
 
@@ -63,7 +63,7 @@ class OptimalPolicy(NavigationPolicy):
     """
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """What a row decides if it is at a decision state, in 1..b."""
+        """Return the decision of each row, in 1..b, for rows at a decision state."""
         return self._towards(self.env.goal_leaf)
 
     def _towards(self, leaf: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ class SearchPolicy(OptimalPolicy):
         self.tried = torch.zeros_like(env.node, dtype=torch.bool)
 
     def decision(self, tensordict: TensorDictBase) -> Tensor:
-        """What a row decides if it is at a decision state, in 1..b."""
+        """Return the decision of each row, in 1..b, for rows at a decision state."""
         assert self.target is not None
         return self._towards(self.target)
 

@@ -1,4 +1,4 @@
-"""Which task each row has, and when it changes to another; `Rows` keeps it."""
+"""The task of each row, and when it changes to another; `Rows` keeps it."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
 
 
 def _chosen(rows: Rows, policy: Policy, steps: Steps, t: int, start: RowState) -> Tensor:
-    """What a policy does at step t; it must leave the rows as they are at the start."""
+    """Return the actions of a policy at step t; it must leave the rows as they are at the start."""
     params = rows.params
     action = policy(steps.observation[t], steps.is_init[t])
     same = rows.params is params and all(map(operator.is_, rows.state, start))

@@ -115,7 +115,7 @@ class Rows(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """The device of the tensors."""
         return self.row.device
 
     def _choose_engine(self) -> None:
@@ -132,7 +132,7 @@ class Rows(nn.Module):
 
     @property
     def engine(self) -> TensorEngine | Native:
-        """What takes the next step."""
+        """The engine that takes the next step."""
         return self.native if self.uses_kernel else self.tensors
 
     @property
@@ -147,7 +147,7 @@ class Rows(nn.Module):
 
     @property
     def assignment(self) -> Assignment:
-        """Which task each row has, and its choices for the next episodes."""
+        """The task of each row, and its choices for the next episodes."""
         return Assignment(self.task, self.choice, self.episodes, self._choices, self._switch)
 
     @assignment.setter
@@ -332,7 +332,7 @@ class Rows(nn.Module):
         return result
 
     def show(self) -> Shown:
-        """What all rows show now."""
+        """Return the present observations of all rows."""
         return dynamics.show(self.state, self.params, self.uses)
 
     @property

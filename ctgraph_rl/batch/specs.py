@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Specs(NamedTuple):
-    """What a policy reads and writes."""
+    """The specs of what a policy reads and writes."""
 
     observation: Composite
     action: Categorical

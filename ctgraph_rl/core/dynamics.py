@@ -55,7 +55,7 @@ STATE_DTYPES = dict.fromkeys(RowState._fields, torch.int64) | {
 
 
 class Shown(NamedTuple):
-    """What a row shows."""
+    """The observation of a row."""
 
     observation: Tensor  # uint8 [N, *shape]
     outcome: Tensor  # uint8

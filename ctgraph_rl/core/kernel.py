@@ -31,7 +31,7 @@ ROWS_A_THREAD = 2048
 
 
 def num_threads(num_rows: int, most: int) -> int:
-    """How many threads to use for so many rows, at most so many."""
+    """Return the number of threads to use for a number of rows, up to a maximum."""
     return max(1, min(torch.get_num_threads(), most, num_rows // ROWS_A_THREAD))
 
 
@@ -85,7 +85,7 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 @cache
 def is_available() -> bool:
-    """Whether the library is there, or can be made; what fails is tried once a process."""
+    """Return whether the library exists or can be built; a failed build is tried once in a process."""
     try:
         library()
     except ValueError:

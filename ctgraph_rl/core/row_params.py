@@ -14,7 +14,7 @@ from ctgraph_rl.core.tree import TreeParams
 
 
 class LegacyIndex(NamedTuple):
-    """How `Observations.legacy_index` numbers the states of each row's task; int64."""
+    """The numbers that `Observations.legacy_index` gives the states of each row's task; int64."""
 
     level_first: Tensor  # [N, D + 1]: first node of a level, in rows of less depth 2**63 - 1 beyond it
     level_shift: Tensor  # [N, D + 1]: what is added to a node of the level
@@ -95,5 +95,5 @@ class Uses(NamedTuple):
 
     @property
     def draws(self) -> bool:
-        """Whether a tick needs random words."""
+        """Return whether a tick needs random words."""
         return self.waits or self.drawn_ids or self.views

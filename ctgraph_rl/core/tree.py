@@ -36,7 +36,7 @@ class HasState(Protocol):
 
 
 class State(NamedTuple):
-    """Where each row is."""
+    """The position of each row in its tree."""
 
     state_type: Tensor  # uint8
     node: Tensor  # int64
@@ -98,7 +98,7 @@ def tree_params(
 
 
 def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list:
-    """Where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
+    """Return where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
 
     def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
         waits, decides = action == WAIT_ACTION, WAIT_ACTION < action <= branching_factor

@@ -1,4 +1,4 @@
-"""Which files of a finished run are not as they were written.
+"""Finds the files of a finished run that are not as they were written.
 
 Runs of earlier versions have no `ctgraph_rl.log.sums.SUMS`: of theirs it is checked that the files can be read.
 """

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Known(NamedTuple):
-    """What is known of the numbers of a run."""
+    """Bounds on the numbers of a run."""
 
     low: float  # lowest mean return on any task; -inf where nothing bounds it
     high: float  # highest one

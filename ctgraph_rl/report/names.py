@@ -1,4 +1,4 @@
-"""How tables and figures call curricula and agents: what of a curriculum was modified, and names that are given."""
+"""Names of curricula and agents in tables and figures: what of a curriculum was modified, and names that are given."""
 
 from __future__ import annotations
 

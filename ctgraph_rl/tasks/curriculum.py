@@ -129,7 +129,7 @@ class Curriculum:
         return bisect_left(self.ends, frames) + 1 if frames else 0
 
     def is_end(self, frames: int) -> bool:
-        """Whether a block ends after the run's first ``frames`` frames."""
+        """Return whether a block ends after the run's first ``frames`` frames."""
         block = self.block_at(frames)
         return block > 0 and block <= len(self.ends) and self.ends[block - 1] == frames
 

@@ -164,7 +164,7 @@ def _here(kind: StateType) -> str:
 
 
 def has_colours(console: Console) -> bool:
-    """Whether blocks of grey can be shown."""
+    """Return whether a console can show blocks of grey."""
     plain = console.no_color or console.color_system is None
     return not plain and console.encoding.lower().startswith("utf")
 
