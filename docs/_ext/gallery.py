@@ -48,14 +48,16 @@ TITLES = {
 }
 """What the figures of the page on drawing show."""
 
+MAKE, REPORT = "python docs/results/make.py", "ctgraph-rl report runs/su_b1_4tasks --agent LSTMPPO=LSTM-PPO"
 RESULTS = {
-    "main_job-training.png": "LSTM-PPO learns four goals one after the other",
-    "main_job-transfer.png": "Its performance matrix, and what each block changed",
-    "baselines_b1.png": "Seven agents on four configurations",
-    "masks_ct8.png": "Modulating masks on CT8",
-    "methods.png": "All methods on four agents",
+    "main_job.png": ("A graph, and the performance matrix of LSTM-PPO", "python docs/results/hero.py"),
+    "main_job-training.png": ("LSTM-PPO learns four goals one after the other", REPORT),
+    "main_job-transfer.png": ("Its performance matrix, and what each block changed", REPORT),
+    "baselines_b1.png": ("Six agents on four configurations", MAKE),
+    "masks_ct8.png": ("Modulating masks on CT8", MAKE),
+    "methods.png": ("All methods on four agents", MAKE),
 }
-"""Figures of the results, which ``docs/results/make.py`` draws from the raw results."""
+"""Titles and commands of figures of the results: of the raw results, or of runs of the main job."""
 
 
 def gallery_page(folder: Path) -> str:
@@ -97,5 +99,5 @@ def _of_page(name: str) -> list[Tile]:
 
 
 def _of_results() -> list[Tile]:
-    found = {name: title for name, title in RESULTS.items() if (DOCS / "results" / name).is_file()}
-    return [Tile(title, "python docs/results/make.py", f"../results/{name}") for name, title in found.items()]
+    found = {name: tile for name, tile in RESULTS.items() if (DOCS / "results" / name).is_file()}
+    return [Tile(title, command, f"../results/{name}") for name, (title, command) in found.items()]
