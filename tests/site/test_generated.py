@@ -97,6 +97,7 @@ def test_cards_show_settings_variants_results_and_examples(site):
 
 
 def test_links_to_files_beside_docs_lead_to_their_pages(site):
+    pytest.importorskip("docutils", reason="needs the extra docs")
     relocated = site("links").relocated
     text = (
         "[a](../../SECURITY.md#x) [b](loggers.md) [c](../../baselines/ppo.py) [d](https://x.y/z.md) ![e](../../p.png)"
@@ -123,6 +124,7 @@ def test_every_tile_of_the_gallery_has_its_command_and_its_figure(site, tmp_path
 
 
 def test_the_index_for_language_models_has_a_line_for_each_page(site, tmp_path):
+    pytest.importorskip("sphinx", reason="needs the extra docs")
     (tmp_path / "a.md").write_text("# A\n\nWhat it is. More.\n", encoding="utf-8")
     titles = {"a": SimpleNamespace(astext=lambda: "A")}
     environment = SimpleNamespace(titles=titles, found_docs={"a"}, doc2path=lambda name: tmp_path / f"{name}.md")

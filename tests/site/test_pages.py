@@ -4,31 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
-from helpers.paths import CHECKOUT
+from helpers.paths import CHECKOUT, sources
 
 TEXTS = (".md", ".ipynb", ".py", ".yaml", ".toml", ".cff")
 TEMPLATES = {"template.md": "results", "lifelong_template.md": "results", "statistics_template.md": "explanation"}
 """Templates of pages, and the folder of docs that their pages are in."""
-
-
-def tracked() -> list[Path]:
-    """Files of the checkout that hold text, without what builds and caches leave."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard"], cwd=CHECKOUT, capture_output=True, text=True
-    )
-    paths = [CHECKOUT / line for line in listed.stdout.splitlines()] or sorted(CHECKOUT.rglob("*"))
-    return [path for path in paths if path.suffix in TEXTS and path.is_file() and not is_made(path)]
-
-
-def is_made(path: Path) -> bool:
-    """Whether a file is none of the sources, where there is no git to ask, as in an archive."""
-    parts = path.relative_to(CHECKOUT).parts
-    made = any(part.startswith(".") or part in ("generated", "_build") for part in parts[:-1])
-    return made or parts[0] in ("build", "dist", "runs")
 
 
 def prose(path: Path) -> str:
@@ -41,7 +24,7 @@ def prose(path: Path) -> str:
     return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
-FILES = tracked()
+FILES = sources(TEXTS)
 PAGES = [path for path in FILES if path.suffix in (".md", ".ipynb") and "tests" not in path.parts]
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import io
 import json
 import re
-import subprocess
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
-from helpers.paths import CHECKOUT
+from helpers.paths import CHECKOUT, sources
 
 INSTEAD = {
     r"wears?|wearing|worn": "a method is used with an agent, as in PPO trained with EWC",
@@ -32,6 +31,7 @@ ALLOWED: dict[str, str] = {}
 
 FOLDERS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins", "conf", "docs")
 FILES = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
+KINDS = (".py", ".md", ".ipynb", ".yaml", ".j2", ".c")
 
 TOKENS = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
 WORDS = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
@@ -49,13 +49,11 @@ def texts(path: Path) -> Iterator[str]:
         yield text
 
 
-def tracked() -> list[Path]:
+def shown() -> list[Path]:
     """Files of the checkout that readers and users see."""
-    command = ["git", "ls-files", "-co", "--exclude-standard", *FOLDERS, *FILES]
-    listed = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True).stdout.splitlines()
-    paths = [CHECKOUT / line for line in listed]
-    kinds = (".py", ".md", ".ipynb", ".yaml", ".j2", ".c")
-    return [path for path in paths if path.suffix in kinds and path.is_file() and "results" not in path.parent.name]
+    paths = [(path, path.relative_to(CHECKOUT).parts) for path in sources(KINDS)]
+    seen = [path for path, parts in paths if parts[0] in FOLDERS + FILES]
+    return [path for path in seen if "results" not in path.parent.name]
 
 
 def found(path: Path) -> list[str]:
@@ -70,7 +68,7 @@ def found(path: Path) -> list[str]:
 
 
 def test_the_words_that_stay_out_are_in_no_page_docstring_comment_or_message():
-    files = tracked()
+    files = shown()
 
     assert len(files) > 250
     assert [line for path in files for line in found(path)] == []
