@@ -10,7 +10,7 @@ DATA = TESTS / "data"
 
 
 def sources(kinds: Sequence[str]) -> list[Path]:
-    """Return files of the checkout by their suffixes, without what builds and caches leave; in an archive without git, too."""
+    """Return files of the checkout by suffix, without what builds and caches leave; in an archive without git, too."""
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=CHECKOUT, capture_output=True, text=True
     )
