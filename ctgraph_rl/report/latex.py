@@ -82,7 +82,8 @@ def _float(
         rf"\par\smallskip\raggedright\textsuperscript{{{letters(i)}}} {latex_text(table.notes[i - 1])}" for i in used
     ]
     bodies = [_tabular(table, rows, part) for part in parts]
-    head = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{latex_text(table.caption + again)}}}"]
+    head = [r"\begin{table}[htbp]", r"\centering", r"\setlength{\belowcaptionskip}{6pt}"]
+    head += [rf"\caption{{{latex_text(table.caption + again)}}}"]
     head += [rf"\label{{tab:{label}}}", r"\footnotesize", r"\setlength{\tabcolsep}{4pt}"]
     return "\n".join([*head, "\n\\par\\medskip\n".join(bodies), *notes, r"\end{table}"])
 
