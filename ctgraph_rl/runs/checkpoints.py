@@ -75,11 +75,7 @@ class Checkpoints:
             state: makes what is saved.
             at_block_end: always save.
         """
-        stop = self.interrupt.is_asked
-        if stop or self.is_due(at_block_end):
-            self.save(state())
-        if stop:
-            self.interrupt.exit()
+        offer_all([self], lambda: [state()], at_block_end)
 
     def is_due(self, at_block_end: bool) -> bool:
         """Return whether it is time to save."""
