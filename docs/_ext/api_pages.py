@@ -117,6 +117,8 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.networks",
             "baselines.optimisers",
+            "baselines.embedding",
+            "baselines.transport",
             "baselines.methods.method",
             "baselines.methods.importance",
             "baselines.methods.masks",

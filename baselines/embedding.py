@@ -1,0 +1,90 @@
+"""Embeddings of tasks: a sample of transitions as one vector.
+
+Linear Wasserstein embedding (Kolouri et al. 2021, arXiv 2006.09430), on transitions in place of labelled data
+(Liu et al. 2022, arXiv 2208.11726); sliced Wasserstein embedding, with sorted projections in place of the plan. N are
+samples, n coordinates of each, M reference points, L directions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from baselines.transport import optimal_plan
+
+REFERENCE_SEED = 98
+"""Of reference points and directions: embeddings are comparable if they share these."""
+
+
+def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions: int) -> Tensor:
+    """Return transitions as points: standardised observation, one-hot action, reward.
+
+    One mean and one standard deviation over all pixels of the sample standardise the observations.
+
+    Args:
+        observation: [N, ...], of any number type.
+        action: int64 [N], in [0, num_actions).
+        reward: [N].
+        num_actions: of the environment.
+
+    Returns:
+        float32 [N, n], n = pixels + num_actions + 1.
+    """
+    pixels = observation.flatten(1).float()
+    deviation = pixels.std(correction=0)
+    pixels = (pixels - pixels.mean()) / torch.where(deviation > 0, deviation, 1.0)
+    return torch.cat([pixels, one_hot(action, num_actions).float(), reward.float().unsqueeze(1)], dim=1)
+
+
+def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
+    """Return points drawn uniformly from [0, 1)^n, float32 [M, n]; the same for equal arguments."""
+    return torch.rand(number, width, generator=torch.Generator().manual_seed(seed))
+
+
+def unit_directions(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
+    """Return directions drawn uniformly from the unit sphere, float32 [L, n]; the same for equal arguments."""
+    return normalize(torch.randn(number, width, generator=torch.Generator().manual_seed(seed)), dim=1)
+
+
+def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
+    """Return the linear Wasserstein embedding of points.
+
+    f_i = (M sum_j gamma_ji x_j - R_i) / sqrt(M), with the optimal plan gamma for squared Euclidean distances between
+    N points x and M reference points R of equal masses. Where the plan splits no R_i, its norm is the 2-Wasserstein
+    distance. Equal points are merged first: the embedding stays the same, and the plan takes a fraction of the time.
+
+    Args:
+        points: float32 [N, n].
+        reference: float32 [M, n].
+
+    Returns:
+        float32 [M * n].
+    """
+    distinct, counts = points.cpu().double().unique(dim=0, return_counts=True)
+    targets, number = reference.cpu().double(), len(reference)
+    cost = (targets.square().sum(1, keepdim=True) - 2 * targets @ distinct.T + distinct.square().sum(1)).numpy()
+    plan = optimal_plan(cost, torch.full([number], len(points)).numpy(), (number * counts).numpy())
+    means = torch.from_numpy(plan).double() @ distinct / len(points)
+    return ((means - targets) / math.sqrt(number)).flatten().to(points)
+
+
+def sliced_wasserstein(points: Tensor, directions: Tensor, num_quantiles: int) -> Tensor:
+    """Return the sliced Wasserstein embedding of points, of norm 1.
+
+    Along each direction these are the quantiles of the projections at equally spaced levels from 0 to 1, with linear
+    interpolation, divided by sqrt(L * num_quantiles), and then all by their norm.
+
+    Args:
+        points: float32 [N, n].
+        directions: float32 [L, n], of norm 1.
+        num_quantiles: at least 2.
+
+    Returns:
+        float32 [L * num_quantiles]; zeros where all points are 0.
+    """
+    levels = torch.linspace(0, 1, num_quantiles, dtype=points.dtype, device=points.device)
+    quantiles = (points @ directions.T).quantile(levels, dim=0)
+    return normalize(quantiles.T.flatten() / math.sqrt(quantiles.numel()), dim=0)

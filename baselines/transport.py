@@ -1,0 +1,110 @@
+"""Exact optimal transport between two weighted sets of points: NumPy has no solver, and SciPy is optional here."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctgraph_rl.checks import require
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Arcs = list[tuple[int, int]]
+
+
+def optimal_plan(cost: Floats, supply: Ints, demand: Ints) -> Ints:
+    """Compute a transport plan of least cost by successive shortest paths.
+
+    Units are whole numbers, so the plan has no rounding errors. Time grows with the number of columns most: it takes
+    about 10 ms for 50 rows and 25 columns, and 60 ms for 128 columns.
+
+    Args:
+        cost: of one unit from a row to a column, float64 [rows, columns].
+        supply: units of each row, int64 [rows], at least 0.
+        demand: units of each column, int64 [columns], at least 0.
+
+    Returns:
+        Units from each row to each column, int64 [rows, columns].
+
+    Raises:
+        ValueError: if the sums of supply and demand differ.
+    """
+    offered, wanted = int(supply.sum()), int(demand.sum())
+    require((offered == wanted, f"supply and demand must have equal sums, got {offered} and {wanted}"))
+    transport = _Transport(cost, demand)
+    for row, units in enumerate(supply.tolist()):
+        while units:
+            units -= transport.send(row, units)
+    return transport.plan
+
+
+class _Transport:
+    """A plan that grows along shortest paths, and the reduced costs, which are never negative and 0 where it sends.
+
+    Args:
+        cost: float64 [rows, columns].
+        demand: int64 [columns].
+    """
+
+    def __init__(self, cost: Floats, demand: Ints) -> None:
+        self.plan, self.left = np.zeros(cost.shape, dtype=np.int64), demand.copy()
+        self.reduced = cost - cost.min(axis=0)
+        self.reduced -= self.reduced.min(axis=1, keepdims=True)
+        self.columns = np.arange(cost.shape[1])
+
+    def send(self, row: int, most: int) -> int:
+        """Send at most so many units from a row along the shortest path to a column that needs more; return how many.
+
+        The path takes units away from arcs of the plan that it passes backwards.
+        """
+        column, forward, backward = self._shortest_path(row)
+        units = min([most, int(self.left[column]), *(int(self.plan[arc]) for arc in backward)])
+        for arc in forward:
+            self.plan[arc] += units
+        for arc in backward:
+            self.plan[arc] -= units
+        self.left[column] -= units
+        return units
+
+    def _shortest_path(self, source: int) -> tuple[int, Arcs, Arcs]:
+        """Return the nearest column that needs more, and the arcs of the path to it, forward and backward."""
+        rows, columns = self.reduced.shape
+        distance, came_from = self.reduced[source].copy(), np.full(columns, source)
+        row_distance, came_by = np.full(rows, np.inf), np.zeros(rows, dtype=np.int64)
+        row_distance[source] = 0.0
+        ahead, done = distance.copy(), np.zeros(columns, dtype=bool)
+        while True:  # Dijkstra's algorithm
+            column = int(ahead.argmin())
+            least = distance[column]
+            ahead[column], done[column] = np.inf, True
+            if self.left[column]:
+                break
+            new = np.flatnonzero((self.plan[:, column] > 0) & (row_distance == np.inf))
+            if len(new):
+                row_distance[new], came_by[new] = least, column
+                onwards = least + self.reduced[new]
+                best = onwards.argmin(axis=0)
+                through = onwards[best, self.columns]
+                shorter = through < distance  # never a column that is done
+                distance[shorter] = ahead[shorter] = through[shorter]
+                came_from[shorter] = new[best[shorter]]
+        self._reduce(least - row_distance, np.where(done, least - distance, 0.0))
+        return column, *_arcs(source, column, came_from, came_by)
+
+    def _reduce(self, of_rows: Floats, of_columns: Floats) -> None:
+        """Change the potentials, so that the shortest path has reduced costs of 0."""
+        self.reduced -= of_rows.clip(min=0.0)[:, None]  # of rows that were not reached it is -inf
+        self.reduced += of_columns
+        self.reduced.clip(min=0.0, out=self.reduced)  # rounding
+
+
+def _arcs(source: int, column: int, came_from: Ints, came_by: Ints) -> tuple[Arcs, Arcs]:
+    """Trace a path back from its last column to its first row."""
+    row = int(came_from[column])
+    forward, backward = [(row, column)], []
+    while row != source:
+        column = int(came_by[row])
+        backward.append((row, column))
+        row = int(came_from[column])
+        forward.append((row, column))
+    return forward, backward
