@@ -12,6 +12,7 @@ import io
 import os
 import random
 import shutil
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stdout
@@ -49,7 +50,7 @@ State = dict[str, bytes | None]
 
 
 class Disk:
-    """Watches a folder, and keeps the states in which the disk may have it if the machine stops.
+    """Watches what one thread does in a folder, and keeps the states that the disk may have if the machine stops.
 
     Args:
         root: the folder; what is in it counts as synced.
@@ -60,7 +61,7 @@ class Disk:
         self.files: dict[int, bytes] = {}  # by number, as synced
         self.folders: dict[int, dict[str, int]] = {}  # by number, as synced: names, and the numbers they stand for
         self._pins: dict[int, int] = {}  # open files, so that no number is given again
-        self._busy = False
+        self._busy, self._thread = False, threading.get_ident()  # a sweep looks at its cells in another one
         for number in self._found():
             self._sync(number)
 
@@ -73,7 +74,7 @@ class Disk:
 
     def _watched(self, act: Callable[..., Any], name: str) -> Callable[..., Any]:
         def watched(*arguments: Any, **how: Any) -> Any:
-            if self._busy or (name == "open" and not self._is_ours(arguments[0])):
+            if self._busy or threading.get_ident() != self._thread or not self._is_ours(name, arguments[0]):
                 return act(*arguments, **how)
             self._quietly(self._keep, f"before {name}")
             done = act(*arguments, **how)
@@ -84,8 +85,8 @@ class Disk:
 
         return watched
 
-    def _is_ours(self, path: Any) -> bool:
-        return isinstance(path, (str, Path)) and os.path.abspath(path).startswith(f"{self.root}/")
+    def _is_ours(self, name: str, path: Any) -> bool:
+        return name != "open" or (isinstance(path, (str, Path)) and os.path.abspath(path).startswith(f"{self.root}/"))
 
     def _quietly(self, act: Callable[[Any], None], argument: Any) -> None:
         self._busy = True
