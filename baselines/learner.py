@@ -145,7 +145,7 @@ class Learner(nn.Module):
 
     def reset_parameters(self) -> None:
         """Draw all weights again as at construction; layers need ``reset_parameters``."""
-        self.policy.apply(_reset)
+        self.policy.apply(reset_layer)
 
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
@@ -199,8 +199,8 @@ class Learner(nn.Module):
         self.optimiser.load_state_dict(state["optimiser"])
 
 
-def _reset(module: nn.Module) -> None:
-    """Draw the weights of a layer as PyTorch does at its construction."""
+def reset_layer(module: nn.Module) -> None:
+    """Draw the weights of a layer, if it has any, as PyTorch does at its construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]
 

@@ -177,12 +177,18 @@ class PolicyGradient(Learner):
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
     ) -> dict[str, Tensor]:
         """Return inputs, actions, advantages and value targets; each argument is [num_envs, num_steps, 1]."""
-        given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
-        advantage, target = vec_generalized_advantage_estimate(self.gamma, self.gae_lambda, *given)
+        advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.normalize_advantage:
             advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
         keys = (*self.trunk.in_keys, "action", "action_log_prob")
         return {key: batch[key] for key in keys} | {"advantage": advantage, "value_target": target}
+
+    def advantages(
+        self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the advantages and the critic's targets; each argument and result is [num_envs, num_steps, 1]."""
+        given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
+        return vec_generalized_advantage_estimate(self.gamma, self.gae_lambda, *given)
 
     def _next_values(self, batch: TensorDictBase) -> Tensor:
         """Compute the value after each step: the next step's own, or that of another forward pass where there is none.

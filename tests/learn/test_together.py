@@ -27,6 +27,7 @@ AGENTS = {
     "reinforce": [],
     "ppo": MINIBATCHES,
     "ppo_count": [*MINIBATCHES, "agent.num_hash_bits=6"],
+    "ppo_rnd": MINIBATCHES,
     "ppo_published": MINIBATCHES,
     "dqn": REPLAY,
     "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],

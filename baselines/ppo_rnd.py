@@ -1,0 +1,242 @@
+"""PPO with a bonus for observations that a network has not yet learned to predict, for exploration.
+
+Random network distillation, Burda et al. 2019 (arXiv 1810.12894): a predictor g learns the outputs of a fixed random
+network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2, which falls as o' is seen more often,
+divided by the standard deviation of its discounted returns. The bonus has a critic and a discount factor of its own,
+and its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
+
+Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Three things differ from
+the paper: predictor and random network have the same shape, the critic of the bonus shares no layer with the policy, so
+that lifelong-learning methods act on the policy alone, and each announced task starts with a new predictor, critic of
+the bonus and statistics.
+
+Beside PPO's own, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each of
+the random network, 16 for each pixel and 4 for each environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+from baselines.learner import reset_layer
+from baselines.networks import Data, critic, encoder
+from baselines.optimisers import make_optimiser
+from baselines.ppo import PPO
+from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, require_memory
+
+LARGEST_INPUT = 5.0
+"""Standard deviations from the mean to which observations are limited."""
+
+
+class Moments(nn.Module):
+    """Mean and variance of all rows seen so far, in float64.
+
+    Args:
+        size: numbers in a row.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("variance", torch.zeros(size, dtype=torch.float64))
+
+    def reset(self) -> None:
+        """Forget all rows."""
+        for buffer in self.buffers():
+            buffer.zero_()
+
+    def update(self, rows: Tensor) -> None:
+        """Add rows, [n, size], by the formula of Chan et al. 1979 for two sets."""
+        rows = rows.to(self.mean.dtype)
+        share = len(rows) / (self.count + len(rows))
+        change = rows.mean(dim=0) - self.mean
+        within = self.variance.lerp(rows.var(dim=0, correction=0), share)
+        self.variance.copy_(within + change.square() * share * (1 - share))
+        self.mean.add_(change * share)
+        self.count.add_(len(rows))
+
+
+class Novelty(nn.Module):
+    """The fixed random network, its predictor, and the statistics that scale observations and bonuses.
+
+    Args:
+        num_inputs: numbers in an observation.
+        hidden_size: width of the hidden layer of both networks.
+        num_features: outputs of both networks.
+        high: largest value of an observation.
+        num_envs: environments, each with a discounted return of bonuses.
+        gamma: discount factor of these returns.
+    """
+
+    returns: Tensor
+
+    def __init__(
+        self, num_inputs: int, hidden_size: int, num_features: int, high: float, num_envs: int, gamma: float
+    ) -> None:
+        super().__init__()
+        self.num_inputs, self.scale, self.gamma = num_inputs, 1 / high, gamma
+        self.target, self.predictor = (
+            nn.Sequential(nn.Linear(num_inputs, hidden_size), nn.ReLU(), nn.Linear(hidden_size, num_features))
+            for _ in range(2)
+        )
+        self.target.requires_grad_(False)
+        self.of_observations, self.of_returns = Moments(num_inputs), Moments(1)
+        self.register_buffer("returns", torch.zeros(num_envs))
+
+    def reset(self) -> None:
+        """Draw a new predictor, and reset the statistics."""
+        self.predictor.apply(reset_layer)
+        self.of_observations.reset()
+        self.of_returns.reset()
+        self.returns.zero_()
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Compute the predictor's error at uint8 observations, float32 [n]: the mean square over features."""
+        moments = self.of_observations
+        inputs = (self._flat(observations) - moments.mean.float()) * (moments.variance + 1e-6).rsqrt().float()
+        inputs = inputs.clamp(-LARGEST_INPUT, LARGEST_INPUT)
+        return (self.predictor(inputs) - self.target(inputs)).square().mean(dim=-1)
+
+    @torch.no_grad()
+    def bonus(self, observations: Tensor) -> Tensor:
+        """Return the bonus for the observations of a batch, [num_envs, num_steps, ...]: float32 [num_envs, num_steps].
+
+        The statistics are those up to and with this batch.
+        """
+        self.of_observations.update(self._flat(observations))
+        errors = self(observations).view(observations.shape[:2])
+        discounted = []
+        for error in errors.unbind(dim=1):
+            self.returns.mul_(self.gamma).add_(error)
+            discounted.append(self.returns.clone())
+        self.of_returns.update(torch.cat(discounted).unsqueeze(-1))
+        return errors / (self.of_returns.variance.sqrt().float() + 1e-8)
+
+    def _flat(self, observations: Tensor) -> Tensor:
+        return observations.reshape(-1, self.num_inputs).float() * self.scale
+
+
+class PPORND(PPO):
+    """PPO with random network distillation.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        bonus_coeff: weight of the advantages of the bonus.
+        bonus_gamma: discount factor of the bonus.
+        num_features: outputs of the random network and of its predictor, whose hidden layer is ``hidden_size`` wide.
+        bonus_learning_rate: of Adam for the predictor and the critic of the bonus.
+        predictor_share: share of each minibatch that the predictor learns from, at least one frame.
+        settings: the arguments of `PPO`.
+    """
+
+    solves = "fully observable tasks (CT-FO) whose goal random actions almost never reach"
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        bonus_coeff: float,
+        bonus_gamma: float,
+        num_features: int,
+        bonus_learning_rate: float,
+        predictor_share: float,
+        **settings: Any,
+    ) -> None:
+        require(
+            *not_negative(bonus_coeff=bonus_coeff),
+            *positive(
+                bonus_gamma=bonus_gamma, bonus_learning_rate=bonus_learning_rate, predictor_share=predictor_share
+            ),
+            *fraction(bonus_gamma=bonus_gamma, predictor_share=predictor_share),
+            *at_least_one(num_features=num_features),
+        )
+        super().__init__(observation_spec, action_spec, **settings)
+        spec, width = observation_spec["observation"], settings["hidden_size"]
+        size = width * (spec.shape.numel() + num_features)
+        require_memory(f"weights of num_features={num_features}", 20 * size, "or smaller layers")
+        self.bonus_coeff, self.bonus_gamma, self.predictor_share = bonus_coeff, bonus_gamma, predictor_share
+        high = spec.space.high.max().item()
+        shape = (spec.shape.numel(), width, num_features)
+        self.novelty = Novelty(*shape, high=high, num_envs=self.num_envs, gamma=bonus_gamma)
+        self.bonus_critic = TensorDictSequential(
+            encoder(observation_spec, width, settings["num_layers"]), critic("features", width)
+        )
+        self.bonus_learning_rate = bonus_learning_rate
+        self._make_bonus_optimiser()
+
+    def _make_bonus_optimiser(self) -> None:
+        learned = [*self.novelty.predictor.parameters(), *self.bonus_critic.parameters()]
+        self.bonus_optimiser = make_optimiser("adam", learned, self.bonus_learning_rate)
+
+    def start_task(self, task: int | None = None) -> None:
+        """Draw a new predictor and a new critic of the bonus, and reset their optimiser and all statistics."""
+        self.novelty.reset()
+        self.bonus_critic.apply(reset_layer)
+        self._make_bonus_optimiser()
+
+    def bonus_values(self, data: Data) -> Tensor:
+        """Compute the values of the bonus at any number of steps, [..., 1]."""
+        features, head = self.bonus_critic
+        return head.module(features.over_time(data))
+
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Yield the minibatches of all epochs; predictor and critic of the bonus learn from each before PPO does."""
+        for minibatch in super().minibatches(batch):
+            self._bonus_step(minibatch, minibatch.pop("next_observation"), minibatch.pop("bonus_target"))
+            yield minibatch
+
+    def _bonus_step(self, minibatch: Data, observations: Tensor, target: Tensor) -> None:
+        """Take a gradient step of the bonus's critic on a minibatch, and of the predictor on part of it."""
+        used = max(1, round(self.predictor_share * len(observations)))  # the frames are shuffled
+        error = (self.bonus_values(minibatch) - target).square().mean()
+        self.bonus_optimiser.zero_grad()
+        (error + self.novelty(observations[:used]).mean()).backward()
+        self.bonus_optimiser.step()
+
+    @torch.no_grad()
+    def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Add the observations that the predictor learns from, and the targets of the bonus's critic."""
+        advantage, target = self.bonus_advantages(batch)
+        given = super()._with_advantage(batch.copy().set("bonus_advantage", advantage))
+        return given | {"bonus_target": target, "next_observation": batch["next", "observation"]}
+
+    def advantages(self, batch: TensorDictBase, *given: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the advantages, the sum of the reward's and the weighted bonus's, and the critic's targets."""
+        advantage, target = super().advantages(batch, *given)
+        return advantage + self.bonus_coeff * batch["bonus_advantage"], target
+
+    def bonus_advantages(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Compute the bonus's advantages and the targets of its critic, [num_envs, num_steps, 1] each.
+
+        After the last step of an episode follows the first one of the next, whose value counts.
+        """
+        bonus = self.novelty.bonus(batch["next", "observation"]).unsqueeze(-1)
+        values = self.bonus_values(batch)
+        last = {key: batch["next", key][:, -1:] for key in self.trunk.in_keys}
+        following = torch.cat([values[:, 1:], self.bonus_values(last)], dim=1)
+        never = torch.zeros_like(batch["next", "done"])
+        given = (values, following, bonus, never, never)
+        return vec_generalized_advantage_estimate(self.bonus_gamma, self.gae_lambda, *given)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the states of both optimisers."""
+        return {**super().get_extra_state(), "bonus_optimiser": self.bonus_optimiser.state_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self.bonus_optimiser.load_state_dict(state["bonus_optimiser"])
