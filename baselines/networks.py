@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torch.nn.utils.rnn import PackedSequence
+from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import LSTMModule, ProbabilisticActor, ValueOperator
+from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
+from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, reset
 from ctgraph_rl.checks import require_memory
+from ctgraph_rl.learn.collect import UNSTORED
 
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
-
-STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")
-"""The keys of a recurrent policy's state."""
 
 
 class Encoder(nn.Module):
@@ -63,45 +62,91 @@ class EncoderModule(TensorDictModule):
         return self.module(*(data[key] for key in self.in_keys))
 
 
-class RecurrentModule(TensorDictSequential):
-    """An encoder with an `LSTMModule` behind it; writes ``memory``, and its state under `STATE_KEYS`.
+class RecurrentModule(TensorDictModuleBase):
+    """An encoder with a cell behind it; writes ``memory``, and the cell's state under the cell's keys.
 
-    `act` and `over_time` are TorchRL's sequential and recurrent mode in plain tensors.
+    `act` is one step of all rows, `over_time` all steps of sequences.
+
+    Args:
+        encoder: writes the features that the cell reads.
+        cell: what remembers.
     """
+
+    def __init__(self, encoder: EncoderModule, cell: Cell) -> None:
+        super().__init__()
+        self.module = nn.ModuleList([encoder, cell])
+        self.state_keys, self.own_keys = cell.state_keys, cell.own_keys
+        self.in_keys = [*encoder.in_keys, *self.state_keys, "is_init", *self.own_keys]
+        self.out_keys = ["memory", *(("next", key) for key in self.state_keys)]
+
+    @property
+    def encoder(self) -> EncoderModule:
+        """What writes the features."""
+        return cast(EncoderModule, self.module[0])
+
+    @property
+    def cell(self) -> Cell:
+        """What remembers."""
+        return cast(Cell, self.module[1])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``memory`` and the next state of a step; in TorchRL's ``recurrent_mode``, ``memory`` of sequences."""
+        return tensordict.update({"memory": self.over_time(tensordict)} if recurrent_mode() else self.act(tensordict))
 
     def act(self, data: Data) -> dict[Any, Tensor]:
         """Compute ``memory`` and the next state for one step of all rows."""
-        encoder, lstm = self.module[0], self.module[1].lstm
-        fresh = data["is_init"].unsqueeze(-1)
-        state = (torch.where(fresh, 0.0, data[key]).transpose(0, 1).contiguous() for key in STATE_KEYS)
-        memory, state = lstm(encoder.over_time(data).unsqueeze(1), tuple(state))
-        following = {("next", key): value.transpose(0, 1) for key, value in zip(STATE_KEYS, state, strict=True)}
-        return {"memory": memory.squeeze(1), **following}
+        encoder, cell = self.encoder, self.cell
+        state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
+        memory, state = cell.step(joined(encoder.over_time(data), *self._own(data)), state)
+        return {"memory": memory, **{("next", key): value for key, value in zip(self.state_keys, state, strict=True)}}
 
     def over_time(self, data: Data) -> Tensor:
-        """Compute ``memory`` at all steps of [rows, steps], from the stored initial state; reset at ``is_init``.
+        """Compute ``memory`` at all steps of [rows, steps], from the state at the first; reset at ``is_init``.
 
-        Each segment between two resets is a sequence of its own, and the LSTM runs over all of them at once. Features
-        are computed once for frames with the same inputs.
+        Features are computed once for frames with the same inputs.
         """
-        encoder, lstm = self.module[0], self.module[1].lstm
-        inputs = [data[key].flatten(0, 1) for key in encoder.in_keys]
-        examples, groups = distinct(inputs)
-        features = encoder.module(*(value.index_select(0, examples) for value in inputs))
-        starts = data["is_init"].squeeze(-1).clone()
-        if not starts[:, 1:].any():
-            state = (data[key][:, 0].transpose(0, 1).contiguous() for key in STATE_KEYS)
-            return lstm(features.index_select(0, groups).unflatten(0, starts.shape), tuple(state))[0]
-        starts[:, 0] = True
-        first = starts.flatten().nonzero().squeeze(-1)
-        lengths, order = first.diff(append=first.new_tensor([starts.numel()])).sort(descending=True)
-        first, time = first[order], torch.arange(int(lengths[0]), device=first.device).unsqueeze(-1)
-        within = time < lengths
-        places = (first + time)[within]
-        state = (data[key].flatten(0, 1)[first].transpose(0, 1).contiguous() for key in STATE_KEYS)
-        memory = packed_lstm(lstm, features, groups[places], within.sum(dim=1).cpu(), *state)
-        back = torch.empty_like(places).scatter_(0, places, torch.arange(len(places), device=places.device))
-        return memory.index_select(0, back).unflatten(0, starts.shape)
+        encoder, cell = self.encoder, self.cell
+        starts, own = data["is_init"].squeeze(-1), [value.flatten(0, 1) for value in self._own(data)]
+        seen = [data[key].flatten(0, 1) for key in encoder.in_keys]
+        examples, groups = distinct([*seen, *own])
+        seen, own = ([value.index_select(0, examples) for value in values] for values in (seen, own))
+        inputs = joined(encoder.module(*seen), *own)
+        state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
+        return cell.sequence(inputs, groups.view_as(starts), starts, state)
+
+    def zero_state(self, num_envs: int) -> TensorDict:
+        """Return the state before the first step: the cell's zeros, and no last action or reward."""
+        state = dict(zip(self.state_keys, self.cell.zeros(num_envs), strict=True))
+        device = next(self.parameters()).device
+        zeros = {PREVIOUS_ACTION: torch.zeros(num_envs, dtype=torch.int64), REWARD: torch.zeros(num_envs, 1)}
+        return TensorDict(state | {key: zeros[key].to(device) for key in self.own_keys}, batch_size=[num_envs])
+
+    def _own(self, data: Data) -> list[Tensor]:
+        """Return the last action, one-hot, and the last reward, as far as the cell reads them; 0 at ``is_init``."""
+        if not self.own_keys:
+            return []
+        return [own_input(key, data[key], self.cell.num_actions) * ~data["is_init"] for key in self.own_keys]
+
+
+def joined(features: Tensor, *others: Tensor) -> Tensor:
+    """Concatenate features with further inputs, [..., n] each."""
+    return torch.cat([features, *others], dim=-1) if others else features
+
+
+def own_input(key: str, value: Tensor, num_actions: int) -> Tensor:
+    """Return an agent's last action or reward as an input, float32 [..., n]."""
+    return one_hot(value, num_actions).float() if key == PREVIOUS_ACTION else value
+
+
+def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
+    """Return what a policy ends with if its trunk reads the last action: a module that copies ``action`` for it."""
+    copy = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", PREVIOUS_ACTION)])
+    return [copy] * (PREVIOUS_ACTION in keys)
+
+
+def sequences_of(batch: Data, keys: Sequence[str]) -> dict[str, Tensor]:
+    """Return inputs of a batch, [rows, steps, ...] each; of states that are not stored for each step the first one."""
+    return {key: batch[key][:, :1] if key.startswith(UNSTORED) else batch[key] for key in keys}
 
 
 def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -125,36 +170,6 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     same = examples[groups]
     differ = any((value != value.index_select(0, same)).any() for value in flat)  # despite equal sums
     return (frames, frames) if differ else (examples, groups)
-
-
-def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, h: Tensor, c: Tensor) -> Tensor:
-    """Run an LSTM of one layer over packed sequences, with one product of features and weights for each group.
-
-    PyTorch's own backward pass writes a tensor of all frames at each step.
-
-    Args:
-        lstm: the LSTM.
-        features: of each group, [num_groups, num_features].
-        groups: of each frame in packed order, int64 [num_frames].
-        sizes: number of sequences at each step, int64 [num_steps] on the CPU.
-        h: the initial hidden states of the sequences, [1, num_sequences, hidden_size].
-        c: the initial cell states likewise.
-
-    Returns:
-        The hidden states at all frames in packed order, [num_frames, hidden_size].
-    """
-    if features.is_cuda:
-        return lstm(PackedSequence(features.index_select(0, groups), sizes), (h, c))[0].data
-    of_features, of_h, bias, other_bias = lstm.all_weights[0]
-    given = nn.functional.linear(features, of_features, bias + other_bias)
-    h, c, memory = h[0], c[0], []
-    for step in given.index_select(0, groups).split(sizes.tolist()):
-        left = len(step)
-        i, f, g, o = torch.addmm(step, h[:left], of_h.t()).chunk(4, dim=1)
-        c = torch.addcmul(f.sigmoid() * c[:left], i.sigmoid(), g.tanh())
-        h = o.sigmoid() * c.tanh()
-        memory.append(h)
-    return torch.cat(memory)
 
 
 def require_weights(
@@ -187,17 +202,17 @@ def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1,
     return EncoderModule(module, in_keys=["observation", *extra], out_keys=["features"])
 
 
-def recurrent(observation_spec: Composite, num_features: int, num_layers: int, **extra: int) -> RecurrentModule:
-    """Build an `encoder` with an LSTM of the same width; it writes ``memory``, and its state under `STATE_KEYS`."""
-    lstm = LSTMModule(num_features, num_features, in_key="features", out_key="memory")
-    return RecurrentModule(encoder(observation_spec, num_features, num_layers, **extra), lstm)
-
-
-def zero_state(trunk: TensorDictSequential, num_envs: int) -> TensorDict:
-    """Return zeros, float32 [num_envs, 1, num_features], for both parts of the state of a `recurrent` trunk."""
-    lstm = trunk[-1].lstm
-    zeros = torch.zeros(num_envs, lstm.num_layers, lstm.hidden_size, device=lstm.weight_hh_l0.device)
-    return TensorDict({key: zeros.clone() for key in STATE_KEYS}, batch_size=[num_envs])
+def recurrent(
+    observation_spec: Composite,
+    num_features: int,
+    num_layers: int,
+    num_actions: int,
+    make_cell: MakeCell,
+    **extra: int,
+) -> RecurrentModule:
+    """Build an `encoder` with a cell of the same width; it writes ``memory``, and its state under the cell's keys."""
+    cell = make_cell(num_features, num_features, num_actions)  # first, as the order decides the weights of a seed
+    return RecurrentModule(encoder(observation_spec, num_features, num_layers, **extra), cell)
 
 
 def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> TensorDictModule:

@@ -12,12 +12,14 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
+from baselines.cells.cell import MakeCell
+from baselines.cells.lstm import LSTM
 from baselines.learner import Learner
 from baselines.networks import (
-    STATE_KEYS,
     ActorCritic,
     Data,
     actor,
+    copied_action,
     critic,
     encoder,
     entropy,
@@ -25,7 +27,7 @@ from baselines.networks import (
     make_orthogonal,
     recurrent,
     require_weights,
-    zero_state,
+    sequences_of,
 )
 from baselines.optimisers import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
@@ -40,7 +42,7 @@ ACTED_KEYS = ("action", "action_log_prob", "state_value")
 
 
 class PolicyGradient(Learner):
-    """An actor and a critic on one trunk, which ends in an LSTM if the class has ``memory``.
+    """An actor and a critic on one trunk, which ends in a cell if the class has ``memory``.
 
     A class that derives from it defines the loss, and passes on all arguments that are not its own. With memory,
     minibatches are whole rows of a batch, so the trunk sees sequences in order, and its state is reset wherever
@@ -52,7 +54,7 @@ class PolicyGradient(Learner):
         num_envs: environments that it learns from.
         num_steps: steps of each environment in a batch.
         hidden_size: width of all layers.
-        num_layers: layers before the heads, or before the LSTM.
+        num_layers: layers before the heads, or before the cell.
         optimiser: ``adam`` or ``rmsprop``.
         learning_rate: of the optimiser.
         gamma: discount factor.
@@ -63,6 +65,7 @@ class PolicyGradient(Learner):
         compile: run gradient steps through ``torch.compile``; only without memory.
         orthogonal_init: initialise linear layers with orthogonal weights, those of the heads a thousand times smaller,
             and biases of 0, as in the code of Ben-Iwhiwhu et al. 2023; False: as PyTorch does.
+        cell: what remembers, a class of `baselines.cells` or a partial of one; None: an LSTM. Only with memory.
     """
 
     num_epochs = num_minibatches = 1
@@ -85,6 +88,7 @@ class PolicyGradient(Learner):
         gae_lambda: float = 1.0,
         compile: bool = False,
         orthogonal_init: bool = False,
+        cell: MakeCell | None = None,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
         require(
@@ -98,6 +102,9 @@ class PolicyGradient(Learner):
         decay = gamma * gae_lambda
         rule = f"gamma * gae_lambda must be >= {SMALLEST_DECAY:g}, got {gamma!r} * {gae_lambda!r} = {decay:g}"
         require((decay >= SMALLEST_DECAY, f"{rule}; use a larger gae_lambda"))
+        no_cell = f"{type(self).__name__} has no memory and takes no cell: use agent=lstm_ppo, or leave the cell out"
+        require((self.memory or cell is None, no_cell))
+        self.cell = LSTM if cell is None else cell
         require_weights(observation_spec, hidden_size, num_layers, action_spec.space.n + 1, self.memory)
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
@@ -106,8 +113,10 @@ class PolicyGradient(Learner):
         self.critic = critic(self.features, hidden_size)
         self.orthogonal_init = orthogonal_init
         self._make_orthogonal()
-        state = [("next", key) for key in STATE_KEYS if self.memory]
-        self.policy = ActorCritic(self.trunk, self.actor, self.critic, selected_out_keys=[*ACTED_KEYS, *state])
+        state = [key for key in self.trunk.out_keys if key != self.features]
+        copied = copied_action(self.trunk.in_keys)
+        keys = [*ACTED_KEYS, *state, *(key for module in copied for key in module.out_keys)]
+        self.policy = ActorCritic(self.trunk, self.actor, self.critic, *copied, selected_out_keys=keys)
         self.optimiser = make_optimiser(optimiser, self.parameters(), learning_rate)
 
     @property
@@ -118,13 +127,14 @@ class PolicyGradient(Learner):
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
     ) -> TensorDictModuleBase:
-        """Build the layers before the heads, which with memory end in an LSTM."""
-        make = recurrent if self.memory else encoder
-        return make(observation_spec, hidden_size, num_layers)
+        """Build the layers before the heads, which with memory end in a cell."""
+        if not self.memory:
+            return encoder(observation_spec, hidden_size, num_layers)
+        return recurrent(observation_spec, hidden_size, num_layers, action_spec.space.n, self.cell)
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return zeros for the LSTM's state; an empty state without memory."""
-        return zero_state(self.trunk, num_envs) if self.memory else super().initial_state(num_envs)
+        """Return zeros for the cell's state; an empty state without memory."""
+        return self.trunk.zero_state(num_envs) if self.memory else super().initial_state(num_envs)
 
     def reset_parameters(self) -> None:
         """See `Learner`."""
@@ -180,8 +190,8 @@ class PolicyGradient(Learner):
         advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.normalize_advantage:
             advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
-        keys = (*self.trunk.in_keys, "action", "action_log_prob")
-        return {key: batch[key] for key in keys} | {"advantage": advantage, "value_target": target}
+        inputs = sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"])
+        return inputs | {"advantage": advantage, "value_target": target}
 
     def advantages(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
 from torchrl.data.postprocs import MultiStep
@@ -48,14 +48,16 @@ class EpsilonGreedy(TensorDictSequential):
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action`` and the trunk's next state."""
-        greedy, exploration = self.module
+        greedy, exploration, *others = self.module
         trunk, head = greedy.module[0].module
         written = trunk.act(tensordict)
         values = head.module(written.pop(head.in_keys[0]))
         written["action"] = (values[0] if isinstance(values, tuple) else values).argmax(dim=-1)
         for key, value in written.items():
             tensordict.set(key, value)
-        return exploration(tensordict)
+        for module in (exploration, *others):
+            module(tensordict)
+        return tensordict
 
 
 class QLearner(Learner):
@@ -135,6 +137,7 @@ class QLearner(Learner):
         action_spec: TensorSpec,
         learning_rate: float,
         *state: Any,
+        copied: Sequence[TensorDictModule] = (),
     ) -> None:
         """Set the network that acts and learns, its target network and the exploration.
 
@@ -144,9 +147,11 @@ class QLearner(Learner):
             action_spec: the actions that exploration draws from.
             learning_rate: of Adam.
             state: keys under which the network writes its recurrent state.
+            copied: what `copied_action` returns for the network.
         """
         self.exploration = EGreedyModule(action_spec, *self.eps_range, self.annealing_batches)
-        self.policy = EpsilonGreedy(greedy, self.exploration, selected_out_keys=["action", *state])
+        keys = ["action", *state, *(key for module in copied for key in module.out_keys)]
+        self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
         self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
 

@@ -1,6 +1,6 @@
-"""The base class of recurrent Q-learning agents: an LSTM, replayed sequences with stored states, double targets.
+"""The base class of recurrent Q-learning agents: a cell, replayed sequences with stored states, double targets.
 
-Sequences are the rows of the batches as they were collected, with the stored state of the LSTM at their first step
+Sequences are the rows of the batches as they were collected, with the stored state of the cell at their first step
 (Kapturowski et al. 2019, R2D2); the state is reset where ``is_init`` is set. One more step is kept after the last
 one, to bootstrap from.
 """
@@ -17,9 +17,12 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
 from torchrl.objectives.common import LossModule
 
-from baselines.networks import STATE_KEYS, Data, recurrent, require_weights, zero_state
+from baselines.cells.cell import MakeCell
+from baselines.cells.lstm import LSTM
+from baselines.networks import Data, copied_action, recurrent, require_weights
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
+from ctgraph_rl.learn.collect import UNSTORED
 
 
 class Quantiles(nn.Module):
@@ -87,13 +90,14 @@ def of_action(quantiles: Tensor, action: Tensor) -> Tensor:
 
 
 class RecurrentQ(QLearner):
-    """Q-learning with an LSTM; classes that derive from it define the distance of predictions from targets.
+    """Q-learning with a cell; classes that derive from it define the distance of predictions from targets.
 
     Args:
         observation_spec: the environment's ``observation_spec_unbatched``.
         action_spec: the environment's ``action_spec_unbatched``.
-        hidden_size: width of features and LSTM.
+        hidden_size: width of features and cell.
         learning_rate: of Adam.
+        cell: what remembers, a class of `baselines.cells` or a partial of one.
         settings: the arguments of `QLearner`; batches are sequences of ``num_steps`` steps.
     """
 
@@ -106,6 +110,7 @@ class RecurrentQ(QLearner):
         action_spec: TensorSpec,
         hidden_size: int,
         learning_rate: float,
+        cell: MakeCell = LSTM,
         **settings: Any,
     ) -> None:
         num_steps, buffer_size = settings["num_steps"], settings["buffer_size"]
@@ -120,15 +125,18 @@ class RecurrentQ(QLearner):
         pairs = num_steps * self.num_quantiles**2
         require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
-        self.trunk = recurrent(observation_spec, hidden_size, 1)
+        self.trunk = recurrent(observation_spec, hidden_size, 1, action_spec.space.n, cell)
+        unstored = [key for key in self.trunk.state_keys if key.startswith(UNSTORED)]
+        message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {unstored}"
+        require((not unstored, f"{message}: use agent=lstm_ppo"))
         head = Quantiles(hidden_size, action_spec.space.n, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         self.greedy = QValueActor(
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
         )
         self.targets = RecurrentTargets(self.greedy)
-        state = (("next", key) for key in STATE_KEYS)
-        self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state)
+        state, copied = self.trunk.out_keys[1:], copied_action(self.trunk.in_keys)
+        self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state, copied=copied)
 
     def values(self, data: Data) -> Tensor:
         """Compute the means of the online network's quantiles."""
@@ -140,8 +148,8 @@ class RecurrentQ(QLearner):
         return num_steps // self.num_steps
 
     def initial_state(self, num_envs: int) -> TensorDict:
-        """Return zeros for the LSTM's state."""
-        return zero_state(self.trunk, num_envs)
+        """Return zeros for the cell's state."""
+        return self.trunk.zero_state(num_envs)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a sequence of ``num_steps + 1`` steps per row; ``learnt`` is False where there is nothing to learn.

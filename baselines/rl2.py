@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import STATE_KEYS, ActorCritic, Data, RecurrentModule, recurrent, zero_state
+from baselines.networks import Data, RecurrentModule, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 
@@ -40,7 +40,7 @@ class TrialTrunk(TensorDictModuleBase):
         super().__init__()
         self.trunk, self.num_actions, self.trial_episodes = trunk, num_actions, trial_episodes
         self.in_keys = [*(key for key in trunk.in_keys if key != "previous"), *OWN_KEYS]
-        self.out_keys = ["memory", ("next", "trial"), *(("next", key) for key in STATE_KEYS)]
+        self.out_keys = [*trunk.out_keys, ("next", "trial")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``memory``, the LSTM's next state and the number of the episode in its trial, from 1."""
@@ -60,8 +60,6 @@ class TrialTrunk(TensorDictModuleBase):
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
         inputs = {key: data[key] for key in self.trunk.in_keys if key != "previous"}
-        for key in STATE_KEYS:
-            inputs[key] = torch.where(fresh.unsqueeze(-1), 0.0, inputs[key])
         action = one_hot(data["previous_action"], self.num_actions)
         previous = torch.cat([action, data["reward"]], dim=-1)
         return inputs | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode
@@ -86,16 +84,15 @@ class RL2(PPO):
         require(*at_least_one(trial_episodes=trial_episodes))
         self.trial_episodes = trial_episodes
         super().__init__(observation_spec, action_spec, **settings)
-        keys = [*self.policy.out_keys, ("next", "trial"), ("next", "previous_action")]
-        copied = TensorDictModule(nn.Identity(), in_keys=["action"], out_keys=[("next", "previous_action")])
-        self.policy = ActorCritic(self.trunk, self.actor, self.critic, copied, selected_out_keys=keys)
 
     def make_trunk(
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
     ) -> TrialTrunk:
         """Build a recurrent trunk that also reads the last action and reward."""
         num_actions = action_spec.space.n
-        trunk = recurrent(observation_spec, hidden_size, num_layers, previous=num_actions + 1)
+        trunk = recurrent(observation_spec, hidden_size, num_layers, num_actions, self.cell, previous=num_actions + 1)
+        message = "reads_action and reads_reward must be false, as RL2 reads its last action and reward itself"
+        require((not trunk.own_keys, message))
         return TrialTrunk(trunk, num_actions, self.trial_episodes)
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -104,8 +101,7 @@ class RL2(PPO):
         The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step; the
         trunk resets it.
         """
-        state = zero_state(self.trunk.trunk, num_envs)
-        device = state[STATE_KEYS[0]].device
+        state, device = self.trunk.trunk.zero_state(num_envs), next(self.parameters()).device
         state["trial"] = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
         state["previous_action"] = torch.zeros(num_envs, dtype=torch.int64, device=device)
         return state.set("reward", torch.zeros(num_envs, 1, device=device))

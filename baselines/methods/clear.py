@@ -16,7 +16,7 @@ from torch import Tensor
 from baselines.learner import Learner
 from baselines.methods.method import Method
 from baselines.methods.weights import Weights
-from baselines.networks import Data
+from baselines.networks import Data, sequences_of
 from ctgraph_rl.checks import at_least_one, not_negative, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -103,7 +103,8 @@ class CLEAR(Method):
         agent = self.agent
         if agent.memory and batch.shape[1] != agent.num_steps:
             return
-        inputs = {key: batch[key] for key in agent.policy.in_keys if key in batch.keys()}  # noqa: SIM118, rows otherwise
+        keys = [key for key in agent.policy.in_keys if key in batch.keys()]  # noqa: SIM118, rows otherwise
+        inputs = sequences_of(batch, keys)
         outputs = agent.outputs(inputs)
         items = {**inputs, **{key: outputs[key] for key in agent.output_keys}}
         self.reservoir.offer(items if agent.memory else {key: value.flatten(0, 1) for key, value in items.items()})

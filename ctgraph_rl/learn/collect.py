@@ -26,6 +26,10 @@ InitialState = Callable[[int], TensorDict]
 TRIAL = "trial"
 """A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
 
+UNSTORED = "unstored_"
+"""A recurrent state under a key with this beginning is carried from step to step, and a batch does not hold it for each
+of them: all steps of the batch show its value before the first one, and, after each step, that after the last one."""
+
 Step = dict[Any, Tensor]
 """What was seen, done and written in a step of all rows, and under keys ``("next", key)`` what came after it."""
 
@@ -109,12 +113,13 @@ def batches(
     start = start_of_episodes(env, initial_state)
     carried = env.reset().update(start) if carried is None else carried
     steps: list[Step] = []
+    unstored = [key for key in start.keys() if key.startswith(UNSTORED)]  # noqa: SIM118, rows otherwise
     for frames in range(done, num_frames, env.numel()):
         if between_steps is not None:
             between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
             step, carried = act(env, policy, carried, start)
-        steps.append(step)
+        _append(steps, step, unstored)
         if len(steps) == num_steps or frames + env.numel() == num_frames:
             yield in_time_order(steps, env), carried
             steps = []
@@ -155,9 +160,17 @@ def take_step(env: EnvBase, data: TensorDictBase) -> tuple[Step, TensorDictBase]
     return step, TensorDict(following, env.batch_size, device=env.device)
 
 
+def _append(steps: list[Step], step: Step, unstored: Sequence[str]) -> None:
+    """Append a step to those of a batch, and drop the states that the batch does not hold for each of them."""
+    for key in unstored if steps else ():
+        del steps[-1]["next", key], step[key]
+    steps.append(step)
+
+
 def in_time_order(steps: Sequence[Step], env: EnvBase) -> TensorDict:
     """Steps as one TensorDict, [rows, steps]."""
     batch = TensorDict(batch_size=[*env.batch_size, len(steps)], device=env.device)
-    for key in steps[0]:
-        batch.set(key, torch.stack([step[key] for step in steps], dim=1))
+    for key in {**steps[0], **steps[-1]}:
+        values = torch.stack([step[key] for step in steps if key in step], dim=1)
+        batch.set(key, values.expand(-1, len(steps), *[-1] * (values.ndim - 2)))
     return batch

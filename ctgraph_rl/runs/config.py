@@ -57,6 +57,9 @@ MOST_CHOICES = 20
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
 """Configurations that come with other packages, and the extras that install these."""
 
+HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
+"""What to do about settings that only some targets take."""
+
 NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report", "together")
 """Keys of the configuration that do not change results."""
 
@@ -68,13 +71,15 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Name a run's directory: curriculum, agent, method if there is one, seed and a hash of the configuration."""
+    """Name a run's directory: curriculum, agent, cell and method if chosen, seed and a hash of the configuration."""
     return name_of(_root_, _root_.hydra.runtime.choices)
 
 
 def name_of(cfg: DictConfig, choices: Any) -> str:
     """Return the name of a configuration's run, given the chosen file of each group."""
-    learner = "-".join([choices.agent, *([choices.method] if choices.method != "finetune" else [])])
+    parts = {"cell": (None, "lstm"), "method": ("finetune",)}
+    chosen = [choices.get(group) for group, usual in parts.items() if choices.get(group) not in usual]
+    learner = "-".join([choices.agent, *chosen])
     seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere
     return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(cfg))}"
 
@@ -180,7 +185,7 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     unknown = [name for name in given if name not in choices]
     missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
     require(
-        *((False, f"{group} has no {name}: {did_you_mean(name, choices)}") for name in unknown),
+        *((False, f"{group} has no {name}: {HINTS.get(name) or did_you_mean(name, choices)}") for name in unknown),
         (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
     )
     return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")

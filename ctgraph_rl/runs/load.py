@@ -27,8 +27,12 @@ from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
 
-OURS = {"agent": re.compile(r"(baselines\.\w+)\.(\w+)"), "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)")}
-"""Names of agents and methods that a directory may name; the caller of `load` gives any other."""
+OURS = {
+    "agent": re.compile(r"(baselines\.\w+)\.(\w+)"),
+    "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)"),
+    "cell": re.compile(r"(baselines\.cells\.\w+)\.(\w+)"),
+}
+"""Names of agents, methods and cells that a directory may name; the caller of `load` gives any other."""
 
 
 @dataclass(frozen=True)
@@ -116,20 +120,23 @@ def _builder(
 ) -> MakeAgent:
     """Return what builds the agent with its method, if it has one; the curriculum is already prepared for that."""
     stored = {part: config.get(part) for part in OURS}
-    alone = _ours(run_dir, "agent", stored["agent"]) if make_agent is None else _with(make_agent, stored["agent"])
+    named = make_agent is None
+    alone = _ours(run_dir, "agent", stored["agent"]) if named else _with(run_dir, make_agent, stored["agent"])
     if make_method is not None:
-        return with_method(alone, _with(make_method, stored["method"]), curriculum)
+        return with_method(alone, _with(run_dir, make_method, stored["method"]), curriculum)
     if stored["method"] is None:
         return alone
     return with_method(alone, _ours(run_dir, "method", stored["method"]), curriculum)
 
 
-def _with(make: Callable[..., Any], stored: Any) -> Callable[..., Any]:
+def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
     """Return a class with the settings that a run stored, as far as it takes them; another function as it is."""
     if not (isinstance(make, type) and isinstance(stored, Mapping)):
         return make
     takes = parameters_of(make)
-    return partial(make, **{key: value for key, value in with_added(stored).items() if key in takes})
+    return partial(
+        make, **{key: value for key, value in _settings(run_dir, with_added(stored)).items() if key in takes}
+    )
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
@@ -142,7 +149,14 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     kind: Any = class_named(ours[1], ours[2])
     defined = kind is not None and issubclass(kind, torch.nn.Module)
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
-    return partial(kind, **{key: value for key, value in with_added(settings).items() if key != "_target_"})
+    return partial(kind, **_settings(run_dir, with_added(settings)))
+
+
+def _settings(run_dir: Path, stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a class, with what builds its cell in place of the cell's settings."""
+    given = {key: value for key, value in stored.items() if key not in ("_target_", "_partial_")}
+    has_cell = isinstance(given.get("cell"), Mapping)
+    return given | ({"cell": _ours(run_dir, "cell", given["cell"])} if has_cell else {})
 
 
 def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:

@@ -167,7 +167,7 @@ def read_run(path: Path) -> Run:
     config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
     if _called(config.get("method")) == NO_METHOD:
         del config["method"]
-    seed, agent = config.pop("seed"), _agent(config)
+    seed, agent = config.pop("seed"), _agent(as_before(config))
     settings = {**dict(flat(as_before(config))), **({"directory": str(path.resolve())} if agent is None else {})}
     try:
         log = RunLog.read(file)
@@ -213,10 +213,14 @@ def _about(file: Path) -> dict[str, Any]:
 
 
 def _agent(config: Mapping[str, Any]) -> str | None:
-    """Return the agent and its method, each by its class or by the name that the recorder of the run gave."""
-    agent = _called(config.get("agent")) or _called(config.get("learner"))
-    method = _called(config.get("method"))
-    return f"{agent} + {method}" if agent and method else agent
+    """Return the agent, its cell and its method, each by its class or by the name that the recorder of the run gave.
+
+    The cell is named if it is not the usual one.
+    """
+    learner = config.get("agent")
+    agent = _called(learner) or _called(config.get("learner"))
+    cell = _called(learner.get("cell")) if isinstance(learner, Mapping) else None
+    return " + ".join(filter(None, (agent, cell, _called(config.get("method"))))) if agent else agent
 
 
 def _called(part: Any) -> str | None:

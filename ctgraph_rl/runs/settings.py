@@ -16,8 +16,19 @@ import yaml
 from ctgraph_rl.checks import LARGEST_INT
 from ctgraph_rl.packages import conf_dir
 
+LSTM = {
+    "_target_": "baselines.cells.lstm.LSTM",
+    "_partial_": True,
+    "reads_action": False,
+    "reads_reward": False,
+}
+"""What stands behind the encoder of an agent with memory, unless ``cell=`` says otherwise."""
+
+WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
+
 ADDED: dict[str, dict[str, Any]] = {
     "run": {"portable": False},
+    **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL},
     "curricula.from_axes": {"read_noise": 0, "read_rotation": 0, "random_graphs": None},
 }
 """Settings that were added after runs had been stored, each with the value for "as before".
@@ -92,7 +103,7 @@ def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str
 
     def value_of(key: str, values: Mapping[str, Any]) -> Any:
         group, _, name = key.partition(".")
-        return values.get(key, _added_to(given.get(group)).get(name, ADDED.get("run", {}).get(key)))
+        return values.get(key, dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key)))
 
     pairs = {key: (value_of(key, before), value_of(key, now)) for key in sorted({*before, *now})}
     return [f"{key}={old!r} instead of {new!r}" for key, (old, new) in pairs.items() if old != new]

@@ -12,12 +12,13 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 from torch.nn.utils.rnn import PackedSequence
 from torchrl.envs.utils import set_exploration_type
-from torchrl.modules import set_recurrent_mode
+from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
 from baselines import benchmark
+from baselines.cells.lstm import packed_lstm
 from baselines.learner import functional_gradient_step
-from baselines.networks import distinct, packed_lstm
+from baselines.networks import distinct
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
@@ -78,8 +79,10 @@ def test_an_lstm_over_time_in_plain_tensors_equals_torchrls(small_agent, episode
 
     memory = agent.trunk.over_time(batch)
 
+    encoder, cell = agent.trunk.module
     with set_recurrent_mode(True):
-        expected = TensorDictSequential(*agent.trunk.module)(batch.select(*agent.trunk.in_keys))["memory"]
+        theirs = LSTMModule(lstm=cell.lstm, in_key="features", out_key="memory")
+        expected = TensorDictSequential(encoder, theirs)(batch.select(*agent.trunk.in_keys))["memory"]
     assert batch["is_init"][:, 1:].any() == episodes_start
     torch.testing.assert_close(memory, expected, atol=1e-6, rtol=0)
     found, others = (
@@ -94,7 +97,7 @@ def test_a_packed_lstm_and_its_gradients_equal_pytorchs():
     features, kinds = torch.randn(6, 3, dtype=torch.float64, requires_grad=True), torch.randint(6, (12,))
     h, c = torch.randn(2, 1, 5, 4, dtype=torch.float64, requires_grad=True).unbind()
 
-    memory = packed_lstm(lstm, features, kinds, sizes, h, c)
+    memory = packed_lstm(lstm, features, kinds, sizes, (h, c))
 
     expected = lstm(PackedSequence(features[kinds], sizes), (h, c))[0].data
     wanted, by = [features, h, c, *lstm.parameters()], torch.randn_like(memory)

@@ -1,0 +1,97 @@
+"""The base class of cells: a state, one step, and a sequence with resets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from ctgraph_rl.checks import require, true_or_false
+
+State = tuple[Tensor, ...]
+"""The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
+
+PREVIOUS_ACTION, REWARD = "previous_action", "reward"
+"""The keys of an agent's last action and reward."""
+
+
+class Cell(nn.Module):
+    """What an agent remembers with: it reads features, step after step, and writes what the heads read.
+
+    A class that derives from it defines `state_keys`, `zeros` and `step`, and `sequence` where there is a faster way
+    than step by step. A parameter of its own, outside PyTorch's layers, needs a ``reset_parameters``. A cell reads the
+    features of the observation and, if set, the agent's own last action and reward; never the time.
+
+    Args:
+        num_features: width of the features.
+        num_outputs: width of what it writes.
+        num_actions: actions of the task.
+        reads_action: also read the last action, one-hot; zeros at the start of an episode.
+        reads_reward: also read the last reward; 0 at the start of an episode.
+    """
+
+    state_keys: ClassVar[tuple[str, ...]] = ()
+    """The keys of its state in the data. A key that begins with `ctgraph_rl.learn.collect.UNSTORED` is carried from
+    step to step, and batches hold its value at their first step alone, which is all that `sequence` needs."""
+
+    memory: ClassVar[bool] = True
+    """Whether it can hold anything of earlier steps."""
+
+    holds: ClassVar[str]
+    """What it can hold, in a few words."""
+
+    def __init__(
+        self,
+        num_features: int,
+        num_outputs: int,
+        num_actions: int,
+        reads_action: bool = False,
+        reads_reward: bool = False,
+    ) -> None:
+        super().__init__()
+        require(*true_or_false(reads_action=reads_action, reads_reward=reads_reward))
+        self.own_keys = (PREVIOUS_ACTION,) * reads_action + (REWARD,) * reads_reward
+        self.num_inputs = num_features + num_actions * reads_action + reads_reward
+        self.num_outputs, self.num_actions = num_outputs, num_actions
+
+    def zeros(self, num_rows: int) -> State:
+        """Return the state at the start of an episode, which is zero, [num_rows, ...] each."""
+        return ()
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """Compute the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
+        raise NotImplementedError
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """Compute the outputs at all steps; the state is reset to zero before a step at which an episode starts.
+
+        Args:
+            inputs: [num_groups, num_inputs], one for all frames that have the same.
+            groups: the group of each frame, int64 [rows, steps].
+            starts: where an episode starts, bool [rows, steps].
+            state: the state before the first step, already zero where an episode starts there.
+
+        Returns:
+            [rows, steps, num_outputs].
+        """
+        outputs = []
+        for group, start in zip(groups.unbind(1), starts.unbind(1), strict=True):
+            output, state = self.step(inputs.index_select(0, group), reset(state, start))
+            outputs.append(output)
+        return torch.stack(outputs, dim=1)
+
+
+MakeCell = Callable[..., Cell]
+"""Return a cell for ``num_features``, ``num_outputs`` and ``num_actions``."""
+
+
+def reset(state: Sequence[Tensor], starts: Tensor) -> State:
+    """Return a state that is zero in the rows where an episode starts, bool [rows]."""
+    return tuple(torch.where(starts.view(-1, *[1] * (value.ndim - 1)), 0.0, value) for value in state)
+
+
+def zeros_like_weights(cell: nn.Module, *shape: int) -> Tensor:
+    """Return zeros with the dtype and the device of a cell's weights."""
+    return next(cell.parameters()).new_zeros(shape)

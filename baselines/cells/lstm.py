@@ -1,0 +1,73 @@
+"""LSTM: long short-term memory, the default cell.
+
+Hochreiter and Schmidhuber 1997, with PyTorch's `torch.nn.LSTM` of one layer.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.rnn import PackedSequence
+
+from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.segments import segments
+
+
+class LSTM(Cell):
+    """An LSTM of one layer; see `Cell` for the arguments."""
+
+    state_keys = ("recurrent_state_h", "recurrent_state_c")
+    holds = "what its gates let in, and the number of times that something was seen"
+
+    def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        self.lstm = nn.LSTM(self.num_inputs, num_outputs, batch_first=True)
+
+    def zeros(self, num_rows: int) -> State:
+        """Return zeros, [num_rows, 1, num_outputs], for both parts of the state."""
+        return tuple(zeros_like_weights(self, num_rows, 1, self.num_outputs) for _ in self.state_keys)
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        before = tuple(value.transpose(0, 1).contiguous() for value in state)
+        output, after = self.lstm(inputs.unsqueeze(1), before)
+        return output.squeeze(1), tuple(value.transpose(0, 1) for value in after)
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`; each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
+        if not starts[:, 1:].any():
+            before = tuple(value.transpose(0, 1).contiguous() for value in state)
+            return self.lstm(inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape), before)[0]
+        found = segments(starts)
+        h, c = (found.initial(value.squeeze(1)).unsqueeze(0) for value in state)
+        memory = packed_lstm(self.lstm, inputs, groups.flatten()[found.frames], found.sizes, (h, c))
+        return found.unpacked(memory).unflatten(0, starts.shape)
+
+
+def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, state: State) -> Tensor:
+    """Run an LSTM of one layer over packed sequences, with one product of features and weights for each group.
+
+    PyTorch's own backward pass writes a tensor of all frames at each step.
+
+    Args:
+        lstm: the LSTM.
+        features: of each group, [num_groups, num_features].
+        groups: of each frame in packed order, int64 [num_frames].
+        sizes: number of sequences at each step, int64 [num_steps] on the CPU.
+        state: the initial hidden and cell states of the sequences, [1, num_sequences, hidden_size] each.
+
+    Returns:
+        The hidden states at all frames in packed order, [num_frames, hidden_size].
+    """
+    if features.is_cuda:
+        return lstm(PackedSequence(features.index_select(0, groups), sizes), state)[0].data
+    of_features, of_h, bias, other_bias = lstm.all_weights[0]
+    given = nn.functional.linear(features, of_features, bias + other_bias)
+    (h, c), memory = (value[0] for value in state), []
+    for step in given.index_select(0, groups).split(sizes.tolist()):
+        left = len(step)
+        i, f, g, o = torch.addmm(step, h[:left], of_h.t()).chunk(4, dim=1)
+        c = torch.addcmul(f.sigmoid() * c[:left], i.sigmoid(), g.tanh())
+        h = o.sigmoid() * c.tanh()
+        memory.append(h)
+    return torch.cat(memory)
