@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from baselines.hooks import Hooks
 from baselines.networks import Data
-from baselines.optimisers import functional_step
+from baselines.optimisers import capturable, functional_step
 from ctgraph_rl.checks import at_least_one, positive, require, true_or_false
+from ctgraph_rl.core.region import Region, captures
 
 MOST_PASSES = 10**6
 """Passes over a batch, or gradient steps after it; more do not end."""
@@ -42,6 +43,9 @@ class Learner(nn.Module):
     stackable: ClassVar[bool] = False
     """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.together`; not with ``memory``."""
 
+    capturable: ClassVar[bool] = False
+    """Whether a gradient step has no branch on data and keeps no new tensors, so that a CUDA graph can replay it."""
+
     solves: ClassVar[str]
     """Which tasks it can solve in principle, in a few words."""
 
@@ -63,6 +67,7 @@ class Learner(nn.Module):
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
         self.compiled_step = make_compiled_step() if compile else None
+        self._region: Region | None = None
         self.method = Hooks()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
 
@@ -134,6 +139,7 @@ class Learner(nn.Module):
     def replace_optimiser(self, parameters: Sequence[nn.Parameter]) -> None:
         """Replace the optimiser by a new one of the same kind for these parameters."""
         self.optimiser = type(self.optimiser)(parameters, **self.optimiser.defaults)
+        self._region = None
         if self.compiled_step is not None:
             self.compiled_step = make_compiled_step()
 
@@ -157,12 +163,36 @@ class Learner(nn.Module):
     def gradient_step(self, batch: Data) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; return losses and gradient norm."""
         batch = self.method.transform_minibatch(batch)
-        weights = self.weights  # also for the compiled step: a cached property that is not there yet cannot be traced
+        self.weights  # noqa: B018, also for the compiled step: a cached property that is not there yet cannot be traced
         usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
+        if usual and self.is_captured:
+            return self._captured_step(batch)
         if self.compiled_step is not None and usual:
             return self.compiled_step(self, batch)
+        return self._eager_step(batch)
+
+    @property
+    def is_captured(self) -> bool:
+        """Whether gradient steps of the usual size are captured as a CUDA graph: on GPUs, without a method."""
+        return self.capturable and type(self.method) is Hooks and captures(self.weights[0].device)
+
+    def _captured_step(self, batch: Data) -> dict[str, Tensor]:
+        """Take the step as a `Region`."""
+        if self._region is None:
+            self._region = Region(self._step_to_capture)
+        measured = self._region(batch)
+        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
+
+    def _step_to_capture(self, batch: Data) -> dict[str, Tensor]:
+        if self.compiled_step is not None:
+            return self.compiled_step(self, batch)
+        with capturable(self.optimiser):
+            return self._eager_step(batch)
+
+    def _eager_step(self, batch: Data) -> dict[str, Tensor]:
+        """Take the step operation by operation."""
         losses = self.losses(batch)
-        gradients = torch.autograd.grad(total_loss(losses), weights)
+        gradients = torch.autograd.grad(total_loss(losses), self.weights)
         for parameter, gradient in zip(self.trainable, self.method.transform_gradients(gradients), strict=True):
             parameter.grad = gradient
         norm = nn.utils.clip_grad_norm_(self.trainable, self.max_grad_norm)
@@ -197,6 +227,7 @@ class Learner(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
         self.optimiser.load_state_dict(state["optimiser"])
+        self._region = None
 
 
 def reset_layer(module: nn.Module) -> None:

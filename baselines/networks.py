@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -112,7 +113,8 @@ class RecurrentModule(TensorDictModuleBase):
         seen, own = ([value.index_select(0, examples) for value in values] for values in (seen, own))
         inputs = joined(encoder.module(*seen), *own)
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
-        return cell.sequence(inputs, groups.view_as(starts), starts, state)
+        faster = cell.sequence if starts.is_cpu else partial(Cell.sequence, cell)  # others may make the host wait
+        return faster(inputs, groups.view_as(starts), starts, state)
 
     def zero_state(self, num_envs: int) -> TensorDict:
         """Return the state before the first step: the cell's zeros, and no last action or reward."""
@@ -250,6 +252,9 @@ class ActorCritic(TensorDictSequential):
     Further modules are called as they are.
     """
 
+    capturable = True
+    """Whether it acts without a branch on data; see `ctgraph_rl.learn.collect.CapturedAct`."""
+
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action``, ``action_log_prob``, ``state_value`` and the trunk's next state."""
         trunk, actor, critic, *others = self.module
@@ -260,7 +265,7 @@ class ActorCritic(TensorDictSequential):
         if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
             action = chances.argmax(dim=-1)
         else:
-            action = chances.flatten(0, -2).multinomial(1, replacement=True).view(chances.shape[:-1])
+            action = draw(chances)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
         written["state_value"] = critic.module(features)
@@ -269,6 +274,13 @@ class ActorCritic(TensorDictSequential):
         for module in others:
             module(tensordict)
         return tensordict
+
+
+def draw(chances: Tensor) -> Tensor:
+    """Draw a number of each categorical distribution, [..., n], int64 [...]; on GPUs without a wait of the host."""
+    if chances.is_cpu:
+        return chances.flatten(0, -2).multinomial(1, replacement=True).view(chances.shape[:-1])
+    return (chances / torch.empty_like(chances).exponential_()).argmax(dim=-1)  # as `multinomial`, which may wait
 
 
 def log_probabilities(actor: ProbabilisticActor, features: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -21,6 +22,20 @@ def make_optimiser(name: str, parameters: Iterable[nn.Parameter], learning_rate:
     if name == "rmsprop":
         return torch.optim.RMSprop(parameters, lr=learning_rate)
     return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+
+
+@contextmanager
+def capturable(optimiser: torch.optim.Optimizer) -> Iterator[None]:
+    """Let an optimiser's steps be captured as a CUDA graph, which PyTorch refuses without this setting."""
+    [group], on_gpu = optimiser.param_groups, optimiser.param_groups[0]["params"][0].is_cuda
+    for parameter in group["params"] if on_gpu else ():
+        state = optimiser.state[parameter]
+        state["step"] = state["step"].to(parameter.device)
+    before, group["capturable"] = group["capturable"], on_gpu
+    try:
+        yield
+    finally:
+        group["capturable"] = before
 
 
 def functional_step(optimiser: torch.optim.Optimizer, gradients: list[Tensor]) -> None:

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate, vec_generalized_advantage_estimate
 
 from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
@@ -70,7 +70,7 @@ class PolicyGradient(Learner):
 
     num_epochs = num_minibatches = 1
     output_keys = ("log_probs", "state_value")
-    stackable = True
+    stackable = capturable = True
 
     def __init__(
         self,
@@ -173,7 +173,7 @@ class PolicyGradient(Learner):
 
     def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
         """Iterate over the minibatches of one epoch."""
-        order = torch.randperm(len(items["action"])).to(items["action"].device)
+        order = torch.randperm(len(items["action"]), device=items["action"].device)
         shuffled = [value.index_select(0, order).chunk(self.num_minibatches) for value in items.values()]
         return (dict(zip(items, parts, strict=True)) for parts in zip(*shuffled, strict=True))
 
@@ -198,7 +198,7 @@ class PolicyGradient(Learner):
     ) -> tuple[Tensor, Tensor]:
         """Compute the advantages and the critic's targets; each argument and result is [num_envs, num_steps, 1]."""
         given = (batch["state_value"], next_values, self.reward(batch), done, terminated)
-        return vec_generalized_advantage_estimate(self.gamma, self.gae_lambda, *given)
+        return generalized_advantages(self.gamma, self.gae_lambda, *given)
 
     def _next_values(self, batch: TensorDictBase) -> Tensor:
         """Compute the value after each step: the next step's own, or that of another forward pass where there is none.
@@ -210,9 +210,19 @@ class PolicyGradient(Learner):
         cut = (after["done"] & ~after["terminated"]).squeeze(-1)
         cut[:, -1] = True
         next_values = values.roll(-1, dims=1)
+        if not cut.is_cpu:  # a choice of frames would make the host wait
+            ends = {key: after[key].flatten(0, 1) for key in self.trunk.in_keys}
+            of_ends = self.critic.module(self.trunk.act(ends)[self.features])
+            return torch.where(cut.unsqueeze(-1), of_ends.view_as(values), next_values)
         ends = {key: after[key][cut] for key in self.trunk.in_keys}
         next_values[cut] = self.critic.module(self.trunk.act(ends)[self.features])
         return next_values
+
+
+def generalized_advantages(gamma: float, gae_lambda: float, *given: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute advantages and value targets; TorchRL's faster way makes the host wait for a GPU."""
+    estimate = vec_generalized_advantage_estimate if given[0].is_cpu else generalized_advantage_estimate
+    return estimate(gamma, gae_lambda, *given)
 
 
 def critic_loss(values: Tensor, batch: Data, weight: float) -> Tensor:

@@ -40,7 +40,7 @@ class SimHashCounts(nn.Module):
         flat = observation.reshape(-1, self.num_inputs).float() * self.scale - 1
         signs = (flat @ self.projection > 0).long()
         codes = (signs << torch.arange(signs.shape[1], device=signs.device)).sum(dim=1)
-        self.counts += codes.bincount(minlength=len(self.counts))
+        self.counts.scatter_add_(0, codes, torch.ones_like(codes))
         return self.counts[codes]
 
 

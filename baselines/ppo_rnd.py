@@ -24,11 +24,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from baselines.learner import reset_layer
 from baselines.networks import Data, critic, encoder
 from baselines.optimisers import make_optimiser
+from baselines.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, require_memory
 
@@ -230,7 +230,7 @@ class PPORND(PPO):
         following = torch.cat([values[:, 1:], self.bonus_values(last)], dim=1)
         never = torch.zeros_like(batch["next", "done"])
         given = (values, following, bonus, never, never)
-        return vec_generalized_advantage_estimate(self.bonus_gamma, self.gae_lambda, *given)
+        return generalized_advantages(self.bonus_gamma, self.gae_lambda, *given)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the states of both optimisers."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.rnn import PackedSequence
 
 from baselines.cells.cell import Cell, State, zeros_like_weights
 from baselines.cells.segments import segments
@@ -29,6 +28,9 @@ class LSTM(Cell):
 
     def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
         """See `Cell`."""
+        if not inputs.is_cpu:
+            h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), *(value.squeeze(1) for value in state))
+            return h, (h.unsqueeze(1), c.unsqueeze(1))
         before = tuple(value.transpose(0, 1).contiguous() for value in state)
         output, after = self.lstm(inputs.unsqueeze(1), before)
         return output.squeeze(1), tuple(value.transpose(0, 1) for value in after)
@@ -59,15 +61,22 @@ def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, 
     Returns:
         The hidden states at all frames in packed order, [num_frames, hidden_size].
     """
-    if features.is_cuda:
-        return lstm(PackedSequence(features.index_select(0, groups), sizes), state)[0].data
-    of_features, of_h, bias, other_bias = lstm.all_weights[0]
-    given = nn.functional.linear(features, of_features, bias + other_bias)
+    given = lstm_inputs(lstm, features)
     (h, c), memory = (value[0] for value in state), []
     for step in given.index_select(0, groups).split(sizes.tolist()):
-        left = len(step)
-        i, f, g, o = torch.addmm(step, h[:left], of_h.t()).chunk(4, dim=1)
-        c = torch.addcmul(f.sigmoid() * c[:left], i.sigmoid(), g.tanh())
-        h = o.sigmoid() * c.tanh()
+        h, c = lstm_step(lstm, step, h[: len(step)], c[: len(step)])
         memory.append(h)
     return torch.cat(memory)
+
+
+def lstm_inputs(lstm: nn.LSTM, features: Tensor) -> Tensor:
+    """Compute what features add to the gates of an LSTM of one layer, [..., 4 * hidden_size]."""
+    of_features, _, bias, other_bias = lstm.all_weights[0]
+    return nn.functional.linear(features, of_features, bias + other_bias)
+
+
+def lstm_step(lstm: nn.LSTM, given: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the next hidden and cell states, [rows, hidden_size], from `lstm_inputs` and the present ones."""
+    i, f, g, o = torch.addmm(given, h, lstm.all_weights[0][1].t()).chunk(4, dim=1)
+    c = torch.addcmul(f.sigmoid() * c, i.sigmoid(), g.tanh())
+    return o.sigmoid() * c.tanh(), c

@@ -35,11 +35,13 @@ _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
 def _added(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     given = images, start, read_noise
     fits = images.dtype == torch.uint8 and start.shape == read_noise.shape == images.shape[:1]
-    return kernel.add_noise(*given) if fits and kernel.takes(*given) else by_parts(*given)
+    if fits and kernel.takes(*given):
+        return kernel.add_noise(*given)
+    return by_parts(*given) if images.is_cpu else noisy(*given)
 
 
 def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
-    """`add_noise` where there is no C code."""
+    """`add_noise` on CPUs without C code."""
     parts = zip(*(part.split(_NOISE_ROWS) for part in (images, start, read_noise)), strict=True)
     noised = [noisy(*part) for part in parts]
     return noised[0] if len(noised) == 1 else torch.cat(noised)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,6 +14,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.batch.specs import Specs, specs_of
 from ctgraph_rl.checks import at_least_one, is_int, require
+from ctgraph_rl.core.dynamics import RowState
+from ctgraph_rl.core.region import Region, captures
+from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
@@ -112,13 +116,14 @@ def batches(
     """
     start = start_of_episodes(env, initial_state)
     carried = env.reset().update(start) if carried is None else carried
+    act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
     steps: list[Step] = []
     unstored = [key for key in start.keys() if key.startswith(UNSTORED)]  # noqa: SIM118, rows otherwise
     for frames in range(done, num_frames, env.numel()):
         if between_steps is not None:
             between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
-            step, carried = act(env, policy, carried, start)
+            step, carried = act_once(carried)
         _append(steps, step, unstored)
         if len(steps) == num_steps or frames + env.numel() == num_frames:
             yield in_time_order(steps, env), carried
@@ -139,6 +144,62 @@ def act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorD
         begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
         following.set(key, state if lasts else torch.where(begins, value, state))
     return step, following
+
+
+def _is_captured(env: EnvBase, policy: Policy) -> bool:
+    """Return whether steps are captured as a CUDA graph: those of policies that say that they are ``capturable``."""
+    return type(env) is CTGraphEnv and getattr(policy, "capturable", False) and captures(env.device)
+
+
+class CapturedAct:
+    """`act` as a `Region`: on a GPU a step of all rows is one CUDA graph.
+
+    The graph is captured again when the rows get other tasks. While they may change tasks at any episode's end, which
+    needs the host, steps are not captured.
+
+    Args:
+        env: where to act. Its actions are not checked, as that would make the host wait.
+        policy: writes ``action``, without a branch on data.
+        start: the recurrent state that every episode starts with.
+    """
+
+    def __init__(self, env: CTGraphEnv, policy: Policy, start: TensorDict) -> None:
+        self.env, self.policy, self.start = env, policy, start
+        self._read = {*env.observation_spec.keys(), *env.done_keys, *start.keys()}
+        self._region: Region | None = None
+        self._params: RowParams | None = None
+
+    def __call__(self, carried: TensorDictBase) -> tuple[Step, TensorDictBase]:
+        """See `act`."""
+        rows = self.env.rows
+        if rows.tasks_change:
+            return act(self.env, self.policy, carried, self.start)
+        if self._region is None or self._params is not rows.params:
+            self._region, self._params = Region(self._act), rows.params
+        given = {key: value for key, value in carried.items() if key in self._read}
+        found = self._region(_labelled("carried", given) | _labelled("rows", rows.state._asdict()))
+        rows.state = RowState(**_part("rows", found))
+        step = {key: value.clone() for key, value in _part("step", found).items()}
+        return step, TensorDict(_part("following", found), self.env.batch_size, device=self.env.device)
+
+    def _act(self, given: Step) -> Step:
+        env, rows = self.env, self.env.rows
+        checks, env.check_actions, rows.state = env.check_actions, False, RowState(**_part("rows", given))
+        try:
+            carried = TensorDict(_part("carried", given), env.batch_size, device=env.device)
+            step, following = act(env, self.policy, carried, self.start)
+        finally:
+            env.check_actions = checks
+        after = _labelled("following", dict(following.items())) | _labelled("rows", rows.state._asdict())
+        return _labelled("step", step) | after
+
+
+def _labelled(label: str, values: Step) -> Step:
+    return {(label, key): value for key, value in values.items()}
+
+
+def _part(label: str, values: Step) -> Step:
+    return {key[1]: value for key, value in values.items() if key[0] == label}
 
 
 def take_step(env: EnvBase, data: TensorDictBase) -> tuple[Step, TensorDictBase]:

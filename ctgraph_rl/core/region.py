@@ -1,0 +1,87 @@
+"""Regions: functions of tensors that GPUs replay as CUDA graphs, without Python and without a wait of the host.
+
+Tensordict's `CudaGraphModule` waits for the device at every call, so it is not used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Tensors = Mapping[Any, Tensor]
+"""Tensors by key."""
+
+WARM_UP = 3
+"""Calls before a function is captured: libraries and kernels are loaded, and optimisers make their state."""
+
+
+def captures(device: torch.device | None) -> bool:
+    """Return whether regions on a device are captured: those on GPUs."""
+    return device is not None and device.type == "cuda"
+
+
+class Region:
+    """A function of tensors with memory of its own for its arguments and its results.
+
+    On a GPU the first `WARM_UP` calls run the function; then it is captured as a CUDA graph, and each further call
+    copies the arguments and launches the graph. Elsewhere every call runs the function, on copies of the arguments and
+    with copies of the results, so that whoever keeps a result too long is found on a CPU as well.
+
+    Args:
+        function: takes and returns tensors by key. It must not branch on data, make the host wait, or change the shapes
+            of its results. What it writes into tensors of others, such as weights, must stay where it is.
+    """
+
+    def __init__(self, function: Callable[[dict[Any, Tensor]], Tensors]) -> None:
+        self.function = function
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self._calls = 0
+        self._arguments: dict[Any, Tensor] = {}
+        self._results: dict[Any, Tensor] = {}
+
+    def __call__(self, arguments: Tensors) -> dict[Any, Tensor]:
+        """Return the function's results, which the next call overwrites.
+
+        Args:
+            arguments: tensors of the keys, shapes and dtypes of the first call.
+        """
+        self._write(self._arguments, arguments)
+        self._calls += 1
+        if not captures(next(iter(self._arguments.values())).device):
+            self._run()
+        elif self.graph is None and self._calls <= WARM_UP:
+            self._warm_up()
+        else:
+            self.graph = self.graph or self._captured()
+            self.graph.replay()
+        return dict(self._results)
+
+    def _run(self) -> None:
+        self._write(self._results, self.function(dict(self._arguments)))
+
+    def _warm_up(self) -> None:
+        """Run the function on another stream than the usual one, as a capture does."""
+        stream, usual = torch.cuda.Stream(), torch.cuda.current_stream()
+        stream.wait_stream(usual)
+        with torch.cuda.stream(stream):
+            self._run()
+        usual.wait_stream(stream)
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        """Return the function as a graph, whose memory the results are."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._results = dict(self.function(dict(self._arguments)))
+        return graph
+
+    @staticmethod
+    def _write(buffers: dict[Any, Tensor], values: Tensors) -> None:
+        """Write values into buffers, which the first call makes."""
+        if not buffers:
+            buffers.update({key: value.detach().clone() for key, value in values.items()})
+            return
+        for key, value in values.items():
+            buffers[key].copy_(value)

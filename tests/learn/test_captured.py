@@ -1,0 +1,123 @@
+"""Regions: what a GPU replays as a CUDA graph neither makes the host wait nor depends on a device.
+
+The device ``meta`` has shapes and no data: an operation that needs a value on the host, or whose result's shape depends
+on data, is an error there, and so is one with a tensor of another device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+import torch
+from helpers.oracles import confounding
+from helpers.small_agents import POLICY_GRADIENTS, agent_of, parameters_equal
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import baselines.learner
+import curricula
+from baselines.learner import Learner
+from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
+from ctgraph_rl.benchmark import configurations
+from ctgraph_rl.core.region import Region
+from ctgraph_rl.learn import collect
+from ctgraph_rl.learn.collect import CapturedAct, in_time_order, start_of_episodes
+
+META = torch.device("meta")
+TINY = {"num_envs": 8, "num_steps": 4, "hidden_size": 8, "num_epochs": 1}
+
+
+@pytest.fixture
+def captured(monkeypatch) -> None:
+    """Use regions on every device."""
+    for module in (collect, baselines.learner):
+        monkeypatch.setattr(module, "captures", lambda device: True)
+
+
+@pytest.fixture
+def swapped() -> Iterator[None]:
+    """Let parameters that move to ``meta`` stay the same objects."""
+    torch.__future__.set_swap_module_params_on_conversion(True)
+    yield
+    torch.__future__.set_swap_module_params_on_conversion(False)
+
+
+def test_a_region_returns_the_results_of_its_function_and_overwrites_them():
+    region = Region(lambda given: {"sum": given["x"] + 1, "x": given["x"]})
+
+    first = region({"x": torch.tensor([1.0])})
+    second = region({"x": torch.tensor([2.0])})
+
+    assert second["sum"].tolist() == [3.0] and first["sum"] is second["sum"]
+    assert first["x"].tolist() == [2.0]
+
+
+@pytest.mark.parametrize("name", configurations())
+def test_no_step_of_the_tensor_engine_needs_the_host(name):
+    rows = Rows([configurations()[name]] * 4, kernel="off").to(META)
+
+    steps = rollout(rows, torch.zeros(2, 4, dtype=torch.int64, device=META), Steps.empty(rows, 2))
+
+    assert {value.device for value in (*steps, *rows.state)} == {META}
+
+
+@pytest.mark.parametrize("name", POLICY_GRADIENTS)
+def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swapped):
+    env = CTGraphEnv([confounding(p=0.3)] * 16, kernel="off")
+    agent = agent_of(compose, name, env).to(META)
+    for optimiser in (each for each in vars(agent).values() if isinstance(each, torch.optim.Optimizer)):
+        optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
+    start, steps = start_of_episodes(env, agent.initial_state), []
+    act, carried = CapturedAct(env, agent.policy, start), env.reset().to(META).update(start)
+    env.rows.to(META)
+    env._device = META
+
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(agent.num_steps):
+            step, carried = act(carried)
+            steps.append(step)
+    minibatches = islice(agent.minibatches(in_time_order(steps, env)), 2)
+    measured = [agent.gradient_step(minibatch) for minibatch in minibatches]
+
+    assert {value.device for step in measured for value in step.values()} == {META}
+
+
+@pytest.mark.parametrize("name", ["ppo", "rl2"])
+def test_a_gpu_estimates_the_advantages_that_a_cpu_estimates(name, compose, monkeypatch):
+    env = CTGraphEnv([confounding(p=0.3)] * 16)
+    agent = agent_of(compose, name, env)
+    [batch] = collect.collect(env, agent.policy, 16 * agent.num_steps, agent.num_steps, agent.initial_state)
+    batch["next", "terminated"][::2] = False  # some episodes are truncated
+
+    def learned_from() -> dict:
+        torch.manual_seed(0)
+        return next(agent.minibatches(batch))
+
+    expected = learned_from()
+    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
+    found = learned_from()
+
+    assert batch["next", "done"].any()
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "boundaries"), [("ppo", "announced"), ("ppo", "hidden"), ("rl2", "hidden")])
+def test_memory_that_is_used_again_and_again_changes_no_bit_of_a_run(name, boundaries, captured, monkeypatch):
+    published = curricula.load("fo_b1_4tasks", num_frames=128)
+    protocol = replace(published.protocol, boundaries=boundaries)
+    curriculum = replace(published, protocol=protocol, evaluation=replace(published.evaluation, num_episodes=2))
+
+    def learned() -> tuple[list, Learner]:
+        torch.manual_seed(0)
+        agent = make_agent(name, curriculum, **TINY)
+        log = learn_curriculum(curriculum, agent, log=RunLog())
+        return [{**line, "seconds": 0} for line in log.measurements], agent
+
+    lines, agent = learned()
+    monkeypatch.undo()
+    expected, its = learned()
+
+    assert lines == expected
+    assert parameters_equal(agent, its)
