@@ -1,0 +1,335 @@
+"""MOHQA: a modulated Hebbian network (MOHN) beside a Q-network, for rewards that come long after decisions.
+
+Ladosz et al. 2021, "Deep reinforcement learning with modulated Hebbian plus Q-network architecture" (IEEE TNNLS,
+arXiv 1909.09902). Features phi of an observation give action values q = sigmoid(W_q relu(phi)), which are learned by
+gradients, and u = sigmoid(W_h y) with y = tanh(phi + noise - average), which are not. It acts greedily on q + u, or at
+random. The average is exponential over the steps of acting: average <- d average + (1 - d) phi, after y was computed.
+
+After each action the eligibility decays, E <- exp(-1 / tau) E, and its row of that action changes by +c where y is
+largest, by -c where it is smallest, and by -h elsewhere; E = 0 at the start of an episode. With reward r,
+W_h <- clip(W_h + (sign(r) - b) E, -1, 1). So a wait between decision and reward does not hide the decision, as it does
+from one-step Q-learning. Targets are r + gamma max(q' + u') with a copy of all weights and the average that was stored
+with the transition, and the published loss is |q - target|^2: the prediction lacks u, and q, which is at most 1, cannot
+reach a target above 1. ``predict_sum`` is the correction, with |q + u - target|^2, where u is a constant.
+
+The paper has one environment, a batch of one step then gives its updates exactly. With more of both, W_h changes after
+the batch, step by step in time, by the sum over environments; each has its own E and average, and a new one starts
+with the mean average. Convolutions are replaced by the encoder of the other agents. The environment's state takes
+4 num_features (num_actions + 1) bytes each, W_h and its copy 8 num_features num_actions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import EGreedyModule
+from torchrl.objectives.common import LossModule
+
+from baselines.networks import Data, EncoderModule, encoder, require_weights
+from baselines.q_learning import QLearner, require_replay
+from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
+
+STATE = ("eligibility", "average", "trial")
+"""The state of an environment; ``trial`` says that the average lasts over episodes."""
+
+RMSPROP_ALPHA, RMSPROP_EPS = 0.95, 0.01
+"""As published."""
+
+
+class Projected(nn.Module):
+    """An encoder with a linear layer behind it.
+
+    Args:
+        encoder: of observations.
+        num_inputs: width of its features.
+        num_features: outputs.
+    """
+
+    def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
+        super().__init__()
+        self.encoder, self.linear = encoder, nn.Linear(num_inputs, num_features)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map the encoder's inputs to float32 [..., num_features]."""
+        return self.linear(self.encoder(*inputs))
+
+
+class HebbianHead(nn.Module):
+    """The weights W_h and how eligibility and weights change.
+
+    Args:
+        num_features: width of phi.
+        num_actions: rows of W_h.
+        eligibility_steps: tau, in steps.
+        hebbian_share: share of the features, rounded up, with the largest y, and with the smallest.
+        hebbian_change: c.
+        hebbian_decay: h.
+        reward_baseline: b.
+    """
+
+    weights: Tensor
+
+    def __init__(
+        self,
+        num_features: int,
+        num_actions: int,
+        eligibility_steps: float,
+        hebbian_share: float,
+        hebbian_change: float,
+        hebbian_decay: float,
+        reward_baseline: float,
+    ) -> None:
+        super().__init__()
+        self.decay, self.share = math.exp(-1 / eligibility_steps), hebbian_share
+        self.change, self.fall, self.reward_baseline = hebbian_change, hebbian_decay, reward_baseline
+        self.register_buffer("weights", torch.zeros(num_actions, num_features))
+
+    def forward(self, y: Tensor) -> Tensor:
+        """Compute u, [..., num_actions], from y, [..., num_features]."""
+        return nn.functional.linear(y, self.weights).sigmoid()
+
+    def eligibility(self, before: Tensor, y: Tensor, action: Tensor) -> Tensor:
+        """Return the eligibility after an action, [n, num_actions, num_features]; y is [n, num_features]."""
+        number = (self.share * y.count_nonzero(dim=-1)).ceil().unsqueeze(-1)
+        place = y.argsort(dim=-1).argsort(dim=-1)
+        largest, smallest = place >= y.shape[-1] - number, place < number
+        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * ~(largest | smallest)
+        return self.decay * before + one_hot(action, len(self.weights)).unsqueeze(-1) * row.unsqueeze(-2)
+
+    def modulate(self, eligibility: Tensor, reward: Tensor) -> None:
+        """Change the weights step by step.
+
+        Args:
+            eligibility: after each step, [num_envs, num_steps, num_actions, num_features].
+            reward: of each step, [num_envs, num_steps, 1].
+        """
+        modulation = (reward.sign() - self.reward_baseline).unsqueeze(-1)
+        for change in (modulation * eligibility).sum(dim=0):
+            self.weights.add_(change).clamp_(-1, 1)
+
+
+class ModulatedGreedy(TensorDictModuleBase):
+    """The policy: greedy on q + u, with exploration; it writes eligibility and average.
+
+    Args:
+        trunk: computes phi.
+        head: computes q, an ``nn.Module`` in a TensorDictModule.
+        hebbian: computes u.
+        exploration: replaces some actions by random ones.
+        average_decay: d.
+        noise_std: standard deviation of the noise, which only an exploring policy has.
+        noise_share: probability of a feature to get noise.
+    """
+
+    def __init__(
+        self,
+        trunk: EncoderModule,
+        head: TensorDictModule,
+        hebbian: HebbianHead,
+        exploration: EGreedyModule,
+        *,
+        average_decay: float,
+        noise_std: float,
+        noise_share: float,
+    ) -> None:
+        super().__init__()
+        self.greedy, self.hebbian, self.exploration = TensorDictSequential(trunk, head), hebbian, exploration
+        self.average_decay, self.noise_std, self.noise_share = average_decay, noise_std, noise_share
+        self.in_keys = [*trunk.in_keys, "is_init", *STATE]
+        self.out_keys = ["action", *(("next", key) for key in STATE)]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` and the next state."""
+        features, average = self.features(tensordict), tensordict["average"]
+        y = (features + self._noise(features) - average).tanh()
+        tensordict.set("action", (self.head(features) + self.hebbian(y)).argmax(dim=-1))
+        tensordict = self.exploration(tensordict)
+        before = tensordict["eligibility"] * ~tensordict["is_init"].unsqueeze(-1)
+        after = self.hebbian.eligibility(before, y, tensordict["action"])
+        tensordict.set(("next", "eligibility"), after)
+        tensordict.set(("next", "average"), average.lerp(features, 1 - self.average_decay))
+        return tensordict.set(("next", "trial"), tensordict["trial"])
+
+    def features(self, data: Data) -> Tensor:
+        """Compute phi at any number of steps, [..., num_features]."""
+        return self.greedy[0].over_time(data)
+
+    def head(self, features: Tensor) -> Tensor:
+        """Compute q, [..., num_actions]."""
+        return self.greedy[1].module(features)
+
+    def _noise(self, features: Tensor) -> Tensor:
+        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+            return torch.zeros_like(features)
+        return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
+
+
+class Target(LossModule):
+    """A Q-network and its target network.
+
+    Args:
+        network: a sequence of trunk and head.
+    """
+
+    value_network: TensorDictSequential
+    value_network_params: TensorDictBase
+    target_value_network_params: TensorDictBase
+
+    def __init__(self, network: TensorDictSequential) -> None:
+        super().__init__()
+        self.convert_to_functional(network, "value_network", create_target_params=True)
+        self.in_keys, self.out_keys = network.in_keys, ["features", "action_value"]
+
+    def forward(self, data: Data) -> tuple[Tensor, Tensor]:
+        """Compute phi and q with the target network's weights."""
+        trunk, head = self.value_network
+        with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
+            features = trunk.over_time(data)
+            return features, head.module(features)
+
+
+class MOHQA(QLearner):
+    """A Q-network with a modulated Hebbian network beside it.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        hidden_size: width of the encoder.
+        num_features: width of phi.
+        learning_rate: of RMSprop.
+        gamma: discount factor.
+        predict_sum: predict q + u, as the targets do; False: q alone, as published.
+        eligibility_steps: tau, over which eligibility falls to 1/e.
+        hebbian_share: share of the features, rounded up, whose eligibility rises, and share of those whose falls.
+        hebbian_change: by how much.
+        hebbian_decay: by how much that of the other features falls.
+        reward_baseline: b, what is taken from the sign of a reward.
+        average_decay: d, of the running average of phi.
+        noise_std: standard deviation of the noise while acting.
+        noise_share: probability of a feature to get noise.
+        settings: the arguments of `QLearner`.
+    """
+
+    solves = "fully observable tasks (CT-FO); its traces reach over waits that look alike"
+
+    policy: ModulatedGreedy
+    average: Tensor
+    target_weights: Tensor
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        hidden_size: int,
+        num_features: int,
+        learning_rate: float,
+        gamma: float,
+        predict_sum: bool,
+        eligibility_steps: float,
+        hebbian_share: float,
+        hebbian_change: float,
+        hebbian_decay: float,
+        reward_baseline: float,
+        average_decay: float,
+        noise_std: float,
+        noise_share: float,
+        **settings: Any,
+    ) -> None:
+        require(
+            *at_least_one(hidden_size=hidden_size, num_features=num_features),
+            *positive(learning_rate=learning_rate, eligibility_steps=eligibility_steps),
+            *true_or_false(predict_sum=predict_sum),
+            *not_negative(hebbian_share=hebbian_share, hebbian_change=hebbian_change, hebbian_decay=hebbian_decay),
+            *not_negative(reward_baseline=reward_baseline, noise_std=noise_std),
+            *fraction(average_decay=average_decay, noise_share=noise_share),
+            *at_most(0.5, hebbian_share=hebbian_share),
+        )
+        num_actions = action_spec.space.n
+        require_weights(observation_spec, hidden_size, 1, num_features)
+        require_replay(observation_spec, settings["buffer_size"], settings["batch_size"], 2 * num_features)
+        super().__init__(gamma=gamma, **settings)
+        self.gamma, self.predict_sum = gamma, predict_sum
+        inner = encoder(observation_spec, hidden_size)
+        projected = Projected(inner.module, hidden_size, num_features)
+        trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
+        layers = nn.Sequential(nn.ReLU(), nn.Linear(num_features, num_actions), nn.Sigmoid())
+        head = TensorDictModule(layers, in_keys=["features"], out_keys=["action_value"])
+        how = {"eligibility_steps": eligibility_steps, "hebbian_share": hebbian_share, "hebbian_change": hebbian_change}
+        how |= {"hebbian_decay": hebbian_decay, "reward_baseline": reward_baseline}
+        self.hebbian = HebbianHead(num_features, num_actions, **how)
+        self.register_buffer("target_weights", self.hebbian.weights.clone())
+        self.register_buffer("average", torch.zeros(num_features))
+        self.greedy = network = TensorDictSequential(trunk, head)
+        self.target = Target(network)
+        self.set_networks(network, self.target, action_spec, learning_rate)
+        self.policy = ModulatedGreedy(
+            trunk,
+            head,
+            self.hebbian,
+            self.exploration,
+            average_decay=average_decay,
+            noise_std=noise_std,
+            noise_share=noise_share,
+        )
+        self.optimiser = torch.optim.RMSprop(network.parameters(), learning_rate, alpha=RMSPROP_ALPHA, eps=RMSPROP_EPS)
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return no eligibility, and the mean average of the environments."""
+        weights, average = self.hebbian.weights, self.average.expand(num_envs, -1)
+        state = {"eligibility": weights.new_zeros(num_envs, *weights.shape), "average": average.clone()}
+        return TensorDict({**state, "trial": weights.new_zeros(num_envs, 1)}, batch_size=[num_envs])
+
+    def reset_parameters(self) -> None:
+        """See `Learner`; the weights of the Hebbian network and the average are 0 again."""
+        super().reset_parameters()
+        self.hebbian.weights.zero_()
+        self.average.zero_()
+
+    def weights_changed(self) -> None:
+        """Copy all weights to the target network."""
+        super().weights_changed()
+        self.target_weights.copy_(self.hebbian.weights)
+
+    def values(self, data: Data) -> Tensor:
+        """Compute q + u, where u is a constant, [..., num_actions]."""
+        features = self.policy.features(data)
+        return self.policy.head(features) + self.hebbian((features - data["average"]).tanh()).detach()
+
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Change W_h by the rewards of a batch; store it, and yield minibatches of replayed items."""
+        self.hebbian.modulate(batch["next", "eligibility"], batch["next", "reward"])
+        self.average.copy_(batch["next", "average"][:, -1].mean(dim=0))
+        yield from super().minibatches(batch)
+
+    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Copy all weights to the target network if it is time."""
+        if self.needs_weights:
+            self.target_weights.copy_(self.hebbian.weights)
+        return super().after_update(measured)
+
+    def experience(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return every step as a transition of up to ``n_steps`` steps."""
+        seen = (*self.policy.greedy.in_keys, "average")
+        after = [("next", key) for key in (*seen, "reward", "terminated")]
+        return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the mean squared error of the value of the action taken; the targets are those of q' + u'."""
+        values = self.values(batch) if self.predict_sum else self.policy.head(self.policy.features(batch))
+        predicted = values.gather(-1, batch["action"].unsqueeze(-1))
+        with torch.no_grad():
+            features, later = self.target({key: batch["next", key] for key in self.policy.greedy.in_keys})
+            y = (features - batch["next", "average"]).tanh()
+            best = (later + nn.functional.linear(y, self.target_weights).sigmoid()).amax(dim=-1, keepdim=True)
+            gamma = best.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(best)
+            target = batch["next", "reward"] + gamma * ~batch["next", "terminated"] * best
+        return {"loss_value": (predicted - target).square().mean()}
