@@ -32,7 +32,7 @@ class Cell(nn.Module):
         reads_reward: also read the last reward; 0 at the start of an episode.
     """
 
-    state_keys: ClassVar[tuple[str, ...]] = ()
+    state_keys: tuple[str, ...] = ()
     """The keys of its state in the data. A key that begins with `ctgraph_rl.learn.collect.UNSTORED` is carried from
     step to step, and batches hold its value at their first step alone, which is all that `sequence` needs."""
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import pairwise
+
 import pytest
 import torch
-from helpers.small_agents import MINIBATCHES, TINY, batches, parameters_equal, saved_and_loaded
+from helpers.small_agents import batches, parameters_equal, saved_and_loaded
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import nn
 
 from baselines.catalogue import catalogue
 from baselines.cells.cell import Cell
+from baselines.cells.scan import linear_scan, max_scan
 from baselines.networks import EncoderModule, RecurrentModule
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import UNSTORED
@@ -25,11 +29,15 @@ OWN = {"reads_action": True, "reads_reward": True}
 every_cell = pytest.mark.parametrize("name", CELLS)
 
 
-def make(name: str, **settings) -> Cell:
+def build(name: str) -> partial:
+    """What builds a cell with the settings of its file."""
+    return instantiate(OmegaConf.load(f"{conf_dir()}/cell/{name}.yaml"))
+
+
+def make(name: str, inputs: int = FEATURES, **settings) -> Cell:
     """A cell with the settings of its file, in float64, with equal weights for every call."""
     torch.manual_seed(0)
-    build = instantiate(OmegaConf.load(f"{conf_dir()}/cell/{name}.yaml"))
-    return build(FEATURES, OUTPUTS, ACTIONS, **settings).double()
+    return build(name)(inputs, OUTPUTS, ACTIONS, **settings).double()
 
 
 def trunk_of(cell: Cell) -> RecurrentModule:
@@ -58,9 +66,13 @@ def step_by_step(trunk: RecurrentModule, data: dict, state: dict) -> torch.Tenso
     return torch.stack(outputs, dim=1)
 
 
+def zeros_before(trunk: RecurrentModule) -> dict[str, torch.Tensor]:
+    return dict(trunk.zero_state(ROWS).select(*trunk.state_keys).items())
+
+
 def state_before(trunk: RecurrentModule) -> dict[str, torch.Tensor]:
     """The state after a few steps of other sequences."""
-    state = dict(trunk.zero_state(ROWS).select(*trunk.state_keys).items())
+    state = zeros_before(trunk)
     for _ in range(3):
         data = {key: value[:, 0] for key, value in sequences(torch.zeros(ROWS, 1, dtype=torch.bool)).items()}
         written = trunk.act(data | state)
@@ -82,6 +94,17 @@ def test_a_cell_and_its_gradients_are_the_same_step_by_step_and_over_sequences(n
     weights = list(trunk.parameters())
     gradients = [torch.autograd.grad(values, weights, by) if weights else () for values in (found, expected)]
     torch.testing.assert_close((found, *gradients[0]), (expected, *gradients[1]), atol=1e-10, rtol=1e-10)
+
+
+@every_cell
+def test_a_state_in_which_an_episode_starts_is_zero_and_is_left_behind(name):
+    trunk = trunk_of(make(name))
+    data = {key: value[:, 0] for key, value in sequences(torch.ones(ROWS, 1, dtype=torch.bool)).items()}
+
+    fresh, after = (trunk.act(data | state)["memory"] for state in (zeros_before(trunk), state_before(trunk)))
+
+    assert torch.equal(fresh, after)
+    assert not any(value.any() for value in trunk.cell.zeros(ROWS))
 
 
 @every_cell
@@ -114,13 +137,12 @@ def test_what_a_cell_reads_of_its_own_past_is_a_setting_and_nothing_at_the_start
 
 
 @every_cell
-@pytest.mark.parametrize("agent", ["lstm_ppo", "drqn"])
-def test_an_agent_with_a_cell_is_saved_and_restored_bit_by_bit(name, agent, small_agent):
+@pytest.mark.parametrize("agent", ["lstm_ppo", pytest.param("drqn", marks=pytest.mark.slow)])
+def test_an_agent_with_a_cell_is_saved_and_restored_bit_by_bit(name, agent):
     if agent == "drqn" and any(key.startswith(UNSTORED) for key in make(name).state_keys):
         pytest.skip("replay needs a state that is stored")
-    own = [f"cell={name}", "agent.cell.reads_action=true", "agent.cell.reads_reward=true"]
-    less = MINIBATCHES if agent == "lstm_ppo" else ["agent.batch_size=2", "agent.num_updates=2"]
-    one, other = (small_agent(agent, [ct_su_b1()], *own, *TINY, *less) for _ in range(2))
+    less = {"num_epochs": 1} if agent == "lstm_ppo" else {"batch_size": 2, "num_updates": 2}
+    one, other = (agent_with(partial(build(name), **OWN), agent, **less) for _ in range(2))
     first, second = batches(one, ct_su_b1(), 2)
     one.learn(first)
 
@@ -133,6 +155,111 @@ def test_an_agent_with_a_cell_is_saved_and_restored_bit_by_bit(name, agent, smal
     goes_on = ~second["is_init"][:, 1:, 0]
     assert torch.equal(second["previous_action"][:, 1:][goes_on], second["action"][:, :-1][goes_on])
     assert torch.equal(second["reward"][:, 1:][goes_on], second["next", "reward"][:, :-1][goes_on])
+
+
+@torch.no_grad()
+def with_open_gates(name: str) -> Cell:
+    """A cell of two inputs whose gates let in a cue, (1, 0), and hold it over blanks, (0, 1), where there is a gate."""
+    cell = make(name, inputs=2)
+    cue, blank = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 1.0]])
+    opened, closed, given = 40 * (cue - blank), 40 * (blank - cue), 5 * cue
+    aggregated = {"inner.lstm.weight_ih_l0": [opened, 0 * cue, given, opened]}  # which forgets at once
+    weights = {
+        "lstm": {"lstm.weight_ih_l0": [opened, 40 * (cue + blank), given, 40 * (cue + blank)]},  # i, f, g, o
+        "gru": {"gru.weight_ih_l0": [0 * cue, closed, given]},  # r, z, n
+        "min_gru": {"gate.weight": [opened], "candidate.weight": [cue]},
+        "amrl_max": aggregated,
+        "amrl_avg": aggregated,
+    }
+    for parameter in cell.parameters():
+        parameter.zero_()
+    for place, blocks in weights[name].items():
+        cell.get_parameter(place).copy_(torch.cat([block.expand(OUTPUTS, 2) for block in blocks]))
+    if hasattr(cell, "linear"):
+        nn.init.eye_(cell.linear.weight)
+    return cell
+
+
+HELD = {
+    "lstm": [1, 1],
+    "gru": [1, 1],
+    "min_gru": [1, 1],
+    "amrl_max": [1, 1],
+    "amrl_avg": [0.5, 1 / 300],
+}
+"""The share of a cue that is in the memory after 1 and 299 blanks."""
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_a_cue_is_held_over_blanks(name):
+    cell = with_open_gates(name)
+    shown = torch.zeros(1, 300, dtype=torch.int64)
+    shown[0, 1:] = 1
+
+    memory = cell.sequence(torch.eye(2).double(), shown, torch.zeros(1, 300, dtype=torch.bool), cell.zeros(1))
+
+    channel = OUTPUTS // 2 if "amrl" in name else 0
+    share = memory[0, :, channel] / memory[0, 0, channel]
+    assert share[[1, 299]].tolist() == pytest.approx(HELD[name], rel=1e-4)
+
+
+def test_stacked_frames_hold_the_last_ones_and_no_others():
+    cell = make("frames", num_frames=3)
+    inputs = torch.randn(1, 8, FEATURES).double().requires_grad_()
+
+    output = cell.sequence(inputs[0], torch.arange(8).view(1, 8), torch.arange(8).view(1, 8) == 6, cell.zeros(1))
+
+    reads = [torch.autograd.grad(output[0, t].sum(), inputs, retain_graph=True)[0].any(dim=-1)[0] for t in (5, 6, 7)]
+    assert [each.nonzero().flatten().tolist() for each in reads] == [[3, 4, 5], [6], [6, 7]]
+
+
+def test_maxima_and_sums_are_those_since_the_last_reset():
+    generator = torch.Generator().manual_seed(0)
+    x, starts = torch.randn(6, 37, 3, generator=generator), torch.rand(6, 37, generator=generator) < 0.15
+
+    largest = max_scan(x, starts)
+    sums = linear_scan((~starts).float().unsqueeze(-1), x)
+
+    for row in range(6):
+        edges = [0, *(starts[row, 1:].nonzero().flatten() + 1).tolist(), 37]
+        for first, last in pairwise(edges):
+            assert torch.equal(largest[row, first:last], x[row, first:last].cummax(dim=0).values)
+            torch.testing.assert_close(sums[row, first:last], x[row, first:last].cumsum(dim=0), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("aggregator", ["max", "mean"])
+@pytest.mark.parametrize("straight_through", [False, True])
+def test_the_gradient_of_an_aggregate_is_its_own_or_1_for_each_input(aggregator, straight_through):
+    cell = make("amrl_max", aggregator=aggregator, straight_through=straight_through)
+    x = torch.tensor([[0.5, 0.1, 0.3, 0.9, 0.2]], dtype=torch.float64).unsqueeze(-1).requires_grad_()
+    starts, state = torch.tensor([[False, True, False, False, False]]), [x.new_zeros(1, 1) for _ in range(2)]
+
+    aggregate = cell._aggregate(x, starts, state)[0]
+    gradient = torch.autograd.grad(aggregate[0, -1].sum(), x)[0].flatten().tolist()
+
+    own = {"max": ([0, 0, 0, 1, 0], 0.9), "mean": ([0, 0.25, 0.25, 0.25, 0.25], 0.375)}[aggregator]
+    assert aggregate[0, -1].item() == pytest.approx(own[1], abs=1e-12)
+    assert gradient == ([0, 1, 1, 1, 1] if straight_through else own[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("amrl_max", {"aggregator": "min"}, "aggregator must be one of max, mean"),
+        ("amrl_max", {"straight_through": 1}, "straight_through must be true or false"),
+        ("frames", {"num_frames": 1}, "num_frames must be an integer >= 2, got 1: one frame is cell=none"),
+        ("frames", {"num_frames": 10**6}, "num_frames must be at most 1,000"),
+        ("gru", {"reads_action": "yes"}, "reads_action must be true or false"),
+    ],
+)
+def test_settings_of_a_cell_that_cannot_be_are_refused(name, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make(name, **settings)
+
+
+def test_an_aggregated_memory_has_an_even_width():
+    with pytest.raises(ValueError, match=r"hidden_size must be even.*got 5: use 6"):
+        build("amrl_max")(3, 5, 3)
 
 
 class Sum(Cell):

@@ -1,0 +1,97 @@
+"""AMRL: an LSTM half of whose outputs are aggregated over the episode, by the maximum or the mean.
+
+Beck et al. 2020 (ICLR, Aggregated Memory for Reinforcement Learning): m_t = max(m_{t-1}, x_t) with m_0 = 0, or
+m_t = (x_1 + ... + x_t) / t; the other half y_t is handed on, and a layer reads both.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.lstm import LSTM
+from baselines.cells.scan import linear_scan, max_scan
+from ctgraph_rl.checks import one_of, require, true_or_false
+
+AGGREGATORS = ("max", "mean")
+
+
+class AMRL(Cell):
+    """Aggregated memory behind an LSTM.
+
+    Args:
+        num_features: width of the features.
+        num_outputs: width of the LSTM and of what is written; even.
+        num_actions: actions of the task.
+        aggregator: ``max`` or ``mean``. The mean divides by the number of steps since the start, which nothing reads.
+        straight_through: the gradient of the aggregate by each input is 1, as in the paper, whose author later found
+            that it can explode (Beck et al. 2024, arXiv 2403.03020); False: that of the maximum or the mean.
+        reads: see `Cell`.
+    """
+
+    holds = "whether something was seen in an episode, for any time; and what its LSTM holds"
+
+    def __init__(
+        self,
+        num_features: int,
+        num_outputs: int,
+        num_actions: int,
+        aggregator: str,
+        straight_through: bool,
+        **reads: bool,
+    ) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        even = f"hidden_size must be even, as AMRL aggregates one half of its LSTM, got {num_outputs}"
+        require(
+            *one_of(AGGREGATORS, aggregator=aggregator),
+            *true_or_false(straight_through=straight_through),
+            (num_outputs % 2 == 0, f"{even}: use {num_outputs + 1}"),
+        )
+        self.inner = LSTM(num_features, num_outputs, num_actions, **reads)
+        self.linear = nn.Linear(num_outputs, num_outputs)
+        self.is_max, self.straight_through = aggregator == "max", straight_through
+        own = ("recurrent_state_max",) if self.is_max else ("recurrent_state_sum", "recurrent_state_count")
+        self.state_keys = (*LSTM.state_keys, *own)
+
+    def zeros(self, num_rows: int) -> State:
+        """Return zeros: of the LSTM, and the maxima, [num_rows, num_outputs // 2], or sums and a count."""
+        widths = [self.num_outputs // 2, 1][: 1 if self.is_max else 2]
+        return (*self.inner.zeros(num_rows), *(zeros_like_weights(self, num_rows, width) for width in widths))
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        memory, inner = self.inner.step(inputs, state[:2])
+        x, y = memory.chunk(2, dim=-1)
+        aggregate, after = self._aggregate(x.unsqueeze(1), x.new_zeros(len(x), 1, dtype=torch.bool), state[2:])
+        return self._output(aggregate[:, 0], y), (*inner, *after)
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`; the aggregates are scans."""
+        x, y = self.inner.sequence(inputs, groups, starts, state[:2]).chunk(2, dim=-1)
+        return self._output(self._aggregate(x, starts, state[2:])[0], y)
+
+    def _aggregate(self, x: Tensor, starts: Tensor, state: State) -> tuple[Tensor, State]:
+        """Return the aggregates of [rows, steps, n] at each step, and the state after the last one."""
+        if self.is_max:
+            first = torch.maximum(state[0].unsqueeze(1), x[:, :1])
+            largest = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
+            straight = _sums(x, starts, state[0]) if self.straight_through else largest
+            return _with_gradient_of(straight, largest), (largest[:, -1],)
+        sums, counts = _sums(x, starts, state[0]), _sums(torch.ones_like(x[..., :1]), starts, state[1])
+        mean = sums / counts
+        return _with_gradient_of(sums if self.straight_through else mean, mean), (sums[:, -1], counts[:, -1])
+
+    def _output(self, aggregate: Tensor, y: Tensor) -> Tensor:
+        return self.linear(torch.cat([y, aggregate], dim=-1)).relu()
+
+
+def _sums(inputs: Tensor, starts: Tensor, state: Tensor) -> Tensor:
+    """Return the sums of [rows, steps, n] inputs since the start of the episode, and of a state before them."""
+    inputs = torch.cat([state.unsqueeze(1) + inputs[:, :1], inputs[:, 1:]], dim=1)
+    return linear_scan((~starts).unsqueeze(-1).to(inputs.dtype), inputs)
+
+
+def _with_gradient_of(other: Tensor, values: Tensor) -> Tensor:
+    """Return values with the gradient of others."""
+    return values if other is values else values.detach() + (other - other.detach())

@@ -1,0 +1,55 @@
+"""Frame stacking: a layer that reads the features of the last few steps.
+
+As in Mnih et al. 2015 (arXiv 1312.5602), which stacks the images themselves.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from baselines.cells.cell import Cell, State, zeros_like_weights
+from ctgraph_rl.checks import at_most, is_int, require
+
+MOST_FRAMES = 1000
+"""Beyond the longest episodes that fit into a batch."""
+
+
+class Frames(Cell):
+    """A linear layer with ReLU over the inputs of the last steps; zeros stand for those before the episode.
+
+    Args:
+        num_features: width of the features.
+        num_outputs: width of what it writes.
+        num_actions: actions of the task.
+        num_frames: steps that it reads, the present one among them.
+        reads: see `Cell`.
+    """
+
+    state_keys = ("recurrent_state_frames",)
+    holds = "the last few steps, exactly"
+
+    def __init__(self, num_features: int, num_outputs: int, num_actions: int, num_frames: int, **reads: bool) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
+        require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
+        self.num_frames = num_frames
+        self.linear = nn.Linear(num_frames * self.num_inputs, num_outputs)
+
+    def zeros(self, num_rows: int) -> State:
+        """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
+        return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        window = torch.cat([state[0], inputs.unsqueeze(1)], dim=1)
+        return self.linear(window.flatten(1)).relu(), (window[:, 1:],)
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`; a frame counts if no episode has started since."""
+        frames = torch.cat([state[0], inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape)], dim=1)
+        episode = torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
+        of_frame = torch.cat([episode.new_zeros(len(starts), self.num_frames - 1), episode], dim=1)
+        windows = frames.unfold(1, self.num_frames, 1).transpose(2, 3)
+        same = of_frame.unfold(1, self.num_frames, 1) == episode.unsqueeze(-1)
+        return self.linear((windows * same.unsqueeze(-1)).flatten(2)).relu()

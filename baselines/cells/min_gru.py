@@ -1,0 +1,47 @@
+"""minGRU: a GRU whose gate reads the input alone, so that all steps are computed at once.
+
+Feng et al. 2024 (arXiv 2410.01201): z = sigmoid(W_z x + b_z), h <- (1 - z) h + z (W_h x + b_h).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.scan import linear_scan
+
+
+class MinGRU(Cell):
+    """A minGRU of one layer; see `Cell` for the arguments."""
+
+    state_keys = ("recurrent_state_h",)
+    holds = "what its gate lets in, whatever it holds already"
+
+    def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        self.gate = nn.Linear(self.num_inputs, num_outputs)
+        self.candidate = nn.Linear(self.num_inputs, num_outputs)
+
+    def zeros(self, num_rows: int) -> State:
+        """Return zeros, [num_rows, num_outputs]."""
+        return (zeros_like_weights(self, num_rows, self.num_outputs),)
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        carry, given = self._parts(inputs)
+        output = carry * state[0] + given
+        return output, (output,)
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`; a scan, in which a reset is a carry of 0."""
+        carry, given = (
+            part.index_select(0, groups.flatten()).unflatten(0, groups.shape) for part in self._parts(inputs)
+        )
+        first = given[:, :1] + carry[:, :1] * state[0].unsqueeze(1)
+        return linear_scan(carry * ~starts.unsqueeze(-1), torch.cat([first, given[:, 1:]], dim=1))
+
+    def _parts(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the state is multiplied by, and what is added to it."""
+        gate = self.gate(inputs)
+        return (-gate).sigmoid(), gate.sigmoid() * self.candidate(inputs)

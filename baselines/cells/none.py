@@ -1,0 +1,26 @@
+"""No memory: one more layer, for what an agent loses that cannot remember."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from baselines.cells.cell import Cell, State
+
+
+class NoMemory(Cell):
+    """A linear layer with ReLU that reads the present step alone; see `Cell` for the arguments."""
+
+    memory = False
+    holds = "nothing"
+
+    def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        self.linear = nn.Linear(self.num_inputs, num_outputs)
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        return self.linear(inputs).relu(), ()
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`."""
+        return self.linear(inputs).relu().index_select(0, groups.flatten()).unflatten(0, groups.shape)
