@@ -27,6 +27,9 @@ RUN = "ctgraph_rl.run"
 COMMANDS = {
     "run": Command(RUN, "train an agent on a curriculum; settings alone do so, too"),
     "agents": Command("baselines.__main__", "list the agents"),
+    "collectives": Command(
+        "ctgraph_rl.collective.__main__", "make a page of figures and tables of learners that share"
+    ),
     "compare": Command("ctgraph_rl.compare", "say whether two runs are equal, and what they differ in"),
     "curricula": Command("curricula.__main__", "list the curricula, or describe one"),
     "draw": Command("ctgraph_rl.visualize.draw", "draw a task, and what a policy does there"),

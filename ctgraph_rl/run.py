@@ -40,8 +40,8 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
-    from ctgraph_rl.report.style import require_packages  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.runs.together import run_cells  # here: as above
+    from ctgraph_rl.collective.job import run_cells  # here: --help and a wrong setting need no torch
+    from ctgraph_rl.report.style import require_packages  # here: as above
 
     if cfg.report:
         require_packages()

@@ -30,6 +30,7 @@ FLOORS = (
     ("runs", "baselines"),
     ("visualize", "hydra_plugins"),
     ("report",),
+    ("collective",),
     ("cli", "run", "describe", "compare"),
     ("benchmark",),
 )
@@ -73,7 +74,7 @@ DOORS = {
 }
 """Modules that import by name, and why."""
 
-CATALOGUES = ("baselines", "baselines.methods", "curricula")
+CATALOGUES = ("baselines", "baselines.exchanges", "baselines.methods", "curricula")
 """Folders of one file for each of many things of a kind."""
 
 LONG_FILES: dict[str, str] = {}

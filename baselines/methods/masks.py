@@ -5,7 +5,8 @@ Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), on the supermasks of Wortsman 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from baselines.learner import Learner
 from baselines.methods.method import TaskMethod
 from baselines.methods.weights import Weights, flat
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import LARGEST_INT, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -27,6 +28,10 @@ class Masks(TaskMethod):
 
     Stored are c, the scores of each of the curriculum's tasks and those of the present one: 4 P bytes each; a mask
     alone could be kept in P bits.
+
+    Args:
+        backbone_seed: c and the initial scores of each slot come from this seed, so that agents with different seeds
+            have the same ones and can use each other's masks; None: from the agent's own seed.
     """
 
     stackable = True
@@ -35,6 +40,12 @@ class Masks(TaskMethod):
     constant: Tensor  # c, float32 [P]
     scores: Tensor  # of tasks that have ended, by slot; float32 [tasks, P]
     own: nn.ParameterList  # the scores that are trained, float32 [n] of each weight tensor
+
+    def __init__(self, backbone_seed: int | None = None) -> None:
+        super().__init__()
+        rule = f"backbone_seed must be an integer in [0, 2**63) or null, got {backbone_seed!r}"
+        require((backbone_seed is None or is_int(backbone_seed, 0, LARGEST_INT), rule))
+        self.backbone_seed = backbone_seed
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`; the optimiser now trains the scores."""
@@ -46,10 +57,17 @@ class Masks(TaskMethod):
         self.ended = 0
         """Number of tasks whose scores are stored."""
 
+        scores = torch.zeros(self.num_tasks, len(weights))
+        own = self.initial_scores()
+        if self.backbone_seed is not None:
+            with _seeded(self.backbone_seed):
+                agent.reset_parameters()
+                scores = torch.stack([flat(self.initial_scores()) for _ in range(self.num_tasks)])
+            own = [part.clone() for part in weights.split(scores[0])]
         constant = flat([_signed_constant(parameter) for parameter in weights.parameters])
         self.register_buffer("constant", constant.detach())
-        self.register_buffer("scores", torch.zeros(self.num_tasks, len(weights)))
-        self.own = nn.ParameterList(self.initial_scores())
+        self.register_buffer("scores", scores)
+        self.own = nn.ParameterList(own)
         agent.replace_optimiser(self.trainable)
         self._write()
 
@@ -81,7 +99,8 @@ class Masks(TaskMethod):
 
     def init_scores(self) -> None:
         """Initialise a new task's scores."""
-        self.set_scores(self.initial_scores())
+        drawn = self.initial_scores()
+        self.set_scores(drawn if self.backbone_seed is None else self.weights.split(self.scores[self.slot]))
 
     def set_scores(self, scores: Sequence[Tensor]) -> None:
         """Set the trained scores to these values."""
@@ -113,6 +132,19 @@ class Masks(TaskMethod):
         """Return the masked weights of a task."""
         slot = self.slot_of(task)
         return None if not self.started or slot == self.slot else _masked(self.scores[slot], self.constant)
+
+    @torch.no_grad()
+    def scores_of(self, task: int) -> Tensor:
+        """Return a copy of the scores of a task that has started, float32 [P]; of the present one as they are now."""
+        slot = self.started.index(task)
+        return flat(self.current_scores()) if slot == self.slot else self.scores[slot].clone()
+
+    @torch.no_grad()
+    def take_scores(self, scores: Tensor) -> None:
+        """Replace the scores of the present task, [P]; the optimiser keeps its state."""
+        self.set_scores(self.weights.split(scores))
+        self._write()
+        self.agent.weights_changed()
 
     @torch.no_grad()
     def _write(self) -> None:
@@ -187,6 +219,14 @@ def _signed_constant(parameter: Tensor) -> Tensor:
     if parameter.ndim < 2:
         return torch.zeros_like(parameter)
     return parameter.sign() * (2 / parameter[0].numel()) ** 0.5
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Let torch's global generator of the CPU, from which agents are built, be that of a seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        yield
 
 
 def _drawn_scores(parameter: Tensor) -> Tensor:

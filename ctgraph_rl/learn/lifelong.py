@@ -89,11 +89,53 @@ def learn_curriculum(
         torch.Size([3, 2])
     """
     log = RunLog() if log is None else log
+    for learned in learning(curriculum, agent, seed, log, device=device, saved=saved):
+        block = curriculum.block_at(learned.frames)
+        if progress is not None:
+            progress.update(block, learned.frames, learned.episode_return)
+        if checkpoint is not None:
+            checkpoint(learned.state, curriculum.is_end(learned.frames))
+    return log
+
+
+class Learned(NamedTuple):
+    """A batch that an agent has learned from."""
+
+    frames: int  # of the run so far
+    batch: TensorDictBase  # [num_envs, num_steps]
+    episode_return: float  # mean of the episodes that ended in the batch's last block; NaN without any
+    state: Callable[[], dict[str, Any]]
+    """Makes all that the rest of the run depends on, as tensors and plain values, until the next batch is collected."""
+
+
+def learning(
+    curriculum: Curriculum,
+    agent: Agent,
+    seed: int,
+    log: RunLog,
+    *,
+    device: torch.device | str = "cpu",
+    saved: Mapping[str, Any] | None = None,
+) -> Iterator[Learned]:
+    """Check the arguments of `learn_curriculum`, and return an iterator that learns a batch at each step.
+
+    Between two steps the agent may be changed, and torch's global generator given to something else if it is put back.
+
+    Raises:
+        ValueError: before any work, as `learn_curriculum` does.
+    """
     device = checked_device(device)
     check_rows(curriculum, agent.num_envs)
     check_ids(curriculum, agent)
     env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
-    evaluator = Evaluator(curriculum, seed, log, device)
+    return _learning(curriculum, agent, env, Evaluator(curriculum, seed, log, device), saved)
+
+
+def _learning(
+    curriculum: Curriculum, agent: Agent, env: CTGraphEnv, evaluator: Evaluator, saved: Mapping[str, Any] | None
+) -> Iterator[Learned]:
+    """Learn block by block; see `learning`."""
+    log = evaluator.log
     if saved is None:
         evaluator.evaluate_if_due(agent, 0)
     frames = 0 if saved is None else saved["frames"]
@@ -108,14 +150,9 @@ def learn_curriculum(
             frames += batch.numel()
             measurements = _learn(agent, batch, curriculum.block_at(frames), frames)
             episode_return = log_training(log, curriculum, batch, frames - batch.numel(), measurements)
-            if progress is not None:
-                progress.update(curriculum.block_at(frames), frames, episode_return)
-            if checkpoint is not None:
-                state = partial(_state, frames, agent, env, carried=carried, log=log)
-                checkpoint(state, curriculum.is_end(frames))
+            yield Learned(frames, batch, episode_return, partial(_state, frames, agent, env, carried=carried, log=log))
         agent.end_task()
         evaluator.evaluate_if_due(agent, frames)
-    return log
 
 
 class Segment(NamedTuple):

@@ -32,6 +32,11 @@ SECONDS_BETWEEN_ATTEMPTS = 0.5
 """To get a lock that another process has."""
 
 
+def member_folder(folder: Path, number: int) -> Path:
+    """Return the run directory of a member of a collective, counted from 0, within the collective's."""
+    return folder / f"member_{number:03d}"
+
+
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
     """Work in a directory alone; the lock ends with the process, however that ends.

@@ -60,6 +60,9 @@ LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm":
 HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
 """What to do about settings that only some targets take."""
 
+SEEDS_APART = 1000
+"""Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
+
 NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report", "together")
 """Keys of the configuration that do not change results."""
 
@@ -71,13 +74,13 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Name a run's directory: curriculum, agent, cell and method if chosen, seed and a hash of the configuration."""
+    """Name a run's directory: curriculum, agent, cell, method and exchange if chosen, seed and a hash of all."""
     return name_of(_root_, _root_.hydra.runtime.choices)
 
 
 def name_of(cfg: DictConfig, choices: Any) -> str:
     """Return the name of a configuration's run, given the chosen file of each group."""
-    parts = {"cell": (None, "lstm"), "method": ("finetune",)}
+    parts = {"cell": (None, "lstm"), "method": ("finetune",), "exchange": (None, "null")}
     chosen = [choices.get(group) for group, usual in parts.items() if choices.get(group) not in usual]
     learner = "-".join([choices.agent, *chosen])
     seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere
@@ -97,6 +100,16 @@ def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path
     own = deepcopy(cfg)
     own.seed, own.together = seed, True
     return own, folder / name_of(own, choices)
+
+
+def of_member(cfg: DictConfig, number: int) -> DictConfig:
+    """Return the configuration of a member of a collective, from 0: its seed, and its curriculum if they differ."""
+    own = deepcopy(cfg)
+    own.seed = cfg.seed + SEEDS_APART * number if is_int(cfg.seed) else cfg.seed
+    OmegaConf.update(own, "exchange.member", number, force_add=True)
+    if "agent" in cfg.curriculum:
+        own.curriculum.agent = (cfg.curriculum.agent or 0) + number
+    return own
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)

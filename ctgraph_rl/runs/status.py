@@ -96,7 +96,8 @@ def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None)
         return Status(FAILED, _failure(folder))
     if now.results not in (None, before.results):
         return Status(MISSING, "its results are not what was written; the next start says more")
-    return Status(MISSING, "stopped; the next start resumes it" if (folder / LOG).exists() else "not begun")
+    begun = (folder / LOG).exists() or (folder / CHECKPOINTS).exists()
+    return Status(MISSING, "stopped; the next start resumes it" if begun else "not begun")
 
 
 def _failure(folder: Path) -> str:

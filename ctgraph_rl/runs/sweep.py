@@ -21,10 +21,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import CHECKPOINTS
+from ctgraph_rl.log.files import CHECKPOINTS, member_folder
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import become_portable
-from ctgraph_rl.runs.config import check_overwrite, explain, save_yaml
+from ctgraph_rl.runs.config import check_overwrite, explain, of_member, save_yaml
 from ctgraph_rl.runs.status import (
     DONE,
     MISSING,
@@ -180,8 +180,10 @@ class Sweeper(Base):
         from ctgraph_rl.runs.job import changed_code, first_line  # here: a sweep that begins needs no torch
 
         try:
-            self._begun[folder] = tuple((first_line(folder) or {}).get("together", ()))
-            changed, unknown = changed_code(cfg, folder, self._known)
+            shared = "exchange" in cfg  # then the first member stands for all
+            one, run_dir = (of_member(cfg, 0), member_folder(folder, 0)) if shared else (cfg, folder)
+            self._begun[folder] = tuple((first_line(run_dir) or {}).get("together", ()))
+            changed, unknown = changed_code(one, run_dir, self._known)
         except Exception as error:  # of the code of a user, which may have changed so that it cannot be run
             changed, unknown = [f"what builds it, which now fails ({type(error).__name__}: {error}),"], False
         if changed:

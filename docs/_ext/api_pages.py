@@ -48,6 +48,8 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (
             "ctgraph_rl.agent",
             "ctgraph_rl.learn.lifelong",
+            "ctgraph_rl.learn.collective",
+            "ctgraph_rl.learn.messages",
             "ctgraph_rl.log.tables",
             "ctgraph_rl.log.scores",
             "ctgraph_rl.runs.read",

@@ -1,0 +1,125 @@
+"""The base classes of exchanges between the learners of a collective; see `ctgraph_rl.learn.collective`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from baselines.methods.masks import Masks
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import at_least_one, fraction, require
+from ctgraph_rl.learn.collective import Help
+from ctgraph_rl.learn.messages import Fields, Message
+
+
+class Exchange:
+    """An exchange without messages, from which others derive: each member learns alone.
+
+    Args:
+        num_members: learners of the collective.
+        every: batches between two exchanges; the first is after the first batch.
+        drop_prob: probability that a message is lost.
+        delay_prob: probability that a message which is not lost arrives at the next exchange.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+
+    def __init__(self, num_members: int, every: int, drop_prob: float, delay_prob: float) -> None:
+        require(
+            *at_least_one(num_members=num_members, every=every),
+            *fraction(drop_prob=drop_prob, delay_prob=delay_prob),
+        )
+        self.num_members, self.every = num_members, every
+        self.drop_prob, self.delay_prob = drop_prob, delay_prob
+        self.kinds: Mapping[str, Fields] = {}
+
+    def connect(self, agents: Sequence[Agent]) -> None:
+        """See `ctgraph_rl.learn.collective.Exchange`, as for all methods."""
+
+    def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
+        """Do nothing."""
+
+    def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
+        """Send nothing."""
+        return []
+
+    def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
+        """Take over nothing."""
+        return []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore nothing."""
+
+
+class MaskExchange(Exchange):
+    """An exchange of masks, which knows each member's last mean return in each of its tasks.
+
+    All members have the same network behind their masks, so a mask of one is a mask of all.
+    """
+
+    method = "mask_ri"
+    """Name of the method that members need."""
+
+    def connect(self, agents: Sequence[Agent]) -> None:
+        """Take the members' methods.
+
+        Raises:
+            ValueError: if a member has no masks that this exchange knows, or another network than the first member.
+        """
+        methods = [getattr(agent, "method", None) for agent in agents]
+        known = [isinstance(method, Masks) and self.takes(method) for method in methods]
+        name, fix = type(self).__name__, f"take method={self.method}"
+        require(
+            *(
+                (good, f"{name} needs masks, and member {number} has {type(method).__name__}: {fix}")
+                for number, (method, good) in enumerate(zip(methods, known, strict=True))
+            )
+        )
+        self.methods: list[Any] = methods
+        first = self.methods[0].constant
+        require(
+            *(
+                (
+                    torch.equal(first, method.constant),
+                    f"{name} needs one network behind all masks, and member {number} has another than member 0: "
+                    "set method.backbone_seed",
+                )
+                for number, method in enumerate(self.methods)
+            )
+        )
+        self.returns: list[dict[int, float]] = [{} for _ in methods]
+
+    def takes(self, method: Masks) -> bool:
+        """Return whether it can exchange the masks of a method."""
+        return True
+
+    def task_of(self, member: int) -> int:
+        """Return the id of the task that a member learns."""
+        method = self.methods[member]
+        return method.started[method.slot]
+
+    def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
+        """Keep the mean return of the batch, if an episode ended in it."""
+        if not math.isnan(episode_return):
+            self.returns[member][self.task_of(member)] = episode_return
+
+    def return_of(self, member: int, task: int) -> float:
+        """Return a member's last mean return in a task; 0 where it has none."""
+        return self.returns[member].get(task, 0.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the returns."""
+        return {"returns": [dict(each) for each in self.returns]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.returns = [dict(each) for each in state["returns"]]

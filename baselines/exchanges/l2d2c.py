@@ -1,0 +1,88 @@
+"""L2D2-C: learners ask each other for masks of the task that they learn, and take over the best one.
+
+Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. That the first query is after the first batch is our choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from baselines.exchanges.exchange import MaskExchange
+from baselines.methods.masks import CombinedMasks, Masks
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.learn.collective import Help
+from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
+
+SHARE = 0.9
+"""A peer's mask is wanted if this share of its return is more than one's own."""
+
+DIGITS = 6
+"""Digits behind the point with which returns are compared."""
+
+
+class L2D2C(MaskExchange):
+    """Each member asks all others for masks of its present task, by the task's id, and overwrites its own scores.
+
+    A query holds the id and the member's last mean return r, 0 where it has none. A peer offers its mask if its own
+    last return r' in the task is positive and 0.9 r' > r. The member requests the mask with the highest r', of equal
+    ones that of the first peer, and replaces its scores. The optimiser keeps its state.
+    """
+
+    def takes(self, method: Masks) -> bool:
+        """Return whether the mask of a task is made of its own scores alone."""
+        return not isinstance(method, CombinedMasks)
+
+    def connect(self, agents: Sequence[Agent]) -> None:
+        """See `MaskExchange`."""
+        super().connect(agents)
+        about: Fields = {"task": TASK_ID, "reward": Number()}
+        mask: Fields = {**about, "scores": Array((len(self.methods[0].weights),))}
+        self.kinds = {"query": about, "offer": about, "request": {"task": TASK_ID}, "mask": mask}
+
+    def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
+        """Send queries, and answer what was received."""
+        if kind == "query":
+            task = self.task_of(member)
+            return to_all(kind, member, self.num_members, {"task": task, "reward": self.return_of(member, task)})
+        if kind == "request":
+            best = self._best(member, received)
+            return [Message(kind, member, offer.sender, {"task": offer.content["task"]}) for offer in best]
+        is_answered = self._is_better if kind == "offer" else self._is_known
+        answered = [each for each in received if is_answered(member, each)]
+        return [Message(kind, member, each.sender, self._about(kind, member, each)) for each in answered]
+
+    def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
+        """Replace the scores of the present task."""
+        helps = []
+        for mask in self._best(member, received):
+            task, reward = mask.content["task"], mask.content["reward"]
+            self.methods[member].take_scores(mask.content["scores"])
+            values = {"task_id": task, "return_of_sender": reward, "return_before": self.return_of(member, task)}
+            helps.append(Help(mask.sender, member, values))
+        return helps
+
+    def _is_better(self, member: int, query: Message) -> bool:
+        """Return whether a member's mask is worth an offer."""
+        own = self.return_of(member, query.content["task"])
+        return own > 0 and _is_wanted(own, query.content["reward"])
+
+    def _is_known(self, member: int, request: Message) -> bool:
+        """Return whether a member has learned a task."""
+        return request.content["task"] in self.returns[member]
+
+    def _about(self, kind: str, member: int, asked: Message) -> dict[str, object]:
+        """Return the content of an offer or a mask."""
+        task = asked.content["task"]
+        about: dict[str, object] = {"task": task, "reward": self.return_of(member, task)}
+        return about if kind == "offer" else {**about, "scores": self.methods[member].scores_of(task)}
+
+    def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
+        """Return the message of the highest return, of those that still concern the task; none if there is none."""
+        task = self.task_of(member)
+        own = self.return_of(member, task)
+        wanted = [m for m in received if m.content["task"] == task and _is_wanted(m.content["reward"], own)]
+        return sorted(wanted, key=lambda m: (-m.content["reward"], m.sender))[:1]
+
+
+def _is_wanted(reward: float, own: float) -> bool:
+    return round(SHARE * reward, DIGITS) > round(own, DIGITS)

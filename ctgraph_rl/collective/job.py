@@ -1,0 +1,159 @@
+"""One collective of a configuration: each member is an ordinary run in a directory of its own."""
+
+from __future__ import annotations
+
+import io
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.collective.summary import COLLECTIVE, FILES, described, read_collective, write_summary
+from ctgraph_rl.disk import made_folder
+from ctgraph_rl.learn.collective import Exchange, Member, learn_collective
+from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder
+from ctgraph_rl.log.provenance import code_changes, versions
+from ctgraph_rl.log.run_log import SCHEMA, RunLog
+from ctgraph_rl.runs import config, together
+from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.interrupt import Interrupt
+from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished, marked_if_it_fails
+from ctgraph_rl.runs.train import RunDirectory
+
+Runs = Sequence[tuple[Any, Path]]
+"""The configuration and the directory of each member."""
+
+
+def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
+    """Run a configuration: a collective if it has an ``exchange``, or else as `ctgraph_rl.runs.together.run_cells`.
+
+    Returns:
+        The directories of single runs; those of a collective's members are within its own.
+    """
+    if "exchange" not in cfg:
+        return together.run_cells(cfg, run_dir)
+    run_collective(cfg, run_dir)
+    if not config.in_sweep():
+        print(described(read_collective(run_dir)))
+    return []
+
+
+def run_collective(cfg: Any, run_dir: Path) -> None:
+    """Run a collective in an existing directory, unless its results are there.
+
+    Raises:
+        ValueError: before any work, for a value out of range, and members that cannot exchange messages.
+        FileExistsError: if a member's directory holds results that ``overwrite`` does not allow to replace.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    batch = (
+        "together=true trains seeds as one batch, members of a collective learn in turn: leave out together or exchange"
+    )
+    require((cfg.together is False, batch))
+    exchange = config.target(cfg, "exchange")()
+    runs = [(config.of_member(cfg, number), member_folder(run_dir, number)) for number in range(exchange.num_members)]
+    with locked(run_dir):
+        for each, _ in runs:
+            config.check_values(each)
+        if _is_finished(runs, run_dir):
+            print("this configuration was run before; overwrite=true runs it again")
+            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+            return
+        with Interrupt() as interrupt, marked_if_it_fails(run_dir):
+            _learn(cfg, runs, exchange, run_dir, interrupt=interrupt)
+
+
+def _is_finished(runs: Runs, run_dir: Path) -> bool:
+    """Return whether all members' results and the collective's are there."""
+    with redirect_stdout(io.StringIO()):  # each would say so
+        finished = [is_finished(cfg, folder) for cfg, folder in runs]
+    return all(finished) and (run_dir / METRICS).exists()
+
+
+def _learn(cfg: Any, runs: Runs, exchange: Exchange, run_dir: Path, *, interrupt: Interrupt) -> None:
+    """Build the objects of all members, let them learn, and write the results."""
+    checkpoints = Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
+    jobs, random = [], []
+    for number, (each, _) in enumerate(runs):
+        jobs.append(_job(number, each, interrupt))
+        random.append(torch.get_rng_state())
+    exchange.connect([job.agent for job in jobs])
+    if _is_replaced(cfg, runs):
+        checkpoints.clear()
+    with ExitStack() as stack:
+        for _, folder in runs:
+            stack.enter_context(locked(made_folder(folder)))
+        given = zip(jobs, runs, strict=True)
+        directories = [stack.enter_context(job.prepared(folder)) for job, (_, folder) in given]
+        checkpoints.tidy()
+        saved = checkpoints.newest()
+        members = _members(jobs, random, directories, saved)
+        log = _log(cfg, members, run_dir, saved)
+        done, total = 0 if saved is None else saved["frames"], sum(job.curriculum.num_frames for job in jobs)
+        blocks = max(len(job.curriculum.blocks) for job in jobs)
+        how: dict[str, Any] = {"device": jobs[0].device, "saved": saved, "checkpoint": checkpoints.offer}
+        with ProgressBar(blocks, total, directories[0].console, done) as progress:
+            learn_collective(members, exchange, cfg.seed, log, progress, **how)
+        log.close()
+        for directory, member in zip(directories, members, strict=True):
+            directory.finish(member.curriculum, member.agent, member.log)
+        write_summary(run_dir)
+        checkpoints.clear()
+
+
+def _job(number: int, cfg: Any, interrupt: Interrupt) -> Job:
+    """Build the objects of a member.
+
+    Raises:
+        ValueError: names the member.
+    """
+    try:
+        return Job.of(cfg, interrupt)
+    except ValueError as error:
+        agent = f"curriculum.agent={cfg.curriculum.agent}, " if "agent" in cfg.curriculum else ""
+        raise ValueError(f"member {number} ({agent}seed={cfg.seed}): {error}") from error
+
+
+def _is_replaced(cfg: Any, runs: Runs) -> bool:
+    """Return whether the collective begins again, whatever its directory holds."""
+    if cfg.overwrite != config.STALE:
+        return bool(cfg.overwrite)
+    begun = [(first_line(folder), code_of(each, {})) for each, folder in runs]
+    return any(about is not None and code_changes(about, now) for about, now in begun)
+
+
+def _members(
+    jobs: Sequence[Job],
+    random: Sequence[torch.Tensor],
+    directories: Sequence[RunDirectory],
+    saved: Mapping[str, Any] | None,
+) -> list[Member]:
+    """Return the members, their logs open."""
+    states = [None] * len(jobs) if saved is None else saved["members"]
+    return [
+        Member(job.curriculum, job.agent, job.cfg.seed, directory.begin(job.curriculum, job.agent, state), state_of)
+        for job, directory, state, state_of in zip(jobs, directories, states, random, strict=True)
+    ]
+
+
+def _log(cfg: Any, members: Sequence[Member], run_dir: Path, saved: Mapping[str, Any] | None) -> RunLog:
+    """Return the collective's log, new or as it was at a checkpoint."""
+    if saved is not None:
+        (run_dir / METRICS).unlink(missing_ok=True)
+        return RunLog.resume(run_dir / COLLECTIVE, saved["log"])
+    for name in reversed(FILES):
+        (run_dir / name).unlink(missing_ok=True)
+    log = RunLog(run_dir / COLLECTIVE)
+    about = [
+        {"seed": each.seed, "curriculum": each.curriculum.name, "labels": list(each.curriculum.labels)}
+        for each in members
+    ]
+    log.append("collective", schema=SCHEMA, members=about, versions=versions(), config=config.plain(cfg))
+    log.sync()
+    return log

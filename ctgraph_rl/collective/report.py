@@ -1,0 +1,147 @@
+"""A page on collectives: a table of learning time, returns and messages, figures, and the tidy tables of all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
+from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.log.escape import csv_text, markdown_text
+from ctgraph_rl.metrics.record import MASTERED
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
+
+MEASURES = ("learning_time", "share_learned", "final_return")
+
+COLUMNS = (*RUN, "every", "drop_prob", "delay_prob", *MEASURES, *WHAT, "bytes", "helps")
+"""Of ``collectives.csv``: a row for each collective."""
+
+SHOWN = (
+    *("curriculum", "agent", "method", "exchange", "num_members", "seed"),
+    *("learning_time", "share_learned", "final_return", "sent", "dropped", "delayed", "refused", "bytes", "helps"),
+)
+"""Columns of the page's table."""
+
+MEANING = (
+    f"learning_time: mean over members and blocks of the frames until a batch has a mean return of {MASTERED}; a block "
+    "without one counts with all its frames. share_learned: share of blocks with one. final_return: sum over members "
+    "of the mean return of the last five batches of a block. sent, dropped, delayed, refused: messages. bytes: of what "
+    "was sent. helps: masks that were taken over."
+)
+
+MOST_MAPS = 12
+"""Collectives whose map of help is drawn."""
+
+
+def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
+    """Return every collective in or below some folders.
+
+    Raises:
+        ValueError: if there is none; and see `read_collective`.
+    """
+    folders = [log.parent for path in paths for log in sorted(Path(path).rglob(COLLECTIVE))]
+    require((bool(folders), f"no {COLLECTIVE} in or below {', '.join(map(str, paths))}: run one with exchange=l2d2c"))
+    return [read_collective(folder) for folder in dict.fromkeys(folders)]
+
+
+def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
+    """Write ``collectives.md`` with its figures, ``collectives.csv`` and the tidy tables of all collectives.
+
+    Args:
+        paths: directories of collectives, or folders that hold them.
+        folder: where the report goes.
+
+    Returns:
+        The page.
+
+    Raises:
+        ModuleNotFoundError: before any work, without what the extra ``report`` installs.
+        ValueError: if there is no collective, or one cannot be read.
+    """
+    require_packages()
+    found = find_collectives(paths)
+    gallery = Gallery(made_folder(folder))
+    for name, columns, rows in tables(found):
+        write_whole(folder / name, csv_text([columns, *rows]))
+    measured = [_row(each) for each in found]
+    write_whole(
+        folder / "collectives.csv", csv_text([list(COLUMNS), *([row[name] for name in COLUMNS] for row in measured)])
+    )
+    drawn = gallery.write((), _figures(found))
+    head = ["| " + " | ".join(SHOWN) + " |", "|" + "---|" * len(SHOWN)]
+    lines = ["| " + " | ".join(markdown_text(_shown(row[name])) for name in SHOWN) + " |" for row in measured]
+    images = [f"![{each.alt}]({each.path})\n\n{each.caption}" for each in drawn]
+    page = folder / "collectives.md"
+    write_whole(page, "\n\n".join(["# Collectives", "\n".join([*head, *lines]), MEANING, *images]) + "\n")
+    return page
+
+
+def _row(collective: Collective) -> dict[str, Any]:
+    """Return the values of `COLUMNS`."""
+    exchange = collective.config["exchange"]
+    settings = {name: exchange.get(name) for name in ("every", "drop_prob", "delay_prob")}
+    counts = {name: collective.total(name) for name in (*WHAT, "bytes")}
+    measured = {name: getattr(collective, name) for name in MEASURES}
+    return {**collective.about, **settings, **measured, **counts, "helps": len(collective.helps)}
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _figures(found: Sequence[Collective]) -> Iterator[CaptionedFigure]:
+    """Yield the figures: learning time over the number of members, and for each collective who helped whom."""
+    yield CaptionedFigure(
+        "learning_time",
+        "Learning time",
+        "Mean frames that a member needs to learn a block, over the number of members. Marks: single collectives; "
+        "lines: means over seeds. Dotted: the value of the fewest members divided by N.",
+        _draw_times(found),
+    )
+    for each in [each for each in found if each.helps][:MOST_MAPS]:
+        caption = "Masks that each member (row) has taken over from each other (column), members counted from 0."
+        title = (
+            f"Who helped whom: {each.about['exchange']}, {each.about['num_members']} members, seed {each.about['seed']}"
+        )
+        yield CaptionedFigure("helps", title, f"{title}. {caption}", _draw_helps(each))
+
+
+def _draw_times(found: Sequence[Collective]) -> Any:
+    """Draw learning times over numbers of members, a line for each curriculum, agent, method and exchange."""
+    lines: dict[str, dict[int, list[float]]] = {}
+    for each in found:
+        name = " ".join(str(each.about[part]) for part in ("exchange", "curriculum", "agent", "method"))
+        lines.setdefault(name, {}).setdefault(each.about["num_members"], []).append(each.learning_time)
+    figure = new_figure(WIDTH, 2.8)
+    axes = figure.subplots()
+    for position, (name, times) in enumerate(list(lines.items())[:MOST_AGENTS]):
+        numbers, look = sorted(times), agent_style(position)
+        means = [math.fsum(times[number]) / len(times[number]) for number in numbers]
+        axes.plot(numbers, means, label=short(name), **look)
+        axes.plot(numbers, [means[0] * numbers[0] / number for number in numbers], ":", color=look["color"])
+        pairs = [(number, time) for number in numbers for time in times[number]]
+        axes.plot(*zip(*pairs, strict=True), linestyle="", marker=".", markersize=3, color=look["color"])
+    axes.set(xlabel="members", ylabel="frames to learn a block", ylim=(0, None))
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.legend()
+    return figure
+
+
+def _draw_helps(collective: Collective) -> Any:
+    """Draw how often each member has helped each other."""
+    count, by_pair = collective.about["num_members"], collective.by_pair
+    figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
+    axes = figure.subplots()
+    cells = [[by_pair[sender, receiver] for sender in range(count)] for receiver in range(count)]
+    image = axes.imshow(cells, cmap="viridis", vmin=0, interpolation="none")
+    figure.colorbar(image, ax=axes, label="masks taken over")
+    axes.set(xlabel="sender", ylabel="receiver")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_major_locator().set_params(integer=True)
+    return figure

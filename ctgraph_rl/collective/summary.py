@@ -1,0 +1,207 @@
+"""What a collective measured, from its directory: learning times of its members, messages, and who helped whom.
+
+``collective.jsonl`` is written while it learns: its first line names members and configuration, a line ``exchange`` has
+the counts of a kind of message in an exchange, a line ``help`` is what a member took over. All else is made of it and
+of the members' logs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT
+from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.files import LOG, METRICS, member_folder
+from ctgraph_rl.log.run_log import RunLog, write_metrics
+from ctgraph_rl.metrics.record import HERE, MASTERED, Metric
+
+COLLECTIVE = "collective.jsonl"
+"""The log of a collective."""
+
+FILES = (COLLECTIVE, "members.csv", "messages.csv", "helps.csv", METRICS)
+"""Files of a collective's directory, in the order in which they are written."""
+
+LAST = 5
+"""Batches at the end of a block whose mean return is its final one, as in the raw data of MOSAIC."""
+
+WHAT = (SENT, DELIVERED, DROPPED, DELAYED, REFUSED)
+
+RUN = ("curriculum", "agent", "method", "exchange", "num_members", "seed")
+"""First columns of all tables: which collective a row is of."""
+
+
+class Learned(NamedTuple):
+    """What a member learned in a block."""
+
+    member: int  # from 0
+    member_seed: int
+    block: int  # from 1
+    label: str
+    frames: int  # of the block
+    frames_to_learn: int | None  # until a batch had a mean return of `MASTERED`; None if none had
+    final_return: float  # mean of the last batches with finished episodes; NaN without any
+
+
+@dataclass(frozen=True)
+class Collective:
+    """A collective as data.
+
+    Args:
+        path: its directory.
+        about: the values of `RUN`.
+        config: the configuration.
+        learned: of each member and block.
+        messages: a row for each exchange and kind of message.
+        helps: what was taken over.
+    """
+
+    path: Path
+    about: Mapping[str, Any]
+    config: Mapping[str, Any]
+    learned: Sequence[Learned]
+    messages: Sequence[Mapping[str, Any]]
+    helps: Sequence[Mapping[str, Any]]
+
+    @property
+    def learning_time(self) -> float:
+        """Mean frames that a member needs to learn a block; what was not learned counts with all of its frames."""
+        times = [each.frames if each.frames_to_learn is None else each.frames_to_learn for each in self.learned]
+        return math.fsum(times) / len(times)
+
+    @property
+    def share_learned(self) -> float:
+        """Share of the members' blocks that were learned."""
+        return sum(each.frames_to_learn is not None for each in self.learned) / len(self.learned)
+
+    @property
+    def final_return(self) -> float:
+        """Sum of the final returns of all members, each the mean over its blocks; blocks without one count 0."""
+        members = Counter(each.member for each in self.learned)
+        values = [
+            0.0 if math.isnan(each.final_return) else each.final_return / members[each.member] for each in self.learned
+        ]
+        return math.fsum(values)
+
+    def total(self, what: str) -> int:
+        """Return the sum of a column of the messages."""
+        return sum(row[what] for row in self.messages)
+
+    @property
+    def by_pair(self) -> Counter[tuple[int, int]]:
+        """How often a sender has helped a receiver."""
+        return Counter((row["sender"], row["receiver"]) for row in self.helps)
+
+
+def read_collective(path: Path | str) -> Collective:
+    """Read the directory of a collective.
+
+    Raises:
+        ValueError: if it holds none, or a log is damaged.
+        OSError: if a log cannot be read.
+    """
+    path = Path(path)
+    log = RunLog.read(path / COLLECTIVE)
+    [about, *_] = [*log.of_kind("collective"), {}]
+    names = about.get("config"), about.get("members")
+    require((all(names), f"{path / COLLECTIVE} does not say what was run: its first line is missing"))
+    config, members = about["config"], about["members"]
+    called = {part: str(config[part]["_target_"]).rpartition(".")[2] for part in ("agent", "method", "exchange")}
+    run = {"curriculum": members[0]["curriculum"], **called, "num_members": len(members), "seed": config["seed"]}
+    learned = [row for number, each in enumerate(members) for row in _learned(path, number, each)]
+    tables: dict[str, Any] = {"messages": log.of_kind("exchange"), "helps": log.of_kind("help")}
+    return Collective(path, run, config, learned, **tables)
+
+
+def _learned(path: Path, number: int, about: Mapping[str, Any]) -> Iterator[Learned]:
+    """Yield what a member learned in each of its blocks."""
+    log = RunLog.read(member_folder(path, number) / LOG)
+    trained = log.of_kind("run")[0]["trained"]
+    lines: dict[int, list[dict[str, Any]]] = {}
+    for line in log.of_kind("training"):
+        lines.setdefault(line["block"], []).append(line)
+    start = 0
+    for block, own in sorted(lines.items()):
+        known = [(line["frames"], line["return_mean"]) for line in own if line["return_mean"] is not None]
+        reached = [frames - start for frames, value in known if value >= MASTERED]
+        last = [value for _, value in known[-LAST:]]
+        label = " ".join(about["labels"][task - 1] for task in trained[block - 1])
+        end = own[-1]["frames"]
+        final = math.fsum(last) / len(last) if last else math.nan
+        times: dict[str, Any] = {
+            "frames": end - start,
+            "frames_to_learn": min(reached, default=None),
+            "final_return": final,
+        }
+        yield Learned(number, about["seed"], block, label, **times)
+        start = end
+
+
+def described(collective: Collective) -> str:
+    """Return a few lines on a collective."""
+    about, num = collective.about, len(collective.learned)
+    return "\n".join(
+        [
+            f"{about['num_members']} members, {about['exchange']}, {about['curriculum']}: learned "
+            f"{collective.share_learned:.0%} of {num} blocks, {collective.learning_time:,.0f} frames each on average",
+            f"messages: {collective.total(SENT):,} sent, {collective.total(DROPPED):,} lost, "
+            f"{collective.total(DELAYED):,} late, {collective.total(REFUSED):,} refused, "
+            f"{collective.total('bytes'):,} bytes; {len(collective.helps):,} masks taken over",
+            f"results: {collective.path}",
+        ]
+    )
+
+
+def write_summary(run_dir: Path) -> None:
+    """Write the tables of a collective whose members are finished and, last of all, its metrics."""
+    collective = read_collective(run_dir)
+    for name, columns, rows in tables([collective]):
+        write_whole(run_dir / name, csv_text([columns, *rows]))
+    write_metrics(run_dir / METRICS, metrics(collective))
+
+
+def tables(collectives: Sequence[Collective]) -> Iterator[tuple[str, list[str], list[list[Any]]]]:
+    """Yield the name, the columns and the rows of each tidy table, of one or of several collectives."""
+    columns: list[str] = [*RUN, *Learned._fields]
+    yield "members.csv", columns, [[*_run(each), *_plain(row)] for each in collectives for row in each.learned]
+    columns = ["round", "frames", "message", *WHAT, "bytes"]
+    yield "messages.csv", [*RUN, *columns], _rows(collectives, "messages", columns)
+    columns = ["round", "receiver", "sender", "block", "frames"]
+    extra = {name for each in collectives for row in each.helps for name in row} - {*columns, "kind", "seconds"}
+    yield "helps.csv", [*RUN, *columns, *sorted(extra)], _rows(collectives, "helps", [*columns, *sorted(extra)])
+
+
+def _run(collective: Collective) -> list[Any]:
+    return [collective.about[name] for name in RUN]
+
+
+def _plain(row: Learned) -> list[Any]:
+    return [None if isinstance(value, float) and math.isnan(value) else value for value in row]
+
+
+def _rows(collectives: Sequence[Collective], part: str, columns: Sequence[str]) -> list[list[Any]]:
+    return [[*_run(each), *(row.get(name) for name in columns)] for each in collectives for row in getattr(each, part)]
+
+
+def metrics(collective: Collective) -> dict[str, Metric]:
+    """Return the metrics of a collective."""
+    values = {
+        "learning_time": (
+            collective.learning_time,
+            "mean over members and blocks of the frames until a batch has a "
+            f"mean return of {MASTERED}; all frames of a block that has none",
+        ),
+        "share_learned": (collective.share_learned, "share of members' blocks with such a batch"),
+        "final_return": (collective.final_return, f"sum over members of the mean return of the last {LAST} batches"),
+        "messages": (float(collective.total(SENT)), "messages that were sent"),
+        "bytes": (float(collective.total("bytes")), "bytes of their content"),
+        "refused": (float(collective.total(REFUSED)), "messages that were refused"),
+        "helps": (float(len(collective.helps)), "masks that were taken over"),
+    }
+    return {name: Metric(value, f"collective/{name}", formula, HERE) for name, (value, formula) in values.items()}

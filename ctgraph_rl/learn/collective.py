@@ -1,0 +1,324 @@
+"""The loop of a collective: learners that each learn a curriculum of their own, in lock-step, and exchange messages.
+
+Not to be mistaken for `ctgraph_rl.learn.together`, where seeds of one configuration are trained as one batch and share
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import at_least_one, require, require_all
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.learn.lifelong import Learned, OfferCheckpoint, Progress, learning, saved_state_fits
+from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT, Fields, Mail, Message
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+class Help(NamedTuple):
+    """What a learner has taken over from another."""
+
+    sender: int
+    receiver: int
+    values: Mapping[str, float]
+    """Numbers to log by name, such as the sender's return."""
+
+
+class Exchange(Protocol):
+    """What learners of a collective tell each other, such as `baselines.exchanges.l2d2c.L2D2C`.
+
+    It draws nothing from torch's global generator.
+    """
+
+    num_members: int
+    every: int
+    """Batches between two exchanges; the first is after the first batch."""
+
+    drop_prob: float
+    delay_prob: float
+    kinds: Mapping[str, Fields]
+    """The kinds of messages in the order in which they are sent within an exchange, each with its fields."""
+
+    def connect(self, agents: Sequence[Agent]) -> None:
+        """Take the agents of all members, before anything is learned.
+
+        Raises:
+            ValueError: if they cannot exchange messages.
+        """
+        ...
+
+    def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
+        """Called after a member has learned from a batch; see `ctgraph_rl.learn.lifelong.Learned`."""
+        ...
+
+    def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
+        """Return the messages of a kind that a member sends, given those of the kind before that it has received."""
+        ...
+
+    def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
+        """Let a member use the messages of the last kind; return what it has taken over."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs, as tensors and plain Python values."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        ...
+
+
+@dataclass(frozen=True)
+class Member:
+    """A learner of a collective.
+
+    Args:
+        curriculum: what it learns.
+        agent: the learner; another one for each member.
+        seed: of its environment.
+        log: where its measurements are appended.
+        random: the state of torch's global generator that it draws from; by default the present one, so a member is
+            made right after its agent.
+    """
+
+    curriculum: Curriculum
+    agent: Agent
+    seed: int = 0
+    log: RunLog = field(default_factory=RunLog)
+    random: Tensor = field(default_factory=torch.get_rng_state)
+
+
+def learn_collective(
+    members: Sequence[Member],
+    exchange: Exchange,
+    seed: int = 0,
+    log: RunLog | None = None,
+    progress: Progress | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    saved: Mapping[str, Any] | None = None,
+    checkpoint: OfferCheckpoint | None = None,
+) -> RunLog:
+    """Let the members of a collective learn in lock-step, a batch each in turn, with messages between batches.
+
+    A member that takes over nothing has the bits of `learn_curriculum` alone. One that has finished its curriculum
+    still answers the others.
+
+    Args:
+        members: the learners.
+        exchange: what they tell each other, and when.
+        seed: decides which messages are lost or late.
+        log: of the collective: a line ``exchange`` for each exchange that had messages, and a line ``help`` for what a
+            member took over, which is also in its own log, as is what it refused; default: a new one in memory.
+        progress: is updated after each round with the frames of all members and their mean return.
+        device: where the environments live, and the agents.
+        saved: a state that ``checkpoint`` was given, to resume from with the same bits as if nothing had stopped.
+            Members are built as they were, and the logs hold what they held then.
+        checkpoint: is offered the state of all after each round.
+
+    Returns:
+        The log of the collective.
+
+    Raises:
+        ValueError: before any work, for members that are not as many as ``exchange.num_members``, share an agent or a
+            log, or cannot learn their curriculum; each is named by its number, from 0.
+        FloatingPointError: if a loss or weight of a member is not finite; names the member, block and frames.
+    """
+    members, log = require_all(Member, "members", members), RunLog() if log is None else log
+    _check(members, exchange)
+    exchange.connect([member.agent for member in members])
+    collective = _Collective(members, exchange, Mail(exchange.drop_prob, exchange.delay_prob, seed), log)
+    collective.start(checked_device(device), saved)
+    while advanced := collective.advance():
+        if progress is not None:
+            block, returns = collective.block(advanced), [learned.episode_return for learned in advanced.values()]
+            known = [value for value in returns if not math.isnan(value)]
+            progress.update(block, collective.frames, sum(known) / len(known) if known else math.nan)
+        if checkpoint is not None:
+            ends = any(members[number].curriculum.is_end(each.frames) for number, each in advanced.items())
+            checkpoint(collective.state, ends)
+    return log
+
+
+def _check(members: Sequence[Member], exchange: Exchange) -> None:
+    """Refuse members that are too many, too few, or not apart."""
+    count, agents, logs = len(members), {id(each.agent) for each in members}, {id(each.log) for each in members}
+    other = f"num_members must be the number of members, {count}, got {exchange.num_members!r}"
+    require(
+        (exchange.num_members == count, other),
+        (len(agents) == count, "members must have an agent each, some share one; build one with each seed"),
+        (len(logs) == count, "members must have a log each, some share one; leave it out for new ones"),
+        *at_least_one(every=exchange.every),
+    )
+
+
+class _Learner:
+    """A member that learns batch by batch, with a state of torch's global generator of its own."""
+
+    def __init__(self, number: int, member: Member, device: torch.device, saved: Mapping[str, Any] | None) -> None:
+        self.number, self.member, self.device, self.saved = number, member, device, saved
+        self.random, self.random_cuda = member.random, _cuda_stream(member.seed, device)
+        self.last: Learned | None = None
+        self.frames = 0 if saved is None else saved["frames"]
+        self.is_done = saved is not None and saved["done"]
+        try:
+            given = None if self.is_done else saved
+            with self.drawing():
+                how: dict[str, Any] = {"device": device, "saved": given}
+                self.steps = learning(member.curriculum, member.agent, member.seed, member.log, **how)
+        except ValueError as error:
+            raise ValueError(f"member {number}: {error}") from error
+        if self.is_done:
+            with saved_state_fits():
+                member.agent.load_state_dict(saved["agent"])  # type: ignore[index]
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Let torch's global generators be those of this member."""
+        before, before_cuda = torch.get_rng_state(), self._cuda_state()
+        torch.set_rng_state(self.random)
+        self._set_cuda_state(self.random_cuda)
+        try:
+            yield
+        finally:
+            self.random, self.random_cuda = torch.get_rng_state(), self._cuda_state()
+            torch.set_rng_state(before)
+            self._set_cuda_state(before_cuda)
+
+    def _cuda_state(self) -> Tensor | None:
+        return torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
+
+    def _set_cuda_state(self, state: Tensor | None) -> None:
+        if state is not None:
+            torch.cuda.set_rng_state(state, self.device)
+
+    def advance(self) -> Learned | None:
+        """Learn from the next batch; None at the end of the curriculum."""
+        if self.is_done:
+            return None
+        try:
+            with self.drawing():
+                learned = next(self.steps, None)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"member {self.number}: {error}") from None
+        self.is_done = learned is None
+        if learned is not None:
+            self.last, self.frames = learned, learned.frames
+        return learned
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the rest of this member's run depends on; a run alone cannot resume it."""
+        with self.drawing():
+            if self.last is not None:
+                return {**self.last.state(), "done": self.is_done}
+        saved: Mapping[str, Any] = self.saved or {}
+        return {**saved, "agent": self.member.agent.state_dict(), "log": self.member.log.position()}
+
+
+def _cuda_stream(seed: int, device: torch.device) -> Tensor | None:
+    """Return the state of a GPU's generator of a run with this seed; None on a CPU."""
+    return torch.Generator(device).manual_seed(seed).get_state() if device.type == "cuda" else None
+
+
+class _Collective:
+    """All members, and what is between them."""
+
+    def __init__(self, members: Sequence[Member], exchange: Exchange, mail: Mail, log: RunLog) -> None:
+        self.members, self.exchange, self.mail, self.log = members, exchange, mail, log
+        self.rounds = 0
+        self.learners: list[_Learner] = []
+
+    def start(self, device: torch.device, saved: Mapping[str, Any] | None) -> None:
+        """Let all members begin, or go back to a saved state."""
+        states: Sequence[Any] = [None] * len(self.members) if saved is None else saved["members"]
+        count = f"the saved state has {len(states)} members, there are {len(self.members)}; start again"
+        require((len(states) == len(self.members), count))
+        self.learners = [
+            _Learner(number, member, device, state)
+            for number, (member, state) in enumerate(zip(self.members, states, strict=True))
+        ]
+        if saved is not None:
+            self.rounds = saved["rounds"]
+            self.mail.load_state_dict(saved["mail"])
+            with saved_state_fits():
+                self.exchange.load_state_dict(saved["exchange"])
+
+    @property
+    def frames(self) -> int:
+        """Frames that all members have learned from."""
+        return sum(learner.frames for learner in self.learners)
+
+    def block(self, advanced: Mapping[int, Learned]) -> int:
+        """Return the highest block that is learned, from 1."""
+        return max(self.members[number].curriculum.block_at(each.frames) for number, each in advanced.items())
+
+    def advance(self) -> dict[int, Learned]:
+        """Let each member learn from a batch, and all exchange messages if it is time; return who has learned."""
+        found = {learner.number: learner.advance() for learner in self.learners}
+        advanced = {number: learned for number, learned in found.items() if learned is not None}
+        for number, learned in advanced.items():
+            self.exchange.observe(number, learned.batch, learned.episode_return)
+        if advanced and self.rounds % self.exchange.every == 0:
+            self._exchange()
+        self.rounds += 1
+        return advanced
+
+    def _exchange(self) -> None:
+        """Send messages of one kind after the other, and let members use the last."""
+        self.mail.begin()
+        received: dict[int, list[Message]] = {number: [] for number in range(len(self.members))}
+        for kind in self.exchange.kinds:
+            for number, messages in received.items():
+                for message in self.exchange.send(kind, number, messages):
+                    self._post(message)
+            received = {number: self._take(number, kind) for number in received}
+        for number, messages in received.items():
+            for given in self.exchange.receive(number, messages):
+                self._log_help(given)
+        for kind in sorted({of for of, _ in self.mail.counts}):
+            counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED, REFUSED)}
+            where = {"round": self.rounds, "frames": self.frames, "message": kind}
+            self.log.append("exchange", **where, **counts, bytes=self.mail.bytes[kind])
+
+    def _post(self, message: Message) -> None:
+        others = set(range(len(self.members))) - {message.sender}
+        wrong = f"a {message.kind} goes from learner {message.sender} to {message.receiver}, which is no other member"
+        require((message.receiver in others, wrong))
+        self.mail.post(message)
+
+    def _take(self, number: int, kind: str) -> list[Message]:
+        good, refused = self.mail.take(number, kind, self.exchange.kinds)
+        for message, reason in refused:
+            self.members[number].log.append("refused", **self._place(number), sender=message.sender, reason=reason)
+        return good
+
+    def _log_help(self, given: Help) -> None:
+        values = {"sender": given.sender, **given.values}
+        self.members[given.receiver].log.append("help", **self._place(given.receiver), **values)
+        self.log.append("help", round=self.rounds, **self._place(given.receiver), receiver=given.receiver, **values)
+
+    def _place(self, number: int) -> dict[str, int]:
+        """Return the block of a member, and its frames so far."""
+        frames = self.learners[number].frames
+        return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the rest of the run depends on, as tensors and plain values."""
+        return {
+            "frames": self.frames,
+            "rounds": self.rounds,
+            "members": [learner.state() for learner in self.learners],
+            "exchange": self.exchange.state_dict(),
+            "mail": self.mail.state_dict(),
+            "log": self.log.position(),
+        }

@@ -1,0 +1,183 @@
+"""Messages between learners: what they may hold is checked, and some are lost or late, by a random stream of their own.
+
+A message holds tensors and numbers by name. A receiver refuses one whose kind, names, shapes or values are not those
+that its exchange states, and counts it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.checks import LARGEST_INT, fraction, is_int, is_real, require
+
+BYTES_OF_A_NUMBER = 8
+
+SENT, DROPPED, DELAYED, DELIVERED, REFUSED = "sent", "dropped", "delayed", "delivered", "refused"
+"""What is counted of the messages of a kind; a delayed one is also delivered or refused, later."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """What one learner sends to another.
+
+    Args:
+        kind: such as ``query``.
+        sender: number of a learner, from 0.
+        receiver: number of another.
+        content: tensors and numbers by name.
+    """
+
+    kind: str
+    sender: int
+    receiver: int
+    content: Mapping[str, Any]
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of the content: those of tensors, and eight for each number."""
+        return sum(
+            value.numel() * value.element_size() if isinstance(value, Tensor) else BYTES_OF_A_NUMBER
+            for value in self.content.values()
+        )
+
+
+class Number(NamedTuple):
+    """A finite number in [low, high]."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    whole: bool = False
+
+    def why_not(self, value: Any) -> str | None:
+        """Return what is wrong with a value; None if nothing is."""
+        is_number = is_int if self.whole else is_real
+        if not is_number(value):
+            return f"no finite {'integer' if self.whole else 'number'}"
+        return None if self.low <= value <= self.high else f"not in [{self.low}, {self.high}]"
+
+
+class Array(NamedTuple):
+    """A tensor of this shape and type whose elements are finite."""
+
+    shape: tuple[int, ...]
+    dtype: torch.dtype = torch.float32
+
+    def why_not(self, value: Any) -> str | None:
+        """Return what is wrong with a value; None if nothing is."""
+        if not isinstance(value, Tensor):
+            return "no tensor"
+        if tuple(value.shape) != self.shape or value.dtype != self.dtype:
+            return f"{value.dtype} {list(value.shape)} instead of {self.dtype} {list(self.shape)}"
+        return None if bool(value.isfinite().all()) else "not finite"
+
+
+Fields = Mapping[str, Number | Array]
+"""What the content of a kind of message must be, by name."""
+
+TASK_ID = Number(0, LARGEST_INT, whole=True)
+
+
+def why_refused(message: Message, kinds: Mapping[str, Fields]) -> str | None:
+    """Return why a message must not be used; None if it may.
+
+    Args:
+        message: what was received.
+        kinds: the fields of each kind of message that the receiver knows.
+    """
+    fields = kinds.get(message.kind)
+    if fields is None:
+        return f"unknown kind {message.kind!r:.40}"
+    if message.content.keys() != fields.keys():
+        return f"a {message.kind} with other fields than {', '.join(fields)}"
+    wrong = {name: field.why_not(message.content[name]) for name, field in fields.items()}
+    return next((f"{name} of a {message.kind}: {why}" for name, why in wrong.items() if why is not None), None)
+
+
+class Mail:
+    """Takes messages to their receivers; each is lost or late with a stated probability, independently of all others.
+
+    A late message arrives at the next exchange. Two numbers are drawn for each message, whatever the probabilities are.
+
+    Args:
+        drop_prob: probability that a message is lost.
+        delay_prob: probability that one which is not lost is late.
+        seed: decides which.
+
+    Raises:
+        ValueError: for probabilities outside [0, 1].
+    """
+
+    def __init__(self, drop_prob: float = 0.0, delay_prob: float = 0.0, seed: int = 0) -> None:
+        require(*fraction(drop_prob=drop_prob, delay_prob=delay_prob))
+        self.drop_prob, self.delay_prob = drop_prob, delay_prob
+        self.generator = torch.Generator().manual_seed(seed)
+        self.here: list[Message] = []
+        self.late: list[Message] = []
+        self.counts: Counter[tuple[str, str]] = Counter()
+        """Messages by kind and by what happened to them, since the last `begin`."""
+
+        self.bytes: Counter[str] = Counter()
+        """Bytes that were sent by kind of message, since the last `begin`."""
+
+    def begin(self) -> None:
+        """Begin an exchange: what was late at the last one is here, and counts start at zero."""
+        self.here, self.late = [*self.here, *self.late], []
+        self.counts.clear()
+        self.bytes.clear()
+
+    def post(self, message: Message) -> None:
+        """Send a message."""
+        lost, late = torch.rand(2, generator=self.generator).tolist()
+        self.counts[message.kind, SENT] += 1
+        self.bytes[message.kind] += message.num_bytes
+        if lost < self.drop_prob:
+            self.counts[message.kind, DROPPED] += 1
+        elif late < self.delay_prob:
+            self.counts[message.kind, DELAYED] += 1
+            self.late.append(message)
+        else:
+            self.here.append(message)
+
+    def take(
+        self, receiver: int, kind: str, kinds: Mapping[str, Fields]
+    ) -> tuple[list[Message], list[tuple[Message, str]]]:
+        """Return what a receiver has got of a kind: what it may use, and what it refuses with the reason.
+
+        Args:
+            receiver: number of a learner.
+            kind: messages of this kind, and of kinds that are unknown.
+            kinds: the fields of each known kind.
+        """
+        own = [
+            each for each in self.here if each.receiver == receiver and (each.kind == kind or each.kind not in kinds)
+        ]
+        self.here = [each for each in self.here if all(each is not other for other in own)]
+        reasons = [(each, why_refused(each, kinds)) for each in own]
+        for each, reason in reasons:
+            self.counts[each.kind, DELIVERED if reason is None else REFUSED] += 1
+        return [each for each, reason in reasons if reason is None], [(each, why) for each, why in reasons if why]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the random stream and the late messages, as tensors and plain values."""
+        return {"random": self.generator.get_state(), "late": [_as_plain(message) for message in self.late]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.generator.set_state(state["random"])
+        self.late = [Message(**message) for message in state["late"]]
+
+
+def _as_plain(message: Message) -> dict[str, Any]:
+    return {**vars(message), "content": dict(message.content)}
+
+
+def to_all(kind: str, sender: int, num_members: int, content: Mapping[str, Any]) -> list[Message]:
+    """Return a message to every other learner."""
+    return [Message(kind, sender, other, content) for other in range(num_members) if other != sender]
