@@ -129,6 +129,9 @@ class Group:
         while given := self._next(minibatches):
             steps.append(self._update(stack, given))
         stack.write()
+        for agent in self.agents:
+            if isinstance(agent, AgentWithMethod):
+                agent.method.after_learning()
         names = list(steps[0])
         table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
         pairs = zip(self.learners, table, strict=True)

@@ -201,14 +201,14 @@ class CombinedMasks(Masks):
         if not earlier:
             return super().current_scores()
         old = self.weights.split(self.scores[..., :earlier, :])
-        return list(map(_combined, self.betas[..., : earlier + 1].unbind(-2), old, self.own))
+        return list(map(combined, self.betas[..., : earlier + 1].unbind(-2), old, self.own))
 
 
 def _masked(scores: Tensor, constant: Tensor) -> Tensor:
     return torch.where(scores >= 0, constant, 0.0)
 
 
-def _combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
+def combined(betas: Tensor, old: Tensor, new: Tensor) -> Tensor:
     """Combine earlier scores of a weight tensor, [..., k, n], with new ones, [..., n], by shares of a softmax."""
     shares = betas.softmax(dim=-1)  # by the tensor: the compiler of torch 2.13 fails at eight numbers for all of them
     return (shares[..., :-1, None] * old).sum(dim=-2) + shares[..., -1:] * new

@@ -103,6 +103,9 @@ class Method(Hooks):
     def on_batch(self, batch: TensorDictBase) -> None:
         """Called with each batch, [num_envs, num_steps], before the agent learns from it."""
 
+    def after_learning(self) -> None:
+        """Called after the agent has learned from a batch."""
+
     def task_weights(self, task: int) -> Tensor | None:
         """Return the weights to act with in a task, float32 [P]; None for the present ones."""
         return None
@@ -221,4 +224,6 @@ class AgentWithMethod(nn.Module):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Show the method a batch, and learn from it."""
         self.method.on_batch(batch)
-        return self.agent.learn(batch)
+        measured = self.agent.learn(batch)
+        self.method.after_learning()
+        return measured

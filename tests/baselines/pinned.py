@@ -24,7 +24,8 @@ REPLAY = ["agent.num_updates=1", "agent.batch_size=4", "agent.buffer_size=64", "
 MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=1"]
 METHODS = {
     "clear": ["method.buffer_size=48"],
-    **{name: ["method.num_samples=4"] for name in ("ewc", "ewc_published", "mas")},
+    "mask_sc": ["method.num_samples=4", "method.every=1", "method.threshold=-1"],
+    **{name: ["method.num_samples=4"] for name in ("ewc", "ewc_published", "mas", "mask_amsc")},
 }
 FRAMES = (32, 64)
 """Of the blocks: one batch and two, so that penalties of what was learned before act."""

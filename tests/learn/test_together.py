@@ -308,6 +308,7 @@ def test_what_cannot_be_one_batch_says_why(compose):
 
     assert reason("lstm_ppo", "finetune") == "LSTMPPO cannot be vectorised over seeds"
     assert reason("ppo", "packnet") == "PackNet cannot be vectorised over seeds"
+    assert reason("ppo", "mask_amsc") == "MaskAMSC cannot be vectorised over seeds"
     assert reason("dqn") is reason("ppo", "mask_lc") is None
     switching = of(Block((ONE, TWO), 96, ByEpisode(2, together=True)), boundaries="hidden")
     assert why_not_together(switching) == "its blocks change the tasks of all rows at once"

@@ -29,6 +29,8 @@ SETTINGS = {
     "ewc_published": ["method.num_samples=8"],
     "l2": ["method.heads=multi"],
     "mas": ["method.num_samples=8"],
+    "mask_amsc": ["method.num_samples=8", "method.competence_gate=false", "method.shuffled=true"],
+    "mask_sc": ["method.num_samples=8", "method.every=1", "method.threshold=-1"],
     "si": ["method.heads=single"],
 }
 """Overrides that make a method small, or meet more of it."""
@@ -78,7 +80,7 @@ def life(compose, agent: str, method: str, *overrides: str, curriculum: Curricul
 # What is refused
 
 
-NEEDS_IDS = ("mask_blc", "mask_lc", "mask_ri", "packnet", "scratch")
+NEEDS_IDS = ("mask_amsc", "mask_blc", "mask_lc", "mask_ri", "mask_sc", "packnet", "scratch")
 NEEDS_BOUNDARIES = ("ewc", "ewc_published", "l2", "mas", "si", *NEEDS_IDS)
 FREE = ("clear", "finetune", "multitask")
 
@@ -168,6 +170,13 @@ WRONG = [
     ("ewc", "num_samples=0", "num_samples must be an integer >= 1, got 0"),
     ("l2", "heads=two", "heads must be one of auto, single, multi, got 'two'"),
     ("mas", "num_samples=1.5", "num_samples must be an integer >= 1, got 1.5"),
+    ("mask_amsc", "distance=near", "distance must be one of cosine, l2, got 'near'"),
+    ("mask_amsc", "temperature=0", "temperature must be a number > 0, got 0"),
+    ("mask_amsc", "num_samples=20000", "at least num_samples=20000, or no task is embedded, got 10000"),
+    ("mask_sc", "embedding=ot", "embedding must be one of lwe, swe, got 'ot'"),
+    ("mask_sc", "every=0", "every must be an integer >= 1, got 0"),
+    ("mask_sc", "selection=best", "selection must be one of similarity, random, none, all, parent, depth_prefix, got"),
+    ("mask_sc", "threshold=2", r"threshold must be a number in \[-1, 1\], got 2"),
     ("packnet", "retrain=1", r"retrain must be a number in \[0, 1\), got 1"),
     ("si", "epsilon=0", "epsilon must be a number > 0, got 0"),
 ]

@@ -19,6 +19,7 @@ from baselines.methods.clear import CLEAR, Reservoir
 from baselines.methods.ewc import EWC
 from baselines.methods.l2 import L2
 from baselines.methods.mas import MAS
+from baselines.methods.mask_amsc import MaskAMSC
 from baselines.methods.mask_blc import MaskBLC
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
@@ -285,9 +286,14 @@ def test_the_samples_of_a_task_are_stored_until_its_end(compose):
 # Compiled steps
 
 
+AMSC = {"distance": "cosine", "z_score": True, "temperature": 1.0, "shuffled": False, "every": 1, "embedding": "lwe"}
+AMSC |= {"competence_gate": False, "competence_batches": 1, "num_samples": 8, "buffer_size": 64}
+AMSC |= {"num_references": 4, "num_directions": 4, "num_quantiles": 4}
+
 COMPILED = {
     "clear": (lambda: CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0)),
     "ewc": (lambda: EWC(**OF_EWC, heads="multi")),
+    "mask_amsc": (lambda: MaskAMSC(**AMSC)),
     "mask_lc": MaskLC,
     "mask_ri": MaskRI,
     "packnet": (lambda: PackNet(retrain=0.5)),

@@ -1,0 +1,145 @@
+"""AMSC: modulating masks that combine the tasks that stand out by their similarity, by a sparsemax.
+
+It follows the public repository DMIU-ShELL/AMSC at commit 075e23e of 2026-07-02, described from facts about it: its
+code was not used. There is no paper with a public text, and the repository changes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from baselines.learner import Learner
+from baselines.methods.selection import STREAM, SelectedMasks, own_generator
+from baselines.methods.weights import Weights
+from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+DISTANCES = ("cosine", "l2")
+
+SMALLEST_DEVIATION = 1e-3
+"""Similarities are divided by no less."""
+
+
+class MaskAMSC(SelectedMasks):
+    """`SelectedMasks` with the support of a sparsemax: w = sparsemax(t / temperature), selected are those with w > 0.
+
+    t are the similarities to all earlier tasks, standardised over them, without those of tasks that were not learned:
+    a task's competence is its mean training return in its last batches. AMSC takes the return of the evaluation right
+    after the task, an oracle here, as a learner sees no evaluation. With two earlier tasks exactly one is selected, and
+    so is an only one, however dissimilar.
+
+    Args:
+        distance: ``cosine`` of the embeddings is the similarity, or minus their Euclidean distance, ``l2``.
+        z_score: standardise similarities over the earlier tasks.
+        temperature: of the sparsemax.
+        competence_gate: leave out tasks whose competence is not above 0.
+        competence_batches: batches that the competence is the mean return of.
+        shuffled: select as many tasks at random instead, by a random stream of its own.
+        settings: the arguments of `SelectedMasks`.
+    """
+
+    def __init__(
+        self,
+        distance: str,
+        z_score: bool,
+        temperature: float,
+        competence_gate: bool,
+        competence_batches: int,
+        shuffled: bool,
+        **settings: Any,
+    ) -> None:
+        super().__init__(**settings)
+        require(
+            *one_of(DISTANCES, distance=distance),
+            *true_or_false(z_score=z_score, competence_gate=competence_gate, shuffled=shuffled),
+            *positive(temperature=temperature),
+            *at_least_one(competence_batches=competence_batches),
+        )
+        self.distance, self.z_score, self.temperature = distance, z_score, temperature
+        self.competence_gate, self.shuffled = competence_gate, shuffled
+        self.competence: dict[int, float] = {}
+        """Of the tasks that have ended, by slot."""
+
+        self.returns: deque[tuple[float, int]] = deque(maxlen=competence_batches)
+        """Sums of the returns of the episodes that ended in the last batches, and their numbers."""
+
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().setup(agent, weights, curriculum)
+        self.shuffle = own_generator(STREAM + 1)
+
+    def start_task(self, task: int | None) -> None:
+        """Start with nothing selected and no returns."""
+        super().start_task(task)
+        self.returns.clear()
+
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Keep the transitions and the returns of finished episodes."""
+        super().on_batch(batch)
+        after = batch["next"]
+        ended = after["episode_reward"][after["done"]]
+        self.returns.append((float(ended.sum()), ended.numel()))
+
+    def end_task(self) -> None:
+        """Store the task's scores and its competence."""
+        super().end_task()
+        total, number = (sum(each) for each in zip(*self.returns, strict=True)) if self.returns else (0.0, 0)
+        self.competence[self.slot] = min(max(total / max(number, 1), 0.0), 1.0)
+
+    def choose(self) -> list[int]:
+        """Return the support of the sparsemax, or as many others."""
+        known = self.embeddings.of_slot
+        earlier = [slot for slot in range(self.num_combined) if slot in known]
+        if self.slot not in known or not earlier:
+            return []
+        given = similarities(known[self.slot], torch.stack([known[slot] for slot in earlier]), self.distance)
+        given = standardised(given) if self.z_score else given
+        able = torch.tensor([not self.competence_gate or self.competence[slot] > 0 for slot in earlier])
+        candidates = torch.tensor(earlier)[able]
+        support = candidates[sparsemax(given[able] / self.temperature) > 0]
+        if self.shuffled:
+            support = candidates[torch.randperm(len(candidates), generator=self.shuffle)[: len(support)]]
+        return support.tolist()
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return competences, returns and the state of the stream that shuffles."""
+        own = {"competence": dict(self.competence), "returns": list(self.returns), "shuffle": self.shuffle.get_state()}
+        return {**super().get_extra_state(), **own}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self.competence = dict(state["competence"])
+        self.returns.clear()
+        self.returns.extend((total, number) for total, number in state["returns"])
+        self.shuffle.set_state(state["shuffle"].cpu())
+
+
+def similarities(embedding: Tensor, others: Tensor, distance: str) -> Tensor:
+    """Return how similar an embedding of norm 1, [Z], is to others, [n, Z]: [n]."""
+    return others @ embedding if distance == "cosine" else -(others - embedding).norm(dim=1)
+
+
+def standardised(values: Tensor) -> Tensor:
+    """Return values minus their mean, divided by their standard deviation or `SMALLEST_DEVIATION`, [n]."""
+    return (values - values.mean()) / values.std(correction=0).clamp(min=SMALLEST_DEVIATION)
+
+
+def sparsemax(values: Tensor) -> Tensor:
+    """Return the probabilities that are nearest to values, [n], most of which are 0.
+
+    Martins and Astudillo 2016 (arXiv 1602.02068): w = max(z - tau, 0), tau = (sum of the K largest - 1) / K, with the
+    largest K that has 1 + K z_(K) > sum of the K largest.
+    """
+    ordered, counts = values.sort(descending=True).values, torch.arange(1, len(values) + 1)
+    sums = ordered.cumsum(0)
+    held = (1 + counts * ordered > sums).nonzero().flatten()
+    if not len(held):  # no values
+        return values
+    last = held[-1]
+    return (values - (sums[last] - 1) / counts[last]).clamp(min=0.0)

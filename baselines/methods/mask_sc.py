@@ -1,0 +1,94 @@
+"""MaskSC: modulating masks that combine the tasks that are most similar, or that an oracle names.
+
+Described from facts about the public repository DMIU-ShELL/MaskSC (2026), which has no paper with a public text. Its
+code was not used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from baselines.learner import Learner
+from baselines.methods.selection import SelectedMasks
+from baselines.methods.weights import Weights
+from ctgraph_rl.checks import at_least_one, is_real, one_of, require
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+SELECTIONS = ("similarity", "random", "none", "all", "parent", "depth_prefix")
+
+ORACLES = ("all", "parent", "depth_prefix")
+"""Selected from a task's start; the last two are read from the curriculum, which a learner does not know."""
+
+
+class MaskSC(SelectedMasks):
+    """`SelectedMasks` with the most similar tasks: a cosine of embeddings above a threshold, and the highest of those.
+
+    Other selections are references. ``all`` is Mask LC and ``none`` is Mask RI, bit by bit; ``random`` are ``top_k``
+    earlier tasks, drawn again at each selection. Two are an oracle's, who knows images and goals: ``depth_prefix`` are
+    all earlier tasks with the same images whose goal is the beginning of this one's, ``parent`` is the last of them.
+
+    Not known, and decided here: the embedding is the moving average of AMSC, and the first selection is after ``every``
+    batches.
+
+    Args:
+        selection: one of `SELECTIONS`.
+        threshold: the cosine must be larger, in [-1, 1].
+        top_k: most tasks that are selected.
+        settings: the arguments of `SelectedMasks`.
+    """
+
+    def __init__(self, selection: str, threshold: float, top_k: int, **settings: Any) -> None:
+        super().__init__(**settings)
+        rule = f"threshold must be a number in [-1, 1], got {threshold!r}"
+        require(*one_of(SELECTIONS, selection=selection), *at_least_one(top_k=top_k), (is_real(threshold, -1, 1), rule))
+        self.selection, self.threshold, self.top_k = selection, threshold, top_k
+        self.compares = selection == "similarity"
+
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().setup(agent, weights, curriculum)
+        ids = curriculum.task_ids
+        self.task_of = {ids[task]: task for task in curriculum.tasks}
+
+    def start_task(self, task: int | None) -> None:
+        """Start with what an oracle selects, or nothing."""
+        super().start_task(task)
+        if self.num_combined and self.selection in ORACLES:
+            self.select(self.choose())
+
+    def choose(self) -> list[int]:
+        """Return the slots that the selection names."""
+        earlier = range(self.num_combined)
+        if self.selection == "similarity":
+            return self._similar()
+        if self.selection == "random":
+            return torch.randperm(len(earlier), generator=self.generator)[: self.top_k].tolist()
+        if self.selection in ("all", "none"):
+            return [*earlier] if self.selection == "all" else []
+        tasks = [self.task_of[number] for number in self.started]
+        family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[self.slot])]
+        return family if self.selection == "depth_prefix" else family[-1:]
+
+    def _similar(self) -> list[int]:
+        known = self.embeddings.of_slot
+        if self.slot not in known:
+            return []
+        cosines = {slot: float(known[slot] @ known[self.slot]) for slot in range(self.num_combined) if slot in known}
+        near = [slot for slot, cosine in cosines.items() if cosine > self.threshold]
+        return sorted(near, key=lambda slot: -cosines[slot])[: self.top_k]
+
+
+def is_prefix(one: Task, other: Task) -> bool:
+    """Return whether a task has the images of another, as many as it needs, and a goal on the way to the other's."""
+    alike = _without_number(one.images) == _without_number(other.images)
+    return alike and one.goal == other.goal[: len(one.goal)] and len(one.goal) < len(other.goal)
+
+
+def _without_number(images: Any) -> Any:
+    """Return images with the number of them set to 1, where it is theirs to say."""
+    given = [each.name for each in getattr(images, "__dataclass_fields__", {}).values() if each.init]
+    return replace(images, num_images=1) if "num_images" in given else images

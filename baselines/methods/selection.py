@@ -1,0 +1,234 @@
+"""The base class of masks that combine a selection of the earlier tasks, and what selects: embeddings of tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from baselines.embedding import linear_wasserstein, reference_points, sliced_wasserstein, transitions, unit_directions
+from baselines.learner import Learner
+from baselines.methods.mask_lc import MaskLC
+from baselines.methods.masks import combined
+from baselines.methods.weights import Weights
+from ctgraph_rl.checks import at_least_one, one_of, require
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+EMBEDDINGS = ("lwe", "swe")
+
+STREAM = 0x5E1EC7
+"""Added to the agent's seed for what a selection draws, so that its own stream is untouched."""
+
+
+def own_generator(stream: int = STREAM) -> torch.Generator:
+    """Return a generator whose stream depends on the seed of torch's global one, from which nothing is drawn."""
+    return torch.Generator().manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
+
+
+class TaskEmbeddings:
+    """A moving average of the embeddings of samples for each task, by slot.
+
+    After each batch ``num_samples`` of the last ``buffer_size`` transitions of the present task are drawn without
+    replacement, and embedded in a direction e; the task's embedding is z <- norm(z / 2 + e / 2), e at first.
+
+    Args:
+        embedding: ``lwe``, linear Wasserstein, or ``swe``, sliced Wasserstein.
+        num_samples: N.
+        buffer_size: transitions that are kept; at least N.
+        num_references: M, of ``lwe``.
+        num_directions: L, of ``swe``.
+        num_quantiles: along each direction, of ``swe``.
+    """
+
+    def __init__(
+        self,
+        embedding: str,
+        num_samples: int,
+        buffer_size: int,
+        num_references: int,
+        num_directions: int,
+        num_quantiles: int,
+    ) -> None:
+        counts = {"num_samples": num_samples, "num_references": num_references, "num_directions": num_directions}
+        require(*one_of(EMBEDDINGS, embedding=embedding))
+        require(*at_least_one(**counts, buffer_size=buffer_size, num_quantiles=num_quantiles))
+        message = f"buffer_size must be at least num_samples={num_samples}, or no task is embedded, got {buffer_size}"
+        require((buffer_size >= num_samples, message))
+        self.embedding, self.num_samples, self.buffer_size = embedding, num_samples, buffer_size
+        self.num_references, self.num_directions, self.num_quantiles = num_references, num_directions, num_quantiles
+        self.of_slot: dict[int, Tensor] = {}
+        """Embeddings of norm 1, float32 [Z]."""
+
+        self.recent: dict[str, Tensor] = {}
+        """The last transitions of the present task, [n, ...] each."""
+
+    def start_task(self) -> None:
+        """Empty the buffer."""
+        self.recent = {}
+
+    def see(self, batch: TensorDictBase) -> None:
+        """Keep the transitions of a batch, [num_envs, num_steps]."""
+        given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
+        for key, values in given.items():
+            new = values.flatten(0, 1).cpu()
+            self.recent[key] = torch.cat([self.recent.get(key, new[:0]), new])[-self.buffer_size :].clone()
+
+    def update(self, slot: int, num_actions: int, generator: torch.Generator) -> None:
+        """Update the embedding of the present task, if there are enough transitions."""
+        seen = len(self.recent["action"])
+        if seen < self.num_samples:
+            return
+        drawn = torch.randperm(seen, generator=generator)[: self.num_samples]
+        observation, action, reward = (value[drawn] for value in self.recent.values())
+        new = normalize(self._embed(transitions(observation, action, reward.squeeze(-1), num_actions)), dim=0)
+        old = self.of_slot.get(slot, new)
+        self.of_slot[slot] = normalize((old + new) / 2, dim=0)
+
+    def _embed(self, points: Tensor) -> Tensor:
+        width = points.shape[1]
+        if self.embedding == "lwe":
+            return linear_wasserstein(points, reference_points(self.num_references, width))
+        return sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
+
+    def state(self) -> dict[str, Any]:
+        """Return embeddings and buffer."""
+        return {"of_slot": dict(self.of_slot), "recent": dict(self.recent)}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        self.of_slot = {slot: value.cpu() for slot, value in state["of_slot"].items()}
+        self.recent = {key: value.cpu() for key, value in state["recent"].items()}
+
+
+class SelectedMasks(MaskLC):
+    """`MaskLC` that combines the new scores with those of selected earlier tasks; the others have a share of 0.
+
+    s = sum_i a_i s_i + a_k s_k over the selected tasks i, where a is the softmax of their b and the new scores' b. The
+    b of a task that is not selected is kept for when it is. When a task starts none is selected.
+
+    Beside what `MaskLC` stores: copies of the selected tasks' scores, 4 P bytes each; an embedding of each task, 4 M n
+    bytes (``lwe``, n = pixels + actions + 1) or 4 L Q (``swe``); the last transitions.
+
+    Args:
+        every: batches between two selections.
+        embedding: as the following, of `TaskEmbeddings`.
+    """
+
+    stackable = False
+
+    compares = True
+    """Whether `choose` reads the embeddings."""
+
+    community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
+    places: Tensor  # their slots, and that of the new scores, int64 [n + 1]
+    offsets: Tensor  # added to their b: 0, or -infinity, float32 [n + 1]
+
+    def __init__(
+        self,
+        every: int,
+        embedding: str,
+        num_samples: int,
+        buffer_size: int,
+        num_references: int,
+        num_directions: int,
+        num_quantiles: int,
+    ) -> None:
+        super().__init__()
+        require(*at_least_one(every=every))
+        self.every = every
+        self.embeddings = TaskEmbeddings(
+            embedding,
+            num_samples,
+            buffer_size,
+            num_references=num_references,
+            num_directions=num_directions,
+            num_quantiles=num_quantiles,
+        )
+        self.selected: list[int] = []
+        """The slots of the selected tasks."""
+
+        self.num_batches = 0
+        """Of the present task."""
+
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().setup(agent, weights, curriculum)
+        self.generator = own_generator()
+        self.num_actions = max(task.graph.branching_factor for task in curriculum.tasks) + 1
+        for name in ("community", "places", "offsets"):
+            self.register_buffer(name, torch.zeros(0), persistent=False)
+
+    def choose(self) -> list[int]:
+        """Return the slots of the tasks to select, among the first `num_combined`."""
+        raise NotImplementedError
+
+    def start_task(self, task: int | None) -> None:
+        """Start with nothing selected."""
+        super().start_task(task)
+        self.num_batches = 0
+        self.embeddings.start_task()
+
+    def init_scores(self) -> None:
+        """Initialise a new task's scores and its combination."""
+        super().init_scores()
+        self._gather([])
+
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Keep the transitions."""
+        if self.compares:
+            self.embeddings.see(batch)
+
+    @torch.no_grad()
+    def after_learning(self) -> None:
+        """Embed the task, and select where it is time."""
+        if self.compares:
+            self.embeddings.update(self.slot, self.num_actions, self.generator)
+        self.num_batches += 1
+        if self.num_combined and self.num_batches % self.every == 0:
+            self.select(self.choose())
+
+    @torch.no_grad()
+    def select(self, slots: Sequence[int]) -> None:
+        """Combine the new scores with those of these tasks from now on."""
+        if sorted(slots) != self.selected:
+            self._gather(sorted(slots))
+            self._write()
+            self.agent.weights_changed()
+
+    def current_scores(self) -> Sequence[Tensor]:
+        """Compute the combination."""
+        if not self.num_combined:
+            return list(self.own)
+        betas = self.betas.index_select(-1, self.places) + self.offsets
+        return list(map(combined, betas.unbind(-2), self.weights.split(self.community), self.own))
+
+    def _gather(self, slots: list[int]) -> None:
+        """Copy the scores of the selected tasks; some others fill up to 4, 16, 64 ..., as each number is compiled."""
+        room = 4
+        while room < len(slots):
+            room *= 4
+        others = [slot for slot in range(self.num_combined) if slot not in slots]
+        filled = [*slots, *others][:room]
+        excluded = len(filled) - len(slots)
+        device = self.scores.device
+        self.selected = list(slots)
+        self.community = self.scores[filled]
+        self.places = torch.tensor([*filled, self.slot], device=device)
+        self.offsets = torch.tensor([0.0] * len(slots) + [-torch.inf] * excluded + [0.0], device=device)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what is selected, and all that selections depend on."""
+        counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
+        return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self.num_batches = state["num_batches"]
+        self.generator.set_state(state["random"].cpu())
+        self.embeddings.load(state["embeddings"])
+        self._gather(list(state["selected"]))
