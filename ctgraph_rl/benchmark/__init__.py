@@ -1,4 +1,4 @@
-"""How fast the environment runs, and with ``--sizes`` what reading costs: ``python -m ctgraph_rl.benchmark``.
+"""How fast the environment runs, with ``--device cuda`` on a GPU, and with ``--sizes`` what reading costs.
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
 table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of
@@ -12,7 +12,8 @@ import argparse
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -30,8 +31,9 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.benchmark import sizes
+from ctgraph_rl.benchmark import ladder, sizes
 from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
@@ -279,8 +281,10 @@ def table(measured: list[Contender]) -> str:
     return "\n".join(lines)
 
 
-def machine() -> str:
-    """What was measured on."""
+def machine(device: torch.device | None = None) -> str:
+    """Return what was measured on."""
+    if device is not None and device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}, torch {torch.__version__}"
     threads, capability = torch.get_num_threads(), torch.backends.cpu.get_cpu_capability()
     return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
 
@@ -289,28 +293,51 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
     names = list(configurations())
     parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.benchmark", description=__doc__)
-    parser.add_argument("--rows", type=int, nargs="+", default=[1, 64, 1024, 16384], help="batch sizes")
+    parser.add_argument("--rows", type=int, nargs="+", help="batch sizes")
     parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
     parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
     parser.add_argument("--sizes", type=int, nargs="*", help="instead: readers of curricula and logs, by tasks")
+    parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds after which no measurement begins")
     options = parser.parse_args(arguments)
     if options.sizes is not None:
         require(*at_least_one(**{f"sizes[{i}]": n for i, n in enumerate(options.sizes)}))
         print(f"{machine()}\n\n{sizes.table(sizes.measured(options.sizes or sizes.SIZES))}")
         return
+    options.rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
     require(
         *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
-        *positive(seconds=options.seconds),
+        *positive(seconds=options.seconds, limit=options.limit),
     )
     if options.threads:
         torch.set_num_threads(options.threads)
+    if options.device:
+        device = checked_device(options.device)
+        tasks = {name: configurations()[name] for name in options.tasks}
+        rungs = climbed(device, options.rows, tasks, options)
+        print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder.table(rungs)}")
+        return
     measured = contenders(options.rows, options.tasks, not options.skip_kernel)
     console = Console(stderr=True)
-    for one in track(measured, "filling caches", console=console):
-        one.run()
-    for one in track(measured * options.rounds, "measuring", console=console):
-        one.measure(options.seconds)
-    print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(measured)}")
+    with suppress(KeyboardInterrupt):
+        for one in track(measured, "filling caches", console=console):
+            one.run()
+        rounds = track(measured * options.rounds, "measuring", console=console)
+        for one in ladder.until(options.limit, rounds):
+            one.measure(options.seconds)
+    found = [one for one in measured if one.speeds]
+    print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(found)}")
+
+
+def climbed(
+    device: torch.device, rows: Sequence[int], tasks: Mapping[str, Task], options: argparse.Namespace
+) -> list[ladder.Rung]:
+    """Measure the ladder of a device for as long as the options say; return what was measured."""
+    rungs = ladder.rungs(device, rows, tasks)
+    with suppress(KeyboardInterrupt):
+        for rung in ladder.until(options.limit, track(rungs, "measuring", console=Console(stderr=True))):
+            ladder.measure(rung, options.rounds, options.seconds, device)
+    return rungs

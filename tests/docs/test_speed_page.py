@@ -9,7 +9,9 @@ import torch
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, rollout
+from ctgraph_rl.benchmark import ladder
 from ctgraph_rl.core import reading
+from ctgraph_rl.core.dynamics import words_of
 from ctgraph_rl.tasks.configurations import ct_co_b1
 
 PAGE = CHECKOUT / "docs" / "how-to" / "go_fast.md"
@@ -42,6 +44,56 @@ def test_the_benchmark_prints_a_row_for_every_way(capsys):
         "TorchRL Collector, info=False",
         "Gymnasium VectorEnv",
     ]
+
+
+@pytest.mark.parametrize(("limit", "stops_after", "rows"), [(600.0, 9, 4), (600.0, 3, 2), (1e-9, 9, 0)])
+def test_the_ladder_of_a_device_prints_what_it_has_measured_when_it_is_stopped(
+    limit, stops_after, rows, capsys, monkeypatch
+):
+    monkeypatch.delitem(ladder.WAYS, "rollout, fused and captured")  # compiling takes long
+    measure, measured = ladder.measure, []
+
+    def stopped(rung: ladder.Rung, *how: object) -> None:
+        measured.append(rung)
+        if len(measured) == stops_after:
+            raise KeyboardInterrupt
+        measure(rung, *how)
+
+    monkeypatch.setattr(ladder, "measure", stopped)
+    benchmark.main(
+        [
+            "--device",
+            "cpu",
+            "--rows",
+            "2",
+            "--tasks",
+            "SU",
+            "--rounds",
+            "1",
+            "--seconds",
+            "0.001",
+            "--limit",
+            f"{limit}",
+        ]
+    )
+
+    lines = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| 2 ")]
+    assert [line[3].strip() for line in lines] == [ladder.COPY, *ladder.WAYS][:rows]
+    assert all(float(line[4]) > 0 for line in lines)
+
+
+@pytest.mark.parametrize("name", benchmark.configurations())
+def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
+    task, actions = benchmark.configurations()[name], torch.randint(0, 3, (20, 8))
+    rows, twin = (Rows([task] * 8, kernel="off") for _ in range(2))
+    steps = rollout(rows, actions, Steps.empty(rows, 20))
+    twin.reset()
+
+    state, words = twin.state, words_of(twin.state.tick, twin.params, twin.uses)
+    for t, action in enumerate(actions):
+        state, words, shown = ladder.one_step(state, action, words, twin.params, twin.uses)
+        expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
+        assert all(torch.equal(*pair) for pair in zip(shown, expected, strict=True))
 
 
 def test_the_benchmark_measures_co_with_waiting_and_rotation_and_both_with_noise():

@@ -13,7 +13,8 @@ from helpers.small_agents import POLICY_GRADIENTS, agent_of
 import baselines.learner
 import curricula
 from ctgraph_rl import CTGraphEnv, Rows, Steps, learn_curriculum, make_agent, rollout
-from ctgraph_rl.benchmark import configurations
+from ctgraph_rl.benchmark import configurations, ladder
+from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.learn import collect
 
@@ -61,6 +62,30 @@ def test_rollouts_have_the_bits_of_a_cpu(name):
         return rollout(rows, actions.to(device), Steps.empty(rows, 64))
 
     assert all(torch.equal(one.cpu(), other) for one, other in zip(steps("cuda"), steps("cpu"), strict=True))
+
+
+@pytest.mark.parametrize("way", ladder.WAYS)
+def test_every_way_of_the_ladder_runs(way):
+    rung = ladder.Rung(way, "CO", 1024, lambda: ladder.WAYS[way]([confounding(p=0.5)] * 1024, torch.device("cuda")))
+
+    ladder.measure(rung, 1, 0.01, torch.device("cuda"))
+
+    assert rung.failure == "" and len(rung.speeds) == 1
+
+
+def test_compiled_steps_have_the_bits_of_a_cpu():
+    task, actions = configurations()["CO, noise 10"], torch.randint(0, 3, (20, 256))
+    rows = Rows([task] * 256)
+    steps = rollout(rows, actions, Steps.empty(rows, 20))
+    twin = Rows([task] * 256, device="cuda")
+    twin.reset()
+    step = torch.compile(ladder.one_step, fullgraph=True, dynamic=False)
+
+    state, words = twin.state, dynamics.words_of(twin.state.tick, twin.params, twin.uses)
+    for t, action in enumerate(actions.to("cuda")):
+        state, words, shown = step(state, action, words, twin.params, twin.uses)
+        expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
+        assert all(torch.equal(one.cpu(), other) for one, other in zip(shown, expected, strict=True))
 
 
 def test_a_region_that_is_replayed_computes_what_its_function_does():
