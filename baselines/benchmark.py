@@ -5,7 +5,8 @@ has them: on `ctgraph_rl.sb3.SB3VecEnv`, and on what its ``make_vec_env`` makes 
 own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
 slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
 it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core.
+core. ``--startup`` measures instead how long a run takes to its first step, beside the bare imports of torch and
+torchrl.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
+from baselines import _startup
 from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.benchmark import machine
@@ -182,12 +184,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--max-frames", type=int, default=500_000, help="frames after which a task counts as not solved"
     )
+    parser.add_argument("--startup", action="store_true", help="instead: the time of a run until its first step")
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
         (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
         *positive(seconds=options.seconds),
     )
+    if options.startup:
+        print(f"{machine()}; medians of {options.rounds} rounds\n\n{_startup.table(options.rounds)}")
+        return
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     console = Console(stderr=True)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +18,23 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 HERE = Path(__file__).resolve().parent
+
+
+@contextmanager
+def first_imports() -> Iterator[None]:
+    """Pause garbage collection while torch is imported for the first time, and leave its objects out of later ones.
+
+    A full collection visits the 300,000 objects of torch, none of which is garbage, and there are several in an import.
+    """
+    pauses = gc.isenabled() and "torch" not in sys.modules
+    if pauses:
+        gc.disable()
+    try:
+        yield
+    finally:
+        if pauses:
+            gc.freeze()
+            gc.enable()
 
 
 def conf_dir() -> str:
@@ -59,7 +79,8 @@ def command(module: str) -> Callable[[], None]:
     """
     if not module.startswith("ctgraph_rl."):
         check_packages()
-    return import_module(module).main
+    with first_imports():
+        return import_module(module).main
 
 
 def curriculum_named(name: str) -> Curriculum:

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
-from ctgraph_rl.packages import check_packages, conf_dir
+from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, sweepable
 from ctgraph_rl.runs.settings import in_digits
@@ -40,8 +40,9 @@ def run(cfg: DictConfig, run_dir: Path) -> None:
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
-    from ctgraph_rl.collective.job import run_cells  # here: --help and a wrong setting need no torch
-    from ctgraph_rl.report.style import require_packages  # here: as above
+    with first_imports():
+        from ctgraph_rl.collective.job import run_cells  # here: --help and a wrong setting need no torch
+        from ctgraph_rl.report.style import require_packages  # here: as above
 
     if cfg.report:
         require_packages()

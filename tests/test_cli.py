@@ -1,5 +1,6 @@
 """``python -m curricula``, ``ctgraph-rl`` with a command, and the page that lists all curricula."""
 
+import gc
 import io
 import json
 import os
@@ -13,6 +14,7 @@ import pytest
 import curricula
 from ctgraph_rl import cli
 from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
+from ctgraph_rl.packages import first_imports
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.__main__ import main as curricula_main
 
@@ -131,6 +133,21 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
 
     assert code == 2
     assert f"ctgraph-rl {command}" in err and str(tmp_path) in err
+
+
+def test_garbage_collection_is_paused_during_the_first_import_of_torch_alone(monkeypatch):
+    freezes = []
+    monkeypatch.setattr(gc, "freeze", lambda: freezes.append(gc.isenabled()))
+
+    with first_imports():  # torch is there
+        assert gc.isenabled()
+    monkeypatch.delitem(sys.modules, "torch")
+    with pytest.raises(ImportError), first_imports():
+        assert not gc.isenabled()
+        raise ImportError
+
+    assert gc.isenabled()
+    assert freezes == [False]
 
 
 def in_a_folder_that_shadows(checkout, tmp_path, path, code):

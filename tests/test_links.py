@@ -35,6 +35,7 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
+    ("baselines._startup", "TemporaryDirectory"): "a new folder",
     ("ctgraph_rl.benchmark.sizes", "TemporaryDirectory"): "a folder of its own",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",

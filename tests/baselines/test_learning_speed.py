@@ -16,6 +16,7 @@ from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
 from baselines import benchmark
+from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
 from baselines.learner import functional_gradient_step
 from baselines.networks import distinct
@@ -258,3 +259,10 @@ def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
     rows = [[cell.strip() for cell in line.split("|")[3:-1]] for line in benchmark.table([ours, theirs]).splitlines()]
 
     assert rows[2:] == [["ours", "200", "", "12", "2.00"], ["SB3", "40", "5.0 x", "1 of 3 seeds", ""]]
+
+
+@pytest.mark.slow
+def test_a_run_starts_within_1_3_times_the_bare_imports():
+    times = [(seconds(BARE), seconds(RUN)) for _ in range(2)]
+
+    assert min(run / bare for bare, run in times) < 1.3
