@@ -34,9 +34,9 @@ from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 SOLVED = 0.9
 """Success rate from which on a task counts as solved."""
 
-AGAINST_EXPERTS = (
+WHERE_KNOWN = (
     *(metric.__name__ for metric in metrics.AGAINST_EXPERTS),
-    *("continual_world_forward_transfer", "forward_transfer_from_experts"),
+    *("continual_world_forward_transfer", "forward_transfer_from_experts", "memory_gap_closed"),
 )
 """Metrics that are shown where some run of a curriculum has a value."""
 
@@ -128,7 +128,7 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Ro
 
     Args:
         rows: the whole table.
-        names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `AGAINST_EXPERTS` where a run
+        names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `WHERE_KNOWN` where a run
             of the curriculum has a value.
 
     Raises:
@@ -138,7 +138,7 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Ro
     unknown = [name for name in names or () if name not in choices]
     message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
     require((not choices or not unknown, message))
-    with_value = {(row.curriculum, row.measure) for row in rows if row.measure in AGAINST_EXPERTS and row.estimate.n}
+    with_value = {(row.curriculum, row.measure) for row in rows if row.measure in WHERE_KNOWN and row.estimate.n}
     always, further = (*(SHOWN if names is None else names), NO_RUN_FINISHED), with_value if names is None else ()
     return [row for row in rows if row.measure.split(" ")[0] in always or (row.curriculum, row.measure) in further]
 

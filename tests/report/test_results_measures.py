@@ -26,13 +26,18 @@ def test_one_fingerprint_is_one_curriculum_though_one_name_says_modified(tmp_pat
     assert (row.curriculum, row.estimate.n) == ("two", 2)
 
 
-def test_five_measures_are_shown_and_those_against_experts_that_have_a_value(tmp_path):
+def test_five_measures_are_shown_and_of_the_gap_of_memory_and_against_experts_those_that_have_a_value(tmp_path):
     path = make_run(tmp_path, 0)
     always = ["average_performance", "forward_transfer", "backward_transfer", "forgetting"]
     at_the_end = ["solved_rate"]
     first = [row.measure for row in selected(table(all_runs([path])))]
     scores = json.loads((path / "metrics.json").read_text())
-    for name, value in (("relative_performance", 1.5), ("sample_efficiency", None), ("regret", 2.0)):
+    for name, value in (
+        ("memory_gap_closed", 0.5),
+        ("relative_performance", 1.5),
+        ("sample_efficiency", None),
+        ("regret", 2.0),
+    ):
         scores[name] = {"value": value, "definition": name, "undefined": None if value else "no experts were given"}
     (path / "metrics.json").write_text(json.dumps(scores))
 
@@ -42,7 +47,12 @@ def test_five_measures_are_shown_and_those_against_experts_that_have_a_value(tmp
     both = selected(table(all_runs([tmp_path])))
 
     assert first == [*always, *at_the_end]
-    assert [row.measure for row in selected(rows)] == [*always, "relative_performance", *at_the_end]
+    assert [row.measure for row in selected(rows)] == [
+        *always,
+        "memory_gap_closed",
+        "relative_performance",
+        *at_the_end,
+    ]
     assert [row.measure for row in both if row.curriculum == "other"] == [*always, *at_the_end]
     assert [row.measure for row in selected(rows, ["solved", "regret"])] == ["regret", "solved goal1", "solved goal2"]
 
