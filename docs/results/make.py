@@ -37,6 +37,9 @@ SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
 BY_FIVES = (INSTANCES, MEMORY)
 """Tables that only have cells of five seeds that finished, as they may be collected before all are run."""
 
+RND = ("rnd_depth", "rnd_co_b1")
+"""Tables of PPO with random network distillation, beside those of other agents on the same tasks."""
+
 REWARDS_MET = "rewards_met"
 OLDER = "ppo_published"
 """The agent of which cells of the depth ladder were of an earlier revision."""
@@ -274,18 +277,22 @@ def rerun() -> dict[str, str]:
 
 def page() -> str:
     """The page: the template with its tables."""
-    small = read("baselines_b1")
+    on_depths, on_co_b1 = map(read, RND)
+    small = read("baselines_b1") + on_co_b1
     tables = {name: by_goal(small, name) for name in SMALL}
     instances = read(INSTANCES)
     tables |= {f"{name}_instances": by_goal(instances, name, f"{name}, instances") for name in SMALL}
     tables |= {"memory": memory_tables(), "observability": search.observability_table()}
     tables |= {f"search_{depth}": search.search_table(depth) for depth in (2, 3)}
-    tables |= {"fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"), "depth_ladder": ladder(read("depth_ladder"))}
+    tables |= {
+        "fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"),
+        "depth_ladder": ladder(read("depth_ladder") + on_depths),
+    }
     template = Template((HERE / "template.md").read_text(encoding="utf-8"))
     return template.substitute(
         tables,
         main_job=main_job(read("main_job")),
-        machines=machines("main_job", *AGENTS, *BY_FIVES, search.NAME),
+        machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME),
         **learned_and_met(),
         **verdicts(),
         **rerun(),
@@ -329,7 +336,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     collecting = commands.add_parser("collect", help="raw results from runs")
-    names = ("main_job", *AGENTS, *BY_FIVES, search.NAME, REWARDS_MET, *comparison.EXPERIMENTS)
+    names = ("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME, REWARDS_MET, *comparison.EXPERIMENTS)
     collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()
