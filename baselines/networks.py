@@ -18,6 +18,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, reset
 from ctgraph_rl.checks import require_memory
 from ctgraph_rl.learn.collect import UNSTORED
+from ctgraph_rl.learn.guide import GUIDED_ACTION
 
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
@@ -266,6 +267,7 @@ class ActorCritic(TensorDictSequential):
             action = chances.argmax(dim=-1)
         else:
             action = draw(chances)
+        action = guided(tensordict, action)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
         written["state_value"] = critic.module(features)
@@ -274,6 +276,12 @@ class ActorCritic(TensorDictSequential):
         for module in others:
             module(tensordict)
         return tensordict
+
+
+def guided(data: TensorDictBase, action: Tensor) -> Tensor:
+    """Return the actions that a guide gave, int64 [num_envs], and where it gave none the policy's own."""
+    given = data.get(GUIDED_ACTION, None)
+    return action if given is None else torch.where(given < 0, action, given)
 
 
 def draw(chances: Tensor) -> Tensor:

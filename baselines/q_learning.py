@@ -16,7 +16,7 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from baselines.learner import MOST_PASSES, Learner
-from baselines.networks import Data
+from baselines.networks import Data, guided
 from baselines.optimisers import make_optimiser
 from baselines.prioritized import PrioritySampler
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
@@ -55,7 +55,9 @@ class EpsilonGreedy(TensorDictSequential):
         written["action"] = (values[0] if isinstance(values, tuple) else values).argmax(dim=-1)
         for key, value in written.items():
             tensordict.set(key, value)
-        for module in (exploration, *others):
+        exploration(tensordict)
+        tensordict.set("action", guided(tensordict, tensordict["action"]))
+        for module in others:
             module(tensordict)
         return tensordict
 

@@ -129,7 +129,11 @@ def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
         "announced": "A new block ends all episodes and is announced.",
         "hidden": "A row changes to the next block when its episode ends, without notice.",
     }
-    return f"{ids[protocol.task_id]} {boundaries[protocol.boundaries]}"
+    guide = (
+        f" A navigating policy acts in the learner's place in a share of the episodes, which falls from 1 to 0 over "
+        f"the first {protocol.guide_frames:,} frames."
+    )
+    return f"{ids[protocol.task_id]} {boundaries[protocol.boundaries]}" + guide * bool(protocol.guide_frames)
 
 
 def evaluation_in_words(evaluation: Evaluation) -> str:

@@ -19,6 +19,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import batches, make_env
 from ctgraph_rl.learn.evaluate import Evaluator, episode_means
+from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Block, Curriculum
 
@@ -146,9 +147,11 @@ def _learning(
         evaluate = partial(evaluator.evaluate_if_due, agent)
         restore = None if saved is None else partial(_restore, saved, agent, env)
         done = frames - segment.start
-        for batch, carried in collect_segment(segment, env, agent, evaluate, done=done, restore=restore):
+        how: dict[str, Any] = {"done": done, "restore": restore, "guide_frames": curriculum.protocol.guide_frames}
+        for batch, carried in collect_segment(segment, env, agent, evaluate, **how):
             frames += batch.numel()
             measurements = _learn(agent, batch, curriculum.block_at(frames), frames)
+            measurements |= _guided(frames - batch.numel() - segment.start, curriculum)
             episode_return = log_training(log, curriculum, batch, frames - batch.numel(), measurements)
             yield Learned(frames, batch, episode_return, partial(_state, frames, agent, env, carried=carried, log=log))
         agent.end_task()
@@ -181,6 +184,7 @@ def collect_segment(
     done: int = 0,
     restore: Callable[[], TensorDictBase] | None = None,
     num_seeds: int = 1,
+    guide_frames: int = 0,
 ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
     """Yield the batches of a segment, each with the data that the next step starts from.
 
@@ -192,15 +196,19 @@ def collect_segment(
         done: frames of the segment that were learned before.
         restore: restores a state between two batches of this segment, and returns the data of the next step.
         num_seeds: seeds whose rows the environment has, equally many of each.
+        guide_frames: see `ctgraph_rl.tasks.protocol.Protocol`; with one seed alone.
     """
     ends = list(accumulate(block.num_frames for block in segment.blocks))
     following = dict(zip(ends, segment.blocks[1:], strict=False))
     _set_tasks(env, segment.blocks[sum(end <= done for end in ends[:-1])], num_seeds)
     carried = None if restore is None else restore()
     num_rows = env.numel() // num_seeds
+    guide = Guide(agent.policy, env, guide_frames) if done < guide_frames else None
 
     def between_steps(of_all_seeds: int) -> None:
         frames = of_all_seeds // num_seeds
+        if guide is not None:
+            guide.frames = frames
         if frames:
             evaluate(segment.start + frames)
         next_end = frames + num_rows
@@ -209,7 +217,7 @@ def collect_segment(
 
     length, num_steps, state = num_seeds * ends[-1], agent.num_steps, agent.initial_state
     where: dict[str, Any] = {"between_steps": between_steps, "carried": carried, "done": num_seeds * done}
-    return batches(env, agent.policy, length, num_steps, state, **where)
+    return batches(env, agent.policy if guide is None else guide, length, num_steps, state, **where)
 
 
 def _set_tasks(env: CTGraphEnv, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
@@ -225,6 +233,12 @@ def announced_id(curriculum: Curriculum, block: Block) -> int | None:
     how = curriculum.protocol
     known = how.task_id != "hidden" and how.boundaries == "announced" and len(set(block.tasks)) == 1
     return curriculum.task_ids[block.tasks[0]] if known else None
+
+
+def _guided(frames: int, curriculum: Curriculum) -> dict[str, float]:
+    """Return the share of new episodes that was guided when a batch began; nothing without a guide."""
+    guide_frames = curriculum.protocol.guide_frames
+    return {"guided_share": guided_share(frames, guide_frames)} if guide_frames else {}
 
 
 def _learn(agent: Agent, batch: TensorDictBase, block: int, frames: int) -> dict[str, float]:

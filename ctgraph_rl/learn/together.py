@@ -61,6 +61,8 @@ class Group(Protocol):
 def why_not_together(curriculum: Curriculum) -> str | None:
     """Return why seeds cannot learn a curriculum in one environment; None if they can."""
     shared = any(block.switch is not None and block.switch.together for block in curriculum.blocks)
+    if curriculum.protocol.guide_frames:
+        return "a guide draws from the generator of one seed"
     return "its blocks change the tasks of all rows at once" if shared else None
 
 

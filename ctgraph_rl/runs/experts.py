@@ -69,9 +69,10 @@ def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
     how = curriculum.protocol
     if how.task_id != "hidden":
         length = how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else None
-        how = Protocol(how.task_id, num_task_ids=length, task_ids=(curriculum.task_ids[task],))
+        ids = (curriculum.task_ids[task],)
+        how = Protocol(how.task_id, num_task_ids=length, task_ids=ids, guide_frames=how.guide_frames)
     else:
-        how = Protocol()
+        how = Protocol(guide_frames=how.guide_frames)
     evaluation = replace(curriculum.evaluation, tasks="all", held_out=())
     blocks = (Block((task,), block.num_frames),)
     return Curriculum(EXPERT, 1, "-", blocks, evaluation=evaluation, protocol=how)

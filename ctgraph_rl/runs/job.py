@@ -34,7 +34,7 @@ from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
-from ctgraph_rl.tasks.curriculum import Curriculum, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
 
@@ -375,7 +375,7 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     evaluation, protocol = (config.changes_of(cfg, part) for part in config.PARTS)
     how = curriculum.protocol
     if protocol.get("task_id") == "hidden":
-        how = Protocol(boundaries=how.boundaries)  # hidden ids have no length and no numbers
+        how = replace(how, task_id="hidden", num_task_ids=None, task_ids=None)  # hidden ids have no length or numbers
     return replace(
         curriculum, evaluation=replace(curriculum.evaluation, **evaluation), protocol=replace(how, **protocol)
     )

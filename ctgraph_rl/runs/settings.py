@@ -27,7 +27,7 @@ LSTM = {
 WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
 
 ADDED: dict[str, dict[str, Any]] = {
-    "run": {"portable": False},
+    "run": {"portable": False, "protocol.guide_frames": None},
     **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL},
     **{f"baselines.methods.mask_{name.lower()}.Mask{name}": {"backbone_seed": None} for name in ("RI", "LC", "BLC")},
     "curricula.from_axes": {"read_noise": 0, "read_rotation": 0, "random_graphs": None},

@@ -155,6 +155,9 @@ class Protocol:
             row changes to the next block's task when its episode ends, without notice to the agent.
         num_task_ids: length of the one-hot id; None: just enough.
         task_ids: the id of each of the curriculum's ``tasks``, all different; None: their positions, from 0.
+        guide_frames: frames after each announced boundary over which the share of new episodes in which a policy that
+            navigates acts in the learner's place falls from 1 to 0. It waits where it must and decides at random, so
+            the learner need not find its first rewards. 0: the learner acts alone.
 
     Raises:
         ValueError: for values out of range, and ids given at boundaries that are hidden.
@@ -164,6 +167,7 @@ class Protocol:
     boundaries: str = "announced"
     num_task_ids: int | None = None
     task_ids: tuple[int, ...] | None = None
+    guide_frames: int = 0
 
     def __post_init__(self) -> None:
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
@@ -175,6 +179,7 @@ class Protocol:
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
         is_length = self.num_task_ids is None or is_int(self.num_task_ids, 1, MOST_IDS)
         require(
+            (is_int(self.guide_frames, 0), f"guide_frames must be an integer >= 0, got {self.guide_frames!r}"),
             (is_length, f"num_task_ids must be an integer in 1..{MOST_IDS}, got {self.num_task_ids!r}"),
             (is_ids, f"task_ids must be integers in 0..{MOST_IDS}, one for each task, got {ids!r}"),
             (differ, f"task_ids must differ from each other, got {ids!r}"),

@@ -1,0 +1,83 @@
+"""Tasks that compare memories: confounding graphs with long waits, after Ladosz et al. 2021.
+
+Their graph was not published. Section 4.2 of Soltoggio et al. 2023 says that the most complex one had p = 0.9 and 500
+observations; whether decision states had images of their own is not known, so it is an argument here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ctgraph_rl.checks import is_int, is_real, require, true_or_false
+from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.tasks.configurations import observations_of
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import PaperImages
+from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.task import Task
+from curricula.order import sequence
+
+SOURCE = "after Ladosz et al. 2021 and Soltoggio et al. 2023, arXiv 2302.10887"
+
+MOST_DEPTH = 16
+"""A goal at random is one end state of 2^d."""
+
+
+def co_hard(
+    depth: int = 2,
+    wait_prob: float = 0.9,
+    expected_length: float | None = None,
+    unique_decisions: bool = False,
+    num_wait_images: int = 500,
+    num_frames: int = 512_000,
+    image_seed: int = 1,
+) -> Curriculum:
+    """One confounding graph, b=2, whose goal is reached by turns in alternation: 1, 2, 1, 2, ...
+
+    With shared decision images a policy must remember its decisions to reach this goal; with unique ones it need not,
+    and only must find out which decision was right, with waits in between that say nothing.
+
+    Args:
+        depth: d.
+        wait_prob: p, in [0, 1).
+        expected_length: E[rho], the mean steps of an episode without fail, which then decides p; None: p is given.
+        unique_decisions: whether each decision state has an image of its own; False: all show one image.
+        num_wait_images: images that wait states draw from at every observation; 1 is a surjective graph.
+        num_frames: frames to learn from.
+        image_seed: seed of the image set.
+    """
+    require(
+        (is_int(depth, 1, MOST_DEPTH), f"depth must be an integer in 1..{MOST_DEPTH}, got {depth!r}"),
+        *true_or_false(unique_decisions=unique_decisions),
+    )
+    p = wait_prob if expected_length is None else _wait_prob(depth, expected_length)
+    graph = CTGraph(2, depth, p)
+    observations = observations_of(graph, "confounding", num_wait_images)
+    observations = _with_unique_decisions(observations, graph) if unique_decisions else observations
+    goal = tuple(1 + place % 2 for place in range(depth))
+    task = Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
+    return sequence("co_hard", [task], num_frames, source=SOURCE)
+
+
+def _wait_prob(depth: int, expected_length: float) -> float:
+    """Return the p with E[rho] = 2 (d + 1) + (d + 1) p / (1 - p)."""
+    least = CTGraph(2, depth).expected_episode_length
+    rule = f"expected_length must be a number >= {least:g} at depth {depth}, got {expected_length!r}"
+    require((is_real(expected_length) and least <= expected_length, rule))
+    waits = (expected_length - least) / (depth + 1)
+    return waits / (1 + waits)
+
+
+def _with_unique_decisions(observations: Observations, graph: CTGraph) -> Observations:
+    """Return observations with an image for each decision state; the ids of waits and ends move up to make room."""
+    more = graph.num_decision_states - 1
+    (first, last), (wait, last_wait), (end, last_end) = (
+        observations.ids(kind) for kind in (StateType.DECISION, StateType.WAIT, StateType.END)
+    )
+    moved = {"wait_ids": (wait + more, last_wait + more), "end_ids": (end + more, last_end + more)}
+    own = {"unique_decisions": True, "unique_ends": False}
+    return replace(observations, decision_ids=(first, last + more), **moved, **own)  # type: ignore[arg-type]
+
+
+NAMED = {"co_hard": co_hard}
+"""The curricula of this module by name."""
