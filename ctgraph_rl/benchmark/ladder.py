@@ -157,7 +157,7 @@ def _replayed(region: Region, rows: Rows, actions: Tensor) -> Run:
 
 
 def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> None:
-    """Measure observations a second; a way that fails notes why, and the others go on."""
+    """Measure observations a second; for a way that fails, note why, and measure the others."""
     try:
         run = rung.make()
         for _ in range(5):  # builds, compiles, captures

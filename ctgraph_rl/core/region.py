@@ -28,7 +28,7 @@ class Region:
 
     On a GPU the first `WARM_UP` calls run the function; then it is captured as a CUDA graph, and each further call
     copies the arguments and launches the graph. Elsewhere every call runs the function, on copies of the arguments and
-    with copies of the results, so that whoever keeps a result too long is found on a CPU as well.
+    with copies of the results, so that a caller that keeps a result too long fails on a CPU as well.
 
     Args:
         function: takes and returns tensors by key. It must not branch on data, make the host wait, or change the shapes

@@ -206,7 +206,7 @@ def test_random_network_distillation_solves_depth_4_and_5_in_some_seeds_and_cost
     assert (solved, [len(lines) for lines in ladder.values()]) == ([5, 5, 3, 3], [5] * 4)
     assert max(float(line["sampled_success"]) for line in ladder["ppo_rnd", "5"]) == 0.153
     assert "solves depth 4 and depth 5 in three of five seeds each" in RESULTS
-    assert "sampled, no seed is above 0.16 at depth 5" in RESULTS
+    assert "Sampled, no seed is above 0.16 at depth 5" in RESULTS
 
     by_rnd = make.groups(make.read("rnd_co_b1"), "task")
     by_ppo = make.groups(
