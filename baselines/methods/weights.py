@@ -92,15 +92,19 @@ def flat(tensors: Sequence[Tensor]) -> Tensor:
     return torch.cat([tensor.flatten() for tensor in tensors])
 
 
-def head_names(policy: TensorDictModuleBase) -> list[str]:
+def head_names(policy: TensorDictModuleBase, without: str | None = None) -> list[str]:
     """Return the names of the parameters of a policy's output layers.
 
     These are the last linear layers of the modules behind the trunk.
+
+    Args:
+        policy: the policy.
+        without: a key; leave out the modules that write it.
     """
     names = []
     for place, module in policy.named_modules():
         behind = isinstance(module, TensorDictModule) and isinstance(module.module, nn.Module)
-        if behind and "observation" not in module.in_keys:
+        if behind and "observation" not in module.in_keys and without not in module.out_keys:
             layers = [name for name, layer in module.named_modules() if isinstance(layer, nn.Linear)]
             parts = ("weight", "bias") if layers else ()
             names += [".".join(filter(None, (place, layers[-1], part))) for part in parts]

@@ -80,7 +80,7 @@ def life(compose, agent: str, method: str, *overrides: str, curriculum: Curricul
 # What is refused
 
 
-NEEDS_IDS = ("mask_amsc", "mask_blc", "mask_lc", "mask_ri", "mask_sc", "packnet", "scratch")
+NEEDS_IDS = ("cka_rl", "mask_amsc", "mask_blc", "mask_lc", "mask_ri", "mask_sc", "packnet", "scratch")
 NEEDS_BOUNDARIES = ("ewc", "ewc_published", "l2", "mas", "si", *NEEDS_IDS)
 FREE = ("clear", "finetune", "multitask")
 
@@ -163,6 +163,8 @@ WRONG = [
     ("clear", "buffer_size=0", "buffer_size must be an integer >= 1, got 0"),
     ("clear", "policy_coeff=-1", "policy_coeff must be a number >= 0, got -1"),
     ("clear", "value_coeff=x", "value_coeff must be a number >= 0, got 'x'"),
+    ("cka_rl", "scope=trunk", "scope must be one of actor_head, all, got 'trunk'"),
+    ("cka_rl", "pool_size=0", "pool_size must be an integer >= 1, got 0"),
     ("ewc", "coeff=0", "coeff must be a number > 0, got 0"),
     ("ewc", "online=1", "online must be true or false, got 1"),
     ("ewc", "alpha=1.5", "alpha must be .* got 1.5"),

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import set_exploration_type
 
+from baselines.methods.cka_rl import CKARL
 from baselines.methods.mask_blc import MaskBLC
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
@@ -24,7 +25,10 @@ from baselines.methods.scratch import Scratch
 from baselines.methods.weights import flat
 
 MASKS = (MaskRI, MaskLC, MaskBLC)
-KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {"PackNet": lambda: PackNet(retrain=0.5)}
+KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {
+    "PackNet": lambda: PackNet(retrain=0.5),
+    "CKARL": lambda: CKARL(scope="all", pool_size=1, scale=1.0, random_alpha=True, alpha_rate=1.0),
+}
 
 every_mask = pytest.mark.parametrize("method", MASKS)
 

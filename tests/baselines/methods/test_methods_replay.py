@@ -15,6 +15,7 @@ from helpers.with_methods import TASKS, same, small, stay, weights_for, with_met
 from torch import Tensor
 
 from baselines.learner import functional_gradient_step
+from baselines.methods.cka_rl import CKARL
 from baselines.methods.clear import CLEAR, Reservoir
 from baselines.methods.ewc import EWC
 from baselines.methods.l2 import L2
@@ -291,6 +292,7 @@ AMSC |= {"competence_gate": False, "competence_batches": 1, "num_samples": 8, "b
 AMSC |= {"num_references": 4, "num_directions": 4, "num_quantiles": 4}
 
 COMPILED = {
+    "cka_rl": (lambda: CKARL(scope="all", pool_size=2, scale=1.0, random_alpha=False, alpha_rate=1.0)),
     "clear": (lambda: CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0)),
     "ewc": (lambda: EWC(**OF_EWC, heads="multi")),
     "mask_amsc": (lambda: MaskAMSC(**AMSC)),

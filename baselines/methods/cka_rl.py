@@ -1,0 +1,186 @@
+"""CKA-RL: each task's weights are those of the first task, a vector of its own, and a mixture of earlier vectors.
+
+Hu et al. 2025 (Continual Knowledge Adaptation for Reinforcement Learning, NeurIPS, arXiv 2510.19314).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from baselines.learner import Learner
+from baselines.methods.method import TaskMethod
+from baselines.methods.weights import Weights, flat, head_names
+from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+SCOPES = ("actor_head", "all")
+
+
+class CKARL(TaskMethod):
+    """w = w_base + v_k + sum_j softmax(scale * alpha)_j v_j, for some or all of the network's weights.
+
+    w_base are the weights at the end of the first task, which is learned without a method. In each later task v_k
+    starts at 0 and is trained together with alpha; at the task's end v_k joins the pool of vectors v_j. If the pool is
+    full, the mean of the two vectors with the highest cosine replaces them. The twin of Mask LC without masks: that
+    combines the scores of masks in the same way.
+
+    All other weights are shared by all tasks and trained on. An earlier task is played with its own weights w where it
+    has them, and the present ones elsewhere. A task that returns continues to train its w, without a mixture.
+
+    Stored are w_base, the pool and v_k, 4 S bytes each, and w of each of the curriculum's tasks, 4 S bytes, where S is
+    the number of weights in ``scope``.
+
+    Args:
+        scope: ``actor_head``, the output layer that decides the action, as published, or ``all`` weights.
+        pool_size: most vectors v_j.
+        scale: s.
+        random_alpha: start alpha at N(0, 1) / n, with n vectors in the pool; False: at 0, with equal shares.
+        alpha_rate: learning rate of alpha by that of the agent, exact for Adam and RMSprop.
+    """
+
+    agent_members = (*TaskMethod.agent_members, "replace_optimiser")
+
+    base: Tensor  # float32 [S]
+    pool: Tensor  # float32 [pool_size, S]
+    kept: Tensor  # w of tasks that have ended, by slot, float32 [tasks, S]
+    own: nn.ParameterList  # w_base + v_k, of each weight tensor in scope
+    alpha: nn.Parameter  # alpha / alpha_rate, float32 [pool_size]
+
+    def __init__(self, scope: str, pool_size: int, scale: float, random_alpha: bool, alpha_rate: float) -> None:
+        super().__init__()
+        require(
+            *one_of(SCOPES, scope=scope),
+            *at_least_one(pool_size=pool_size),
+            *positive(scale=scale, alpha_rate=alpha_rate),
+            *true_or_false(random_alpha=random_alpha),
+        )
+        self.scope, self.pool_size, self.random_alpha = scope, pool_size, random_alpha
+        self.alpha_rate, self.factor = alpha_rate, scale * alpha_rate
+
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`; the optimiser now trains w_base + v_k and alpha."""
+        super().setup(agent, weights, curriculum)
+        names = weights.names if self.scope == "all" else head_names(agent.policy, without="state_value")
+        self.inside = [name in names for name in weights.names]
+        message = f"{type(agent).__name__} has no output layer behind a trunk for scope=actor_head: set scope=all"
+        require((any(self.inside), message))
+        self.in_scope = weights.mask_of(names)
+        self.ended = self.num_pooled = 0
+        vector = flat(self._network()).detach()
+        self.register_buffer("base", torch.zeros_like(vector))
+        self.register_buffer("pool", vector.new_zeros(self.pool_size, len(vector)))
+        self.register_buffer("kept", vector.new_zeros(self.num_tasks, len(vector)))
+        self.own = nn.ParameterList([each.detach().clone() for each in self._network()])
+        self.alpha = nn.Parameter(vector.new_zeros(self.pool_size))
+        agent.replace_optimiser(self.trainable)
+
+    @property
+    def trainable(self) -> list[nn.Parameter]:
+        """The optimiser's parameters: the weights, those in scope by w_base + v_k, and alpha."""
+        own, weights = iter(self.own), zip(self.weights.parameters, self.inside, strict=True)
+        return [*(next(own) if inside else parameter for parameter, inside in weights), self.alpha]
+
+    @property
+    def num_combined(self) -> int:
+        """Number of vectors v_j in the present weights."""
+        return self.num_pooled if self.slot >= self.ended else 0
+
+    @property
+    def shares(self) -> Tensor:
+        """softmax(scale * alpha), float32 [num_combined]."""
+        return (self.factor * self.alpha[: self.num_combined]).softmax(dim=0)
+
+    def current(self) -> Tensor:
+        """Compute w in scope, float32 [S]."""
+        own = flat(list(self.own))
+        return own + self.shares @ self.pool[: self.num_combined] if self.num_combined else own
+
+    @torch.no_grad()
+    def start_task(self, task: int | None) -> None:
+        """Start a task at w_base and a mixture, or load the weights of one that returns."""
+        super().start_task(task)
+        if self.slot < self.ended:
+            self._set_own(self.kept[self.slot])
+        elif self.slot:
+            self._set_own(self.base)
+        if self.num_combined:
+            drawn = torch.randn(self.num_combined) if self.random_alpha else torch.zeros(self.num_combined)
+            self.alpha[: self.num_combined] = drawn.to(self.alpha) / (self.num_combined * self.alpha_rate)
+        self.agent.replace_optimiser(self.trainable)
+        self.after_step()
+        self.agent.weights_changed()
+
+    @torch.no_grad()
+    def end_task(self) -> None:
+        """Store the task's weights, and add its vector to the pool."""
+        present = self.current()
+        if self.slot >= self.ended:
+            if self.slot:
+                self._add(flat(list(self.own)) - self.base)
+            else:
+                self.base.copy_(present)
+        self.kept[self.slot] = present
+        self._set_own(present)
+        self.ended = max(self.ended, self.slot + 1)
+
+    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the gradients of the weights, and that of alpha."""
+        in_scope = flat([each for each, inside in zip(gradients, self.inside, strict=True) if inside])
+        shares, along = self.shares.detach(), self.pool[: self.num_combined] @ in_scope
+        of_alpha = self.factor * shares * (along - shares @ along)
+        return [*gradients, torch.cat([of_alpha, torch.zeros_like(self.alpha[self.num_combined :])])]
+
+    @torch.no_grad()
+    def after_step(self) -> None:
+        """Write w to the network."""
+        parts = self.current().split([each.numel() for each in self.own])
+        for parameter, part in zip(self._network(), parts, strict=True):
+            parameter.copy_(part.view_as(parameter))
+
+    @torch.no_grad()
+    def task_weights(self, task: int) -> Tensor | None:
+        """Return the weights of a task in scope, and the present ones elsewhere."""
+        slot = self.slot_of(task)
+        if not self.started or slot == self.slot:
+            return None
+        weights = self.weights.vector()
+        weights[self.in_scope.to(weights.device)] = self.kept[slot]
+        return weights
+
+    def _network(self) -> list[nn.Parameter]:
+        """Return the network's parameters in scope."""
+        return [each for each, inside in zip(self.weights.parameters, self.inside, strict=True) if inside]
+
+    def _set_own(self, vector: Tensor) -> None:
+        for own, part in zip(self.own, vector.split([each.numel() for each in self.own]), strict=True):
+            own.copy_(part.view_as(own))
+
+    def _add(self, vector: Tensor) -> None:
+        """Add a vector to the pool; if that is full, the mean of the two most similar vectors replaces them."""
+        vectors = torch.cat([self.pool[: self.num_pooled], vector.unsqueeze(0)])
+        if len(vectors) > self.pool_size:
+            vectors = merged(vectors)
+        self.num_pooled = len(vectors)
+        self.pool[: self.num_pooled] = vectors
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the slots of the tasks, how many have ended, and the number of vectors in the pool."""
+        return {**super().get_extra_state(), "ended": self.ended, "num_pooled": self.num_pooled}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self.ended, self.num_pooled = state["ended"], state["num_pooled"]
+
+
+def merged(vectors: Tensor) -> Tensor:
+    """Return vectors, [n, S], with their mean in place of the two of the highest cosine, [n - 1, S]."""
+    directions = nn.functional.normalize(vectors, dim=1)
+    cosines = (directions @ directions.T).fill_diagonal_(-torch.inf)
+    pair = divmod(int(cosines.argmax()), len(vectors))
+    others = [number for number in range(len(vectors)) if number not in pair]
+    return torch.cat([vectors[others], vectors[list(pair)].mean(dim=0, keepdim=True)])
