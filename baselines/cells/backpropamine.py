@@ -80,10 +80,9 @@ class Backpropamine(Cell):
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
         """See `Cell`; inputs are multiplied with their weights once a group."""
         given, outputs = self.input(inputs), []
-        for group, start, any_starts in zip(
-            groups.unbind(1), starts.unbind(1), starts.any(dim=0).tolist(), strict=True
-        ):
-            output, state = self._step(given.index_select(0, group), reset(state, start) if any_starts else state)
+        resets = starts.any(dim=0).tolist() if starts.is_cpu else [True] * starts.shape[1]  # a GPU would have to wait
+        for group, start, some in zip(groups.unbind(1), starts.unbind(1), resets, strict=True):
+            output, state = self._step(given.index_select(0, group), reset(state, start) if some else state)
             outputs.append(output)
         return torch.stack(outputs, dim=1)
 
