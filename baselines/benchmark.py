@@ -5,8 +5,10 @@ has them: on `ctgraph_rl.sb3.SB3VecEnv`, and on what its ``make_vec_env`` makes 
 own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
 slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
 it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core. ``--startup`` measures instead how long a run takes to its first step, beside the bare imports of torch and
-torchrl.
+core. Ctrl-C ends a measurement, and what was measured until then is printed.
+
+``--device cuda`` measures `baselines.ladder` instead, ``--startup`` how long a run takes to its first step, beside the
+bare imports of torch and torchrl.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
@@ -24,11 +27,14 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from baselines import _startup
+from baselines import _startup, ladder
 from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.benchmark import machine
+from ctgraph_rl.benchmark.ladder import climbed, found, until
+from ctgraph_rl.benchmark.ladder import table as ladder_table
 from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 
@@ -154,7 +160,10 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
 
 def table(measured: list[Contender]) -> str:
     """Format medians in Markdown; the ratio says how many times as fast ours is."""
-    ours = {(one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours"}
+    ours = {
+        (one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours" and one.speeds
+    }
+    measured = [one for one in measured if one.speeds and (one.agent, one.task) in ours]
     lines = ["| agent | task | who | frames/s | ours is | frames to 90 % | seconds to 90 % |", "|---" * 7 + "|"]
     for one in measured:
         speed = statistics.median(one.speeds)
@@ -173,6 +182,17 @@ def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
     return f"{frames:,.0f}", f"{seconds:.2f}"
 
 
+def on_device(device: torch.device, options: argparse.Namespace) -> str:
+    """Measure `baselines.ladder` on a device, with the agents of the options; return the table."""
+    rungs = [
+        rung
+        for rung in ladder.rungs(device, options.rows, options.together)
+        if rung.name == ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents
+    ]
+    rows = found(climbed(rungs, options, device), ladder.ENVIRONMENT)
+    return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, ladder.ENVIRONMENT)}"
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
     names = list(dict.fromkeys(name for name, _ in PAIRS))
@@ -185,17 +205,26 @@ def main(arguments: list[str] | None = None) -> None:
         "--max-frames", type=int, default=500_000, help="frames after which a task counts as not solved"
     )
     parser.add_argument("--startup", action="store_true", help="instead: the time of a run until its first step")
+    parser.add_argument("--limit", type=float, default=3600.0, help="seconds after which no measurement begins")
+    parser.add_argument("--device", default=None, help="instead: PPO and LSTM-PPO on one device, such as cuda")
+    parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
+    parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
+        *at_least_one(**{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
+        *at_least_one(**{f"together[{i}]": n for i, n in enumerate(options.together)}),
         (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
-        *positive(seconds=options.seconds),
+        *positive(seconds=options.seconds, limit=options.limit),
     )
     if options.startup:
         print(f"{machine()}; medians of {options.rounds} rounds\n\n{_startup.table(options.rounds)}")
         return
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    if options.device:
+        print(on_device(checked_device(options.device), options))
+        return
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
         missing = "Stable-Baselines3 is missing, ours are measured alone: pip install 'ctgraph_rl[benchmark]'"
@@ -204,11 +233,13 @@ def main(arguments: list[str] | None = None) -> None:
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]
     for learner in learners:
         learner.learn()
-    for _ in track(range(options.rounds), "measuring", console=console):
-        for contender, learner in zip(measured, learners, strict=True):
+    start, pairs = time.perf_counter(), list(zip(measured, learners, strict=True))
+    with suppress(KeyboardInterrupt):
+        for contender, learner in until(options.limit, track(pairs * options.rounds, "measuring", console=console)):
             contender.measure(learner, options.seconds)
-    for seed in track(range(options.seeds), "learning", console=console):
-        for contender in measured:
+        left = options.limit - (time.perf_counter() - start)
+        work = [(seed, contender) for seed in range(options.seeds) for contender in measured]
+        for seed, contender in until(left, track(work, "learning", console=console)):
             contender.solve(seed, options.max_frames)
     print(f"{machine()}; medians of {options.rounds} rounds and {options.seeds} seeds\n\n{table(measured)}")
 

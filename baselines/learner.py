@@ -126,6 +126,10 @@ class Learner(nn.Module):
         """
         raise NotImplementedError
 
+    def one_step(self, data: Data) -> dict[Any, Tensor]:
+        """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
+        return dict(self.outputs(data))
+
     @cached_property
     def weights(self) -> list[nn.Parameter]:
         """The parameters by which the losses are differentiated."""

@@ -160,6 +160,13 @@ class PolicyGradient(Learner):
         features = self.trunk.over_time(data)
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
+    def one_step(self, data: Data) -> dict[Any, Tensor]:
+        """Compute `outputs` for one step of all rows, and with memory the next state; see `Learner`."""
+        written = self.trunk.act(data)
+        features = written.pop(self.features)
+        values = self.critic.module(features)
+        return {**written, "log_probs": log_probabilities(self.actor, features), "state_value": values}
+
     def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
         """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""
         given = self._with_advantage(batch)

@@ -292,6 +292,11 @@ class Stack:
         bind = self.template.bind
         return vmap(lambda *given: bind(given[0], given[1]).outputs(given[2]))(self._tensors, self.others, data)
 
+    def one_step(self, data: dict[Any, Tensor]) -> dict[Any, Tensor]:
+        """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
+        bind = self.template.bind
+        return vmap(lambda *given: bind(given[0], given[1]).one_step(given[2]))(self._tensors, self.others, data)
+
     def losses(self, batch: dict[Any, Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
         """Compute the losses of all learners from minibatches, [seeds, items, ...].
 

@@ -41,6 +41,7 @@ TOP = {
     "baselines.__main__": "a command of cli.py",
     "baselines.methods.__main__": "a command of cli.py",
     "baselines.benchmark": "composes agents as a run does",
+    "baselines.ladder": "measures as the benchmark of the environment does",
 }
 """Modules that stand above all floors, and why."""
 

@@ -12,7 +12,7 @@ import argparse
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -317,8 +317,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.device:
         device = checked_device(options.device)
         tasks = {name: configurations()[name] for name in options.tasks}
-        rungs = climbed(device, options.rows, tasks, options)
-        print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder.table(rungs)}")
+        measured_there = ladder.climbed(ladder.rungs(device, options.rows, tasks), options, device)
+        print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder.table(ladder.found(measured_there))}")
         return
     measured = contenders(options.rows, options.tasks, not options.skip_kernel)
     console = Console(stderr=True)
@@ -330,14 +330,3 @@ def main(arguments: list[str] | None = None) -> None:
             one.measure(options.seconds)
     found = [one for one in measured if one.speeds]
     print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(found)}")
-
-
-def climbed(
-    device: torch.device, rows: Sequence[int], tasks: Mapping[str, Task], options: argparse.Namespace
-) -> list[ladder.Rung]:
-    """Measure the ladder of a device for as long as the options say; return what was measured."""
-    rungs = ladder.rungs(device, rows, tasks)
-    with suppress(KeyboardInterrupt):
-        for rung in ladder.until(options.limit, track(rungs, "measuring", console=Console(stderr=True))):
-            ladder.measure(rung, options.rounds, options.seconds, device)
-    return rungs

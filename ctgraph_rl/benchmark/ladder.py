@@ -8,17 +8,21 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import torch
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Words
-from ctgraph_rl.core.region import Region
+from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
 
@@ -36,26 +40,27 @@ GOAL, FUSED = 0.5e9, 5e9
 
 @dataclass
 class Rung:
-    """A way to step, and its observations a second."""
+    """A way to step or to learn, and its observations a second."""
 
     name: str
     task: str
     num_rows: int
     make: Callable[[], Run]
+    goal: float = 0.0  # observations a second; 0: none
     speeds: list[float] = field(default_factory=list)
     failure: str = ""
 
 
 def rungs(device: torch.device, num_rows: Sequence[int], tasks: Mapping[str, Task]) -> list[Rung]:
     """Return what is measured, in the order of the table."""
-    found = []
+    size, measured = next(iter(tasks.values())).images.shape, []
     for n in num_rows:
-        size = next(iter(tasks.values())).images.shape
-        found.append(Rung(COPY, "", n, lambda n=n, size=size: _copy(n, size, device)))  # type: ignore[misc]
+        measured.append(Rung(COPY, "", n, partial(_copy, n, size, device)))
         for name, task in tasks.items():
             for way, make in WAYS.items():
-                found.append(Rung(way, name, n, lambda n=n, task=task, make=make: make([task] * n, device)))  # type: ignore[misc]
-    return found
+                goal = FUSED if make is _fused else GOAL
+                measured.append(Rung(way, name, n, partial(make, [task] * n, device), goal))
+    return measured
 
 
 def _copy(num_rows: int, size: Sequence[int], device: torch.device) -> Run:
@@ -156,24 +161,43 @@ def _replayed(region: Region, rows: Rows, actions: Tensor) -> Run:
     return run
 
 
+class Options(Protocol):
+    """How long to measure: options of the command line."""
+
+    rounds: int
+    seconds: float
+    limit: float
+
+
+def climbed(rungs: list[Rung], options: Options, device: torch.device) -> list[Rung]:
+    """Measure a ladder for as long as the options say, or until Ctrl-C; return it."""
+    with suppress(KeyboardInterrupt):
+        for rung in until(options.limit, track(rungs, "measuring", console=Console(stderr=True))):
+            measure(rung, options.rounds, options.seconds, device)
+    return rungs
+
+
 def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> None:
     """Measure observations a second; for a way that fails, note why, and measure the others."""
     try:
         run = rung.make()
-        for _ in range(5):  # builds, compiles, captures
+        for _ in range(WARM_UP + 1):
             run()
+        start = finished(device)
+        run()
+        at_once = max(1, min(10, round(seconds / (finished(device) - start))))
         for _ in range(rounds):
-            rung.speeds.append(_speed(run, seconds, device))
+            rung.speeds.append(_speed(run, at_once, seconds=seconds, device=device))
     except (RuntimeError, torch.OutOfMemoryError) as error:
         rung.failure = f"{type(error).__name__}: {error}".splitlines()[0]
 
 
-def _speed(run: Run, seconds: float, device: torch.device) -> float:
+def _speed(run: Run, at_once: int, seconds: float, device: torch.device) -> float:
+    """Return observations a second; the device is waited for after so many runs at once."""
     count, start = 0, finished(device)
-    while finished(device) - start < seconds:
-        for _ in range(10):  # the device is not waited for after each
-            count += run()
-    return count / (finished(device) - start)
+    while (now := finished(device)) - start < seconds:
+        count += sum(run() for _ in range(at_once))
+    return count / (now - start)
 
 
 def finished(device: torch.device) -> float:
@@ -184,7 +208,7 @@ def finished(device: torch.device) -> float:
 
 
 def until(limit: float, items: Iterable[T]) -> Iterator[T]:
-    """Yield items for so many seconds, or until Ctrl-C, which ends it as the last item would."""
+    """Yield items for so many seconds."""
     start = time.perf_counter()
     for item in items:
         if time.perf_counter() - start > limit:
@@ -192,17 +216,40 @@ def until(limit: float, items: Iterable[T]) -> Iterator[T]:
         yield item
 
 
-def table(measured: Sequence[Rung]) -> str:
-    """Format medians in Markdown, with their ratios to the copy of the same rows, and to the goal."""
-    lines = ["| rows | task | way | M obs/s | / copy | / goal |", "|---|---|---|---|---|---|"]
-    copies = {rung.num_rows: statistics.median(rung.speeds) for rung in measured if rung.name == COPY and rung.speeds}
-    for rung in measured:
-        if rung.failure:
-            lines.append(f"| {rung.num_rows:,} | {rung.task} | {rung.name} | {rung.failure} | | |")
-        elif rung.speeds:
-            speed, goal = statistics.median(rung.speeds), FUSED if "fused" in rung.name else GOAL
-            share = f"{speed / copies[rung.num_rows]:.2g}" if rung.num_rows in copies else ""
-            of_goal = f"{speed / goal:.2g} of {goal / 1e9:g}G" if rung.name != COPY else ""
-            cells = [f"{rung.num_rows:,}", rung.task, rung.name, f"{speed / 1e6:.4g}", share, of_goal]
-            lines.append(f"| {' | '.join(cells)} |")
+def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any]]:
+    """Return what was measured as plain values: medians, and their ratios to the yardstick.
+
+    The yardstick is that of the same task and rows, or where there is none, of the most rows.
+
+    Args:
+        measured: the ladder; what was not measured is left out.
+        yardstick: the name of the rung that others are compared with.
+    """
+    known = [rung for rung in measured if rung.speeds or rung.failure]
+    median = {(rung.name, rung.num_rows, rung.task): statistics.median(rung.speeds) for rung in known if rung.speeds}
+    rows = []
+    for rung in known:
+        row: dict[str, Any] = {"rows": rung.num_rows, "task": rung.task, "way": rung.name}
+        speed = median.get((rung.name, rung.num_rows, rung.task))
+        if speed is None:
+            rows.append({**row, "failure": rung.failure})
+            continue
+        yardsticks = {
+            n: each for (name, n, task), each in median.items() if name == yardstick and task in ("", rung.task)
+        }
+        ratio = speed / yardsticks.get(rung.num_rows, yardsticks[max(yardsticks)]) if yardsticks else None
+        rows.append({**row, "per_second": speed, "ratio": ratio, "goal": rung.goal or None, "rounds": len(rung.speeds)})
+    return rows
+
+
+def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
+    """Format what `found` returns in Markdown, each row with its ratio to the yardstick and its share of the goal."""
+    lines = [f"| rows | task | way | M/s | / {yardstick} | / goal |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        numbers = [row.get("failure", ""), "", ""]
+        if "per_second" in row:
+            speed, ratio, goal = row["per_second"], row["ratio"], row["goal"]
+            share = "" if goal is None else f"{speed / goal:.2g} of {goal / 1e6:,.3g}M"
+            numbers = [f"{speed / 1e6:.4g}", "" if ratio is None else f"{ratio:.2g}", share]
+        lines.append(f"| {row['rows']:,} | {row['task']} | {row['way']} | {' | '.join(numbers)} |")
     return "\n".join(lines)

@@ -21,6 +21,7 @@ from baselines.cells.lstm import packed_lstm
 from baselines.learner import functional_gradient_step
 from baselines.networks import distinct
 from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.benchmark import ladder as ladder_of_envs
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
 
@@ -250,6 +251,33 @@ def test_without_stable_baselines_ours_is_measured_alone(capsys, monkeypatch):
     printed = capsys.readouterr()
     assert "pip install 'ctgraph_rl[benchmark]'" in printed.err.replace("\n", " ")
     assert [line.split("|")[3].strip() for line in printed.out.splitlines()[4:]] == ["ours"]
+
+
+def test_a_benchmark_that_is_stopped_prints_what_it_has(capsys, monkeypatch):
+    def stopped(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(benchmark, "find_spec", lambda name: None)
+    monkeypatch.setattr(benchmark.Contender, "solve", stopped)
+
+    benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1"])
+    benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1", "--limit", "1e-9"])
+
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| a2c")]
+    assert [line.split("|")[3].strip() for line in lines] == ["ours"]
+
+
+def test_the_ladder_of_a_device_has_both_agents_and_seeds_together(capsys, monkeypatch):
+    monkeypatch.setattr(ladder_of_envs, "measure", lambda rung, *how: rung.speeds.append(1e6))
+
+    benchmark.main(["--device", "cpu", "--rows", "16", "--together", "2"])
+
+    lines = [line.split("|") for line in capsys.readouterr().out.splitlines()[4:]]
+    assert [line[3].strip() for line in lines] == [
+        *("environment alone", "ppo, step by step", "ppo, captured", "ppo, compiled and captured"),
+        *("ppo, 2 seeds as one job", "environment alone", "lstm_ppo, step by step", "lstm_ppo, captured"),
+        "lstm_ppo, 2 seeds as one job",
+    ]
 
 
 def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import re
+import sys
 
 import pytest
 import torch
@@ -94,6 +97,38 @@ def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
         state, words, shown = ladder.one_step(state, action, words, twin.params, twin.uses)
         expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
         assert all(torch.equal(*pair) for pair in zip(shown, expected, strict=True))
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
+    yield __import__("gpu")
+    del sys.modules["gpu"]
+
+
+def test_the_page_says_of_gpus_what_was_measured(gpu):
+    report = json.loads(gpu.FILE.read_text()) if gpu.FILE.exists() else None
+
+    page = gpu.PAGE.read_text(encoding="utf-8")
+
+    assert gpu.with_section(page, report) == page
+    assert (report is None) == ("Not measured: no GPU was at hand." in page)
+
+
+def test_a_report_of_a_gpu_has_its_parts_as_they_were_measured_and_the_time_of_many_seeds(gpu, monkeypatch):
+    monkeypatch.setattr(gpu, "TESTS", ("-c", "print('FAILED one'); print('1 failed')"))
+    for module, rung in {gpu.ladder: gpu.ladder.COPY, gpu.learning: "lstm_ppo, 1,024 seeds as one job"}.items():
+        made = [ladder.Rung(rung, "SU", 2, lambda: lambda: 7, 1e6)]
+        monkeypatch.setattr(module, "rungs", lambda *what, made=made: made)
+    options = argparse.Namespace(minutes=0.2, seconds=0.001, rows=[2], envs=[2], together=[2])
+
+    report = dict(gpu.parts(torch.device("cpu"), options))
+    text = gpu.section(json.loads(json.dumps(report)))
+
+    assert report["tests"] == {"exit_code": 0, "said": "1 failed", "failed": ["FAILED one"]}
+    assert "Tests marked `cuda`: 1 failed." in text
+    assert re.search(r"1,024 seeds of the main job as one job: [\d.e+-]+ minutes of learning, computed", text)
+    assert gpu.section({name: report[name] for name in ("machine", "commit")}).startswith("Measured on")
 
 
 def test_the_benchmark_measures_co_with_waiting_and_rotation_and_both_with_noise():

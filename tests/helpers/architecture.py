@@ -243,7 +243,8 @@ def upward(modules: Iterable[Module], floors: Sequence[Sequence[str]], top: Mapp
             f"{source} -> {target}"
             for source, targets in arrows(modules, typing=True).items()
             for target in targets
-            if place(target) >= place(source) and (wing(source) != wing(target) or target in top)
+            if place(target) >= place(source)
+            and (wing(source) != wing(target) or {source, target} & set(top) == {target})
         }
     )
 

@@ -18,8 +18,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import baselines.learner
 import curricula
+from baselines.ladder import Seeds, built
 from baselines.learner import Learner
 from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
+from ctgraph_rl.batch import rows
 from ctgraph_rl.benchmark import configurations
 from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn import collect
@@ -56,11 +58,11 @@ def test_a_region_returns_the_results_of_its_function_and_overwrites_them():
 
 @pytest.mark.parametrize("name", configurations())
 def test_no_step_of_the_tensor_engine_needs_the_host(name):
-    rows = Rows([configurations()[name]] * 4, kernel="off").to(META)
+    batch = Rows([configurations()[name]] * 4, kernel="off").to(META)
 
-    steps = rollout(rows, torch.zeros(2, 4, dtype=torch.int64, device=META), Steps.empty(rows, 2))
+    steps = rollout(batch, torch.zeros(2, 4, dtype=torch.int64, device=META), Steps.empty(batch, 2))
 
-    assert {value.device for value in (*steps, *rows.state)} == {META}
+    assert {value.device for value in (*steps, *batch.state)} == {META}
 
 
 @pytest.mark.parametrize("name", POLICY_GRADIENTS)
@@ -121,3 +123,26 @@ def test_memory_that_is_used_again_and_again_changes_no_bit_of_a_run(name, bound
 
     assert lines == expected
     assert parameters_equal(agent, its)
+
+
+@pytest.mark.parametrize("name", ["ppo", "lstm_ppo"])
+def test_seeds_of_the_ladder_have_the_losses_that_each_has_alone(name, monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
+    monkeypatch.setattr(rows, "knows", lambda *what: False)  # the kernel needs a CPU
+    learners = [built(name, confounding(p=0.3), **TINY, num_minibatches=2) for _ in range(3)]
+    group, seen = Seeds(learners, confounding(p=0.3), torch.device("cpu")), []
+    monkeypatch.setattr(group, "update", seen.append)
+
+    group.learn(next(group.batches))
+    found, gradients = group.stack.losses(seen[0])
+
+    assert len(seen) == 2
+    for i, learner in enumerate(learners):
+        expected = learner.loss({key: value[i] for key, value in seen[0].items()})
+        torch.testing.assert_close({key: value[i] for key, value in found.items()}, expected)
+        [first, *_] = torch.autograd.grad(expected["loss_objective"] + expected["loss_critic"], learner.weights[:1])
+        assert first.shape == gradients[0][i].shape
+    before = learners[0].weights[0].clone()
+    group.gradient_step(seen[0])
+    group.stack.write()
+    assert not torch.equal(learners[0].weights[0], before)
