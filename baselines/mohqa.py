@@ -34,7 +34,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
-from baselines.networks import Data, EncoderModule, encoder, require_weights
+from baselines.networks import Data, EncoderModule, encoder, guided, require_weights
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
@@ -153,6 +153,7 @@ class ModulatedGreedy(TensorDictModuleBase):
         y = (features + self._noise(features) - average).tanh()
         tensordict.set("action", (self.head(features) + self.hebbian(y)).argmax(dim=-1))
         tensordict = self.exploration(tensordict)
+        tensordict.set("action", guided(tensordict, tensordict["action"]))
         before = tensordict["eligibility"] * ~tensordict["is_init"].unsqueeze(-1)
         after = self.hebbian.eligibility(before, y, tensordict["action"])
         tensordict.set(("next", "eligibility"), after)

@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 from helpers.small_agents import GREEDY, batches, learnt_from
-from torch.nn.functional import linear
+from torch.nn.functional import linear, one_hot
 from torchrl.envs.utils import set_exploration_type
 
 from baselines.mohqa import HebbianHead
-from ctgraph_rl import evaluate
+from ctgraph_rl import CTGraphEnv, evaluate
+from ctgraph_rl.learn.guide import GUIDED_ACTION
 from curricula.paper import ct_fo_b1, ct_su_b1
 
 DECAY = math.exp(-1 / 48)
@@ -104,6 +105,20 @@ def test_the_policy_acts_on_the_sum_of_both_networks_and_writes_its_state(small_
     before = torch.where(data["is_init"].unsqueeze(-1), 0.0, data["eligibility"])
     expected = agent.hebbian.eligibility(before, y, written["action"])
     torch.testing.assert_close(written["next", "eligibility"], expected)
+
+
+def test_a_guided_action_is_taken_and_is_what_becomes_eligible(small_agent):
+    agent = small_agent("mohqa", [ct_su_b1()])
+    data = CTGraphEnv([ct_su_b1()] * 3).reset().update(agent.initial_state(3))
+
+    with set_exploration_type(GREEDY), torch.no_grad():
+        own = agent.policy(data.clone())["action"]
+        given = torch.tensor([(own[0] + 1) % 3, -1, (own[2] + 2) % 3])
+        written = agent.policy(data.set(GUIDED_ACTION, given))
+
+    taken = torch.where(given < 0, own, given)
+    assert torch.equal(written["action"], taken)
+    assert torch.equal(written["next", "eligibility"].any(dim=-1), one_hot(taken, 3).bool())
 
 
 @pytest.mark.parametrize("predict_sum", [False, True])
