@@ -252,8 +252,12 @@ def make_compiled_step() -> Step:
     """
     torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
     step = FunctionType(functional_gradient_step.__code__.replace(), functional_gradient_step.__globals__)
-    options: dict[str, Any] = {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
-    return torch.compile(step, fullgraph=True, dynamic=False, options=options)
+    return torch.compile(step, fullgraph=True, dynamic=False, options=compiler_options())
+
+
+def compiler_options() -> dict[str, Any]:
+    """Return the compiler's options: between operations there are no checks of sizes and, without a GPU, no Python."""
+    return {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
 
 
 def functional_gradient_step(learner: Learner, batch: Data) -> dict[str, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import torch
@@ -86,8 +87,10 @@ class StackedOptimiser:
         settings, self.is_adam = optimisers[0].defaults, isinstance(optimisers[0], torch.optim.Adam)
         betas = settings["betas"] if self.is_adam else (0.0, settings["alpha"])
         self.adam = torch.optim.Adam(parameters, settings["lr"], betas, settings["eps"], fused=True)
-        for parameter, own in zip(parameters, self.own, strict=True):
-            self.adam.state[parameter] = self._read(parameter, own)
+        self.state = [self._read(parameter, own) for parameter, own in zip(parameters, self.own, strict=True)]
+        self.adam.state.update(zip(parameters, self.state, strict=True))
+        self.steps_before = [state["step"].item() for state in self.state]
+        self.corrections: Tensor | None = None
 
     @property
     def moments(self) -> dict[str, str]:
@@ -110,17 +113,44 @@ class StackedOptimiser:
         norms = [torch.linalg.vector_norm(each, dim=tuple(range(1, each.ndim))) for each in gradients]
         norm = torch.linalg.vector_norm(torch.stack(norms), dim=0)
         scale = (max_norm / (norm + 1e-6)).clamp(max=1.0)
+        gradients = [gradient * scale.view(-1, *[1] * (gradient.ndim - 1)) for gradient in gradients]
+        if self.corrections is not None:
+            how = {key: self.adam.defaults[key] for key in ("betas", "eps")}
+            adam_step(self.parameters, gradients, self.state, self.corrections, **how)
+            return norm
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            parameter.grad = gradient * scale.view(-1, *[1] * (gradient.ndim - 1))
+            parameter.grad = gradient
         self.adam.step()
         self.num_steps += 1
         return norm
 
+    @property
+    def tensors(self) -> list[Tensor]:
+        """The tensors beside parameters that a step by functions alone needs: moments, and the next step's corrections.
+
+        These are, of each parameter, the learning rate over the correction of the first moment, and one over the root
+        of the second's.
+        """
+        moments = [state[key] for key in ("exp_avg", "exp_avg_sq") for state in self.state]
+        (beta1, beta2), rate = self.adam.defaults["betas"], self.adam.defaults["lr"]
+        numbers = [before + self.num_steps + 1 for before in self.steps_before]
+        corrections = [(rate / (1 - beta1**number), (1 - beta2**number) ** -0.5) for number in numbers]
+        return [*moments, torch.tensor(corrections, dtype=moments[0].dtype, device=moments[0].device)]
+
+    def functional(self, parameters: Sequence[Tensor], tensors: Sequence[Tensor]) -> StackedOptimiser:
+        """Return a copy that updates other parameters and `tensors` in place, by functions that can be traced."""
+        other, count = copy(self), len(parameters)
+        first, second, other.corrections = tensors[:count], tensors[count : 2 * count], tensors[-1]
+        pairs = zip(first, second, strict=True)
+        other.parameters = parameters
+        other.state = [{"exp_avg": one, "exp_avg_sq": two} for one, two in pairs]
+        return other
+
     @torch.no_grad()
     def write(self) -> None:
         """Write the state to the optimisers of the seeds."""
-        for parameter, own in zip(self.parameters, self.own, strict=True):
-            moments = {name: unstacked(self.adam.state[parameter][key]) for key, name in self.moments.items()}
+        for of_all, own in zip(self.state, self.own, strict=True):
+            moments = {name: unstacked(of_all[key]) for key, name in self.moments.items()}
             for number, (optimiser, each) in enumerate(zip(self.optimisers, own, strict=True)):
                 state = optimiser.state[each]
                 if not state:
@@ -130,6 +160,34 @@ class StackedOptimiser:
                 for name, value in moments.items():
                     state[name].copy_(value[number])
         self.num_steps = 0
+
+
+@torch.no_grad()
+def adam_step(
+    parameters: Iterable[Tensor],
+    gradients: Iterable[Tensor],
+    states: Iterable[dict[str, Tensor]],
+    corrections: Tensor,
+    *,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Take a step of Adam in place, by functions that compile to one pass over each parameter.
+
+    Args:
+        parameters: of the network.
+        gradients: of each.
+        states: the moments of each.
+        corrections: of each the learning rate over the correction of the first moment, and one over the root of the
+            second's; [parameters, 2]..
+        betas: decay of both moments.
+        eps: is added to the root of the second moment.
+    """
+    given = zip(parameters, gradients, states, corrections.unbind(), strict=True)
+    for parameter, gradient, state, (rate, inverse) in given:
+        first = state["exp_avg"].lerp_(gradient, 1 - betas[0]) if betas[0] else gradient
+        second = state["exp_avg_sq"].mul_(betas[1]).addcmul_(gradient, gradient, value=1 - betas[1])
+        parameter.sub_(rate * first / (second.sqrt() * inverse + eps))
 
 
 def stacked(tensors: Sequence[Tensor]) -> Tensor:

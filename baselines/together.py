@@ -6,18 +6,22 @@ evaluation and the hooks at task changes are those of an agent alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
+from copy import copy, deepcopy
 from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
+from torch._inductor import compile
 from torch.func import vmap
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from baselines.learner import Learner, total_loss
+from baselines.learner import Learner, compiler_options, total_loss
 from baselines.methods.method import AgentWithMethod, Method
 from baselines.networks import Data
 from baselines.optimisers import StackedOptimiser, is_stackable, stacked, unstacked
@@ -55,9 +59,12 @@ class Group:
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
         self.agents, self.generators = list(agents), list(generators)
         self.learners = [_learner(agent) for agent in agents]
-        self.template = Template(self.learners[0])
         self.is_stacked = self.learners[0].minibatch_size <= LARGEST_MINIBATCH
+        self.most_at_once = _most_at_once(self.learners[0]) if self.learners[0].compiled_step else len(self.agents)
+        self._template: Template | None = None
         self._acting: Stack | None = None
+        self._compiled: dict[str, Step] = {}
+        self._steps: dict[int, Step] = {}
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
@@ -70,9 +77,17 @@ class Group:
             generator.set_state(torch.get_rng_state())
             torch.set_rng_state(before)
 
+    @property
+    def template(self) -> Template:
+        """A copy of a learner as it is in the present task: what a method computes can depend on earlier tasks."""
+        if self._template is None:
+            self._template = Template(self.learners[0])
+        return self._template
+
     def start_task(self, task: int | None = None) -> None:
         """See `ctgraph_rl.agent.Agent`."""
-        self._acting = None
+        self._acting = self._template = None
+        self._steps.clear()
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
@@ -124,8 +139,17 @@ class Group:
         for agent, part in zip(self.agents, parts, strict=True):
             if isinstance(agent, AgentWithMethod):
                 agent.method.on_batch(part)
-        minibatches = [learner.minibatches(part) for learner, part in zip(self.learners, parts, strict=True)]
-        stack, steps = Stack(self.template, self.learners), []
+        count = len(parts)
+        bounds = torch.arange(count).tensor_split(math.ceil(count / self.most_at_once))
+        return [measured for numbers in bounds for measured in self._learn_at_once(numbers.tolist(), parts)]
+
+    def _learn_at_once(
+        self, numbers: Sequence[int], parts: Sequence[TensorDictBase]
+    ) -> list[dict[str, float] | FloatingPointError]:
+        """Let some of the agents learn as one stack."""
+        learners = [self.learners[number] for number in numbers]
+        minibatches = {number: self.learners[number].minibatches(parts[number]) for number in numbers}
+        stack, steps = Stack(self.template, learners), []
         while given := self._next(minibatches):
             steps.append(self._update(stack, given))
         stack.write()
@@ -134,32 +158,59 @@ class Group:
                 agent.method.after_learning()
         names = list(steps[0])
         table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
-        pairs = zip(self.learners, table, strict=True)
+        pairs = zip(learners, table, strict=True)
         return [_or_error(lambda of, column: of.after_batch(of.means(names, column)), *pair) for pair in pairs]
 
-    def _next(self, minibatches: Sequence[Iterator[dict[Any, Tensor]]]) -> list[Data]:
-        """Return the next minibatch of each agent; none after the last."""
+    def _next(self, minibatches: Mapping[int, Iterator[dict[Any, Tensor]]]) -> list[Data]:
+        """Return the next minibatch of each of these agents; none after the last."""
         given = []
-        for number, (learner, iterator) in enumerate(zip(self.learners, minibatches, strict=True)):
+        for number, iterator in minibatches.items():
             with self.random(number):
                 minibatch = next(iterator, None)
-                given += [] if minibatch is None else [learner.method.transform_minibatch(minibatch)]
+                given += [] if minibatch is None else [self.learners[number].method.transform_minibatch(minibatch)]
         return given
 
     def _update(self, stack: Stack, minibatches: Sequence[Data]) -> dict[str, Tensor]:
-        """Take a gradient step of all agents; return what was measured, [seeds] each."""
-        needs_weights = self.learners[0].needs_weights
+        """Take a gradient step of a stack; return what was measured, [seeds] each."""
+        needs_weights = stack.learners[0].needs_weights
         batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
-        measured = stack.gradient_step(batch)
-        if type(self.learners[0]).after_update is Learner.after_update:
+        measured = self._step(stack, batch)
+        if type(stack.learners[0]).after_update is Learner.after_update:
             return measured
         if needs_weights:
             stack.write()
-        for number, learner in enumerate(self.learners):
+        for number, learner in enumerate(stack.learners):
             kept = learner.after_update({key: value[number] for key, value in measured.items()})
         if needs_weights:
             stack.read_others()
         return {key: measured[key] for key in kept}
+
+    def _step(self, stack: Stack, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents say so."""
+        first, count = stack.learners[0], len(stack.learners)
+        if first.compiled_step is None or batch["action"].shape[1] != first.minibatch_size:
+            return stack.gradient_step(batch)
+        if count not in self._steps:
+            graph = stack.traced(batch)
+            if graph.code not in self._compiled:
+                self._compiled[graph.code] = compile(graph, [*stack.inputs(batch)], compiler_options())
+            self._steps[count] = self._compiled[graph.code]
+        measured = self._steps[count](*stack.inputs(batch))
+        stack.optimiser.num_steps += 1
+        return measured
+
+
+Step = Callable[..., dict[str, Tensor]]
+"""A compiled gradient step of a `Stack`, a function of its `inputs`."""
+
+CACHED_BYTES = 2**23
+"""What a core keeps in its cache, of weights, gradients and moments."""
+
+
+def _most_at_once(learner: Learner) -> int:
+    """Return how many seeds a compiled step takes: their tensors stay in the cache from one step to the next."""
+    of_one = sum(4 * parameter.numel() * parameter.element_size() for parameter in learner.parameters())
+    return max(1, CACHED_BYTES // of_one)
 
 
 def _or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str, float] | FloatingPointError:
@@ -317,6 +368,24 @@ class Stack:
         norm = self.optimiser.step(map(unstacked, changed), learner.max_grad_norm)
         learner.method.after_step()
         return {**losses, "grad_norm": norm}
+
+    def inputs(self, batch: dict[Any, Tensor]) -> list[Tensor]:
+        """Return the tensors that `gradient_step` reads or updates, in one order."""
+        return [*self.kept.values(), *self.optimiser.tensors, *self.others.values(), *batch.values()]
+
+    def traced(self, batch: dict[Any, Tensor]) -> GraphModule:
+        """Return `gradient_step` as a graph of operations, a function of `inputs`."""
+
+        def step(*given: Tensor) -> dict[str, Tensor]:
+            left = iter(given)
+            other = copy(self)
+            other.kept = {number: next(left).detach().requires_grad_(number in self.learned) for number in self.kept}
+            parameters = [other.kept[number] for number in self.template.trained]
+            other.optimiser = self.optimiser.functional(parameters, [next(left) for _ in self.optimiser.tensors])
+            other.others = {key: next(left) for key in self.others}
+            return other.gradient_step({key: next(left) for key in batch})
+
+        return make_fx(step, tracing_mode="fake")(*(tensor.detach() for tensor in self.inputs(batch)))
 
 
 def _learner(agent: Agent) -> Any:

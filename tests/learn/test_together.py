@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +33,8 @@ AGENTS = {
     "dqn": REPLAY,
     "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
 }
+
+COMPILED = [("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
 
 METHODS = ("scratch", "l2", "ewc", "mask_ri", "mask_lc", "mask_blc")
 
@@ -138,34 +141,57 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
 
 
 @pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in AGENTS), *(("ppo", m) for m in METHODS)])
-def test_losses_and_gradients_of_the_first_update_are_those_of_a_run_alone(make, monkeypatch, name, method):
-    its, found = make(name, method), {}
-    update = Group._update
+def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
+    make, monkeypatch, name, method
+):
+    its, found = make(name, method), []
+    start, update = Group.start_task, Group._update
 
-    def kept(group, stack, minibatches):
-        if not found:
+    def started(group, task=None):
+        start(group, task)
+        found.append(None)
+
+    def compared(group, stack, minibatches):
+        if found[-1] is None:
             for learner in group.learners:
                 learner.double()
-            in_double = Stack(Template(group.learners[0]), group.learners)
-            batch = {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
-            found["losses"], found["gradients"] = in_double.losses(batch)
-            for number, learner in enumerate(group.learners):
-                losses = learner.losses({key: wide(value) for key, value in minibatches[number].items()})
-                found[number] = losses, torch.autograd.grad(together.total_loss(losses), learner.weights)
+            found[-1] = (
+                of_all(group, minibatches),
+                [of_one(*pair) for pair in zip(group.learners, minibatches, strict=True)],
+            )
+            for learner in group.learners:
                 learner.float()
         return update(group, stack, minibatches)
 
-    monkeypatch.setattr(Group, "_update", kept)
+    monkeypatch.setattr(Group, "start_task", started)
+    monkeypatch.setattr(Group, "_update", compared)
     its.learn()
 
-    for number in range(len(SEEDS)):
-        losses, gradients = found[number]
-        assert list(losses) == list(found["losses"])
-        for key, value in losses.items():
-            torch.testing.assert_close(found["losses"][key][number], value, rtol=1e-10, atol=1e-10)
-        for gradient, one in zip(found["gradients"], gradients, strict=True):
-            torch.testing.assert_close(gradient[number], one, rtol=1e-10, atol=1e-10)
-    assert any(gradient.abs().max() > 1e-6 for gradient in found["gradients"])
+    assert len(found) == 3
+    for (losses, gradients), alone in found:
+        for number, (its_losses, its_gradients) in enumerate(alone):
+            assert list(losses) == list(its_losses)
+            for key, value in its_losses.items():
+                torch.testing.assert_close(losses[key][number], value, rtol=1e-10, atol=1e-10)
+            for gradient, one in zip(gradients, its_gradients, strict=True):
+                torch.testing.assert_close(gradient[number], one, rtol=1e-10, atol=1e-10)
+        assert any(gradient.abs().max() > 1e-6 for gradient in gradients)
+
+
+def of_all(group: Group, minibatches) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
+    """Losses of a group, and the gradients of what is trained."""
+    stack = Stack(group.template, group.learners)
+    losses, gradients = stack.losses(
+        {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
+    )
+    learner = group.template.bind(stack._tensors, stack.others)
+    return losses, list(learner.method.transform_gradients(gradients))
+
+
+def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
+    losses = learner.losses({key: wide(value) for key, value in minibatch.items()})
+    gradients = torch.autograd.grad(together.total_loss(losses), learner.weights)
+    return losses, list(learner.method.transform_gradients(gradients))
 
 
 def wide(value: torch.Tensor) -> torch.Tensor:
@@ -183,6 +209,60 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert [line.keys() for line in lines(log)] == [line.keys() for line in lines(its_log)]
         assert agent.state_dict().keys() == alone.state_dict().keys()
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("ppo", "ewc"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in COMPILED)],
+)
+def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeypatch, name, method):
+    its = make(
+        name, method, "agent.compile=true", curriculum=of(Block(ONE, 64), Block(THREE, 64), task_id="at_boundaries")
+    )
+    pairs, traced = [], Stack.traced
+
+    def compared(stack, batch):
+        batch_in_double = {key: wide(value) for key, value in batch.items()}
+        one, other = in_double(stack), in_double(stack)
+        measured = one.gradient_step(batch_in_double)
+        graph = traced(other, batch_in_double)
+        pairs.append((measured, graph(*other.inputs(batch_in_double))))
+        other.optimiser.num_steps += 1
+        pairs.append((written(one), written(other)))
+        return traced(stack, batch)
+
+    monkeypatch.setattr(Stack, "traced", compared)
+    monkeypatch.setattr(together, "compile", lambda graph, *_: graph)
+    monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
+    its.learn()
+
+    assert len(pairs) == 8, "of two seeds and of the third, in each task"
+    for one, other in pairs:
+        assert one.keys() == other.keys()
+        for key in one:
+            torch.testing.assert_close(one[key], other[key], rtol=1e-10, atol=1e-10)
+
+
+def written(stack: Stack) -> dict[Any, torch.Tensor]:
+    """The weights and moments of a stack's learners, once they are written to them."""
+    stack.write()
+    learners = list(enumerate(stack.learners))
+    weights = {(i, name): value for i, learner in learners for name, value in learner.named_parameters()}
+    states = [
+        (i, each.optimiser.state[own], own_number)
+        for i, each in learners
+        for own_number, own in enumerate(each.trainable)
+    ]
+    return weights | {(i, number, key): value for i, state, number in states for key, value in state.items()}
+
+
+def in_double(stack: Stack) -> Stack:
+    """A stack of copies of the same learners in float64."""
+    learners = [deepcopy(learner).double() for learner in stack.learners]
+    for learner in learners:
+        for state in learner.optimiser.state.values():
+            state |= {key: wide(value) for key, value in state.items() if key != "step"}
+    return Stack(Template(learners[0]), learners)
 
 
 def test_large_minibatches_are_learned_from_one_seed_after_the_other_by_the_agents_own_code(make, monkeypatch):
@@ -237,8 +317,9 @@ def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_
         assert list(map(lines, resumed_logs)) == list(map(lines, logs))
 
 
+@pytest.mark.parametrize("functional", [False, True])
 @pytest.mark.parametrize("name", ["adam", "rmsprop"])
-def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name):
+def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name, functional):
     torch.manual_seed(0)
     own = [[torch.nn.Parameter(torch.randn(*shape).double()) for shape in ((3, 3), (4,))] for _ in SEEDS]
     optimisers = [make_optimiser(name, parameters, 0.1) for parameters in own]
@@ -250,7 +331,9 @@ def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(nam
         stack = StackedOptimiser(optimisers, kept)
         for _ in range(3):
             gradients = [torch.randn_like(parameter) for parameter in kept]
-            norms = stack.step(gradients, 0.5)
+            one = stack.functional(kept, stack.tensors) if functional else stack
+            norms = one.step(gradients, 0.5)
+            stack.num_steps += functional
             for number, parameters in enumerate(copies):
                 parameters[0].grad, parameters[1].grad = (
                     gradients[0][number].mT.contiguous(),
