@@ -29,6 +29,7 @@ def co_hard(
     expected_length: float | None = None,
     unique_decisions: bool = False,
     num_wait_images: int = 500,
+    read_noise: int = 0,
     num_frames: int = 512_000,
     image_seed: int = 1,
 ) -> Curriculum:
@@ -43,6 +44,7 @@ def co_hard(
         expected_length: E[rho], the mean steps of an episode without fail, which then decides p; None: p is given.
         unique_decisions: whether each decision state has an image of its own; False: all show one image.
         num_wait_images: images that wait states draw from at every observation; 1 is a surjective graph.
+        read_noise: largest addition to each pixel whenever an image is read, in 0..255.
         num_frames: frames to learn from.
         image_seed: seed of the image set.
     """
@@ -54,6 +56,7 @@ def co_hard(
     graph = CTGraph(2, depth, p)
     observations = observations_of(graph, "confounding", num_wait_images)
     observations = _with_unique_decisions(observations, graph) if unique_decisions else observations
+    observations = replace(observations, read_noise=read_noise)
     goal = tuple(1 + place % 2 for place in range(depth))
     task = Task(graph, goal, observations, PaperImages(observations.last_id + 1, image_seed))
     return sequence("co_hard", [task], num_frames, source=SOURCE)

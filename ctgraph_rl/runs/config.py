@@ -130,7 +130,9 @@ def check_one_cell() -> None:
         return
     chosen = HydraConfig.get()
     given = {setting.partition("=")[0].lstrip("+") for setting in chosen.overrides.task}
-    swept = {key: value for key, value in (chosen.sweeper.get("params") or {}).items() if key not in given}
+    together = {key: "..." for variant in chosen.sweeper.get("variants") or () for key in variant}
+    every = {**(chosen.sweeper.get("params") or {}), **together}
+    swept = {key: value for key, value in every.items() if key not in given}
     shown = " ".join(f"{key}={value}" for key, value in swept.items())
     launcher = chosen.runtime.choices["hydra/launcher"]
     require(

@@ -61,11 +61,18 @@ class Sweeper(Base):
         max_batch_size: cells that are given to the launcher at a time; None: all.
         params: what is swept, beside the command line.
         status: only report the status of each cell.
+        variants: settings that change together, each combined with all of ``params``; None: there are none.
     """
 
-    def __init__(self, max_batch_size: int | None, params: dict[str, str] | None, status: bool) -> None:
+    def __init__(
+        self,
+        max_batch_size: int | None,
+        params: dict[str, str] | None,
+        status: bool,
+        variants: Sequence[Mapping[str, Any]] | None = None,
+    ) -> None:
         super().__init__(max_batch_size, params)
-        self.status = status
+        self.status, self.variants = status, variants or ({},)
         self._values: dict[str, tuple[str, Any] | None] = {}
         self._stale: dict[Path, str] = {}
         self._begun: dict[Path, tuple[int, ...]] = {}
@@ -98,8 +105,7 @@ class Sweeper(Base):
         )
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables
-        overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *arguments])
-        [batch] = self.split_arguments(overrides, None)
+        batch = [cell for variant in self.variants for cell in self._combined(variant, arguments)]
         cells = self.cells(batch)
         again = cells if overwrite is True else self._stale
         before = {folder: Outcome.of(folder) if folder in again else NOTHING for folder in cells}
@@ -115,6 +121,14 @@ class Sweeper(Base):
             self._show(cells, found, len(batch) - len(cells))
         if any(state != DONE for state, _ in found.values()):
             sys.exit(1)
+
+    def _combined(self, variant: Mapping[str, Any], arguments: Sequence[str]) -> list[list[str]]:
+        """Return all combinations of a variant with what is swept; the last value of a setting counts."""
+        own = [f"{key}={value}" for key, value in variant.items()]
+        overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *own, *arguments])
+        batch: list[list[str]]
+        [batch] = self.split_arguments(overrides, None)
+        return batch
 
     def _show(self, cells: Mapping[Path, Overrides], found: Mapping[Path, Status], repeated: int) -> None:
         if self._num_unknown:
