@@ -80,7 +80,7 @@ def life(compose, agent: str, method: str, *overrides: str, curriculum: Curricul
 # What is refused
 
 
-NEEDS_IDS = ("cka_rl", "mask_amsc", "mask_blc", "mask_lc", "mask_ri", "mask_sc", "packnet", "scratch")
+NEEDS_IDS = ("cka_rl", "mask_amsc", "mask_blc", "mask_lc", "mask_ri", "mask_sc", "mask_shared", "packnet", "scratch")
 NEEDS_BOUNDARIES = ("ewc", "ewc_published", "l2", "mas", "si", *NEEDS_IDS)
 FREE = ("clear", "finetune", "multitask")
 

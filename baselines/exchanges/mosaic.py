@@ -1,0 +1,218 @@
+"""MOSAIC: learners find out by embeddings who learns a similar task, and combine masks of those who do better.
+
+Nath et al. 2025 (arXiv 2506.05577), repository DMIU-ShELL/MOSAIC, where each member has one task. Its detection of task
+changes is not here: a new task begins without an embedding. That the first query is after the first batch is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import cosine_similarity
+
+from baselines.embedding import linear_wasserstein, reference_points, transitions
+from baselines.exchanges.exchange import MaskExchange
+from baselines.methods.mask_shared import MaskShared
+from baselines.methods.masks import Masks
+from baselines.methods.weights import flat
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import at_least_one, is_real, require, true_or_false
+from ctgraph_rl.learn.collective import Help
+from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
+
+LARGEST_RETURN = 0.9999
+"""Of a return that decides the own share: others keep a share that can be learned."""
+
+SIMILARITY = Number(-1.001, 1.001)  # rounding
+
+
+class Mosaic(MaskExchange):
+    """Each member sends its task's embedding to all others, and combines masks of similar ones with a higher return.
+
+    After each batch a member's z becomes (z + e) / 2, at first e / 2, where e is the linear Wasserstein embedding of
+    ``num_samples`` of the last ``buffer_size`` transitions, with its last mean return r. A peer offers its mask if the
+    cosine of both z is at least ``threshold`` and its own return is above r. The member requests the ``top_n`` most
+    similar ones. Its own scores become its present combination, with an initial share of 0.5 + 0.5 r, r clipped to
+    [0, 0.9999], or ``own_share``; the c received share the rest equally (`MaskShared.receive`).
+
+    Args:
+        threshold: least cosine, in [-1, 1].
+        top_n: masks that are requested at most.
+        num_samples: N. **More than** ``buffer_size`` **means that no embedding is ever made and no message sent**, as
+            with the 256 of the published default.
+        buffer_size: the last transitions that samples are drawn from.
+        num_references: reference points of the embedding.
+        use_similarity: False offers masks whatever the task is.
+        use_return: False offers masks whatever the returns are.
+        own_share: fixed initial share of the own scores, in (0, 1); None: by the return.
+        seed: decides the samples.
+        common: arguments of `Exchange`.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+
+    method = "mask_shared"
+
+    def __init__(
+        self,
+        threshold: float,
+        top_n: int,
+        num_samples: int,
+        buffer_size: int,
+        num_references: int,
+        use_similarity: bool,
+        use_return: bool,
+        own_share: float | None,
+        seed: int,
+        **common: Any,
+    ) -> None:
+        super().__init__(**common)
+        share_rule = f"own_share must be a number in (0, 1) or null, got {own_share!r}"
+        require(
+            (is_real(threshold, -1, 1), f"threshold must be in [-1, 1], got {threshold!r}"),
+            (own_share is None or (is_real(own_share, 0, 1) and own_share not in (0, 1)), share_rule),
+            *at_least_one(top_n=top_n, num_samples=num_samples, buffer_size=buffer_size, num_references=num_references),
+            *true_or_false(use_similarity=use_similarity, use_return=use_return),
+        )
+        self.threshold, self.top_n, self.own_share = threshold, top_n, own_share
+        self.num_samples, self.buffer_size, self.num_references = num_samples, buffer_size, num_references
+        self.use_similarity, self.use_return = use_similarity, use_return
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def takes(self, method: Masks) -> bool:
+        """Return whether a method combines masks that it receives."""
+        return isinstance(method, MaskShared)
+
+    def connect(self, agents: Sequence[Agent]) -> None:
+        """See `MaskExchange`.
+
+        Raises:
+            ValueError: also if members have no room for so many masks.
+        """
+        super().connect(agents)
+        room = min(method.max_received for method in self.methods)
+        require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
+        self.num_actions = max(method.num_actions for method in self.methods)
+        self.known: list[Known] = [Known() for _ in agents]
+        about: Fields = {"task": TASK_ID, "reward": Number()}
+        scores = Array((len(self.methods[0].weights),))
+        self.kinds = {
+            "query": {**about, "embedding": Array(())},  # its length is that of the first one that is made
+            "offer": {**about, "similarity": SIMILARITY},
+            "request": {"task": TASK_ID, "similarity": SIMILARITY},
+            "mask": {**about, "similarity": SIMILARITY, "scores": scores},
+        }
+
+    def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
+        """Keep the batch's last transitions and its mean return, and update the embedding."""
+        super().observe(member, batch, episode_return)
+        task, known = self.task_of(member), self.known[member]
+        if known.task != task:
+            known = self.known[member] = Known(task)
+        known.see(batch, self.buffer_size)
+        if len(known.recent["action"]) < self.num_samples:
+            return
+        points = known.sample(self.num_samples, self.num_actions, self.generator)
+        new = linear_wasserstein(points, reference_points(self.num_references, points.shape[1]))
+        known.embedding = (new if known.embedding is None else known.embedding + new) / 2
+        query = {**self.kinds["query"], "embedding": Array(tuple(new.shape))}
+        self.kinds = {**self.kinds, "query": query}
+
+    def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
+        """Send queries, and answer what was received."""
+        if kind == "query":
+            return self._queries(member)
+        if kind == "offer":
+            return [each for query in received for each in self._offers(member, query)]
+        if kind == "request":
+            best = self._best(member, received)
+            return [Message(kind, member, each.sender, _of(each, "task", "similarity")) for each in best]
+        own = {
+            "reward": self._own_return(member),
+            "scores": flat(self.methods[member].current_scores()).detach().clone(),
+        }
+        return [Message(kind, member, each.sender, {**_of(each, "task", "similarity"), **own}) for each in received]
+
+    def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
+        """Combine the masks with the member's own."""
+        best, own = self._best(member, received), self._own_return(member)
+        if not best:
+            return []
+        share = 0.5 + 0.5 * min(max(own, 0.0), LARGEST_RETURN) if self.own_share is None else self.own_share
+        self.methods[member].receive(torch.stack([each.content["scores"] for each in best]), share)
+        task = {"task_id": self.task_of(member), "return_before": own, "own_share": share}
+        return [
+            Help(each.sender, member, {**task, "return_of_sender": each.content["reward"], **_of(each, "similarity")})
+            for each in best
+        ]
+
+    def _queries(self, member: int) -> list[Message]:
+        """Return a query to every other member; none without an embedding."""
+        embedding = self.known[member].embedding
+        if embedding is None:
+            return []
+        content = {"task": self.task_of(member), "reward": self._own_return(member), "embedding": embedding}
+        return to_all("query", member, self.num_members, content)
+
+    def _offers(self, member: int, query: Message) -> list[Message]:
+        """Return an offer to who asked, if the tasks are similar and the member's return is higher."""
+        embedding, own = self.known[member].embedding, self._own_return(member)
+        if embedding is None or (self.use_return and own <= query.content["reward"]):
+            return []
+        similarity = cosine_similarity(embedding, query.content["embedding"], dim=0).item()
+        if self.use_similarity and similarity < self.threshold:
+            return []
+        content = {"task": query.content["task"], "reward": own, "similarity": similarity}
+        return [Message("offer", member, query.sender, content)]
+
+    def _own_return(self, member: int) -> float:
+        return self.return_of(member, self.task_of(member))
+
+    def _best(self, member: int, received: Sequence[Message]) -> list[Message]:
+        """Return the most similar ones, one of each sender, of those that still concern the member's task."""
+        task = self.task_of(member)
+        newest = {each.sender: each for each in received if each.content["task"] == task}
+        return sorted(newest.values(), key=lambda each: (-each.content["similarity"], each.sender))[: self.top_n]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return returns, embeddings, transitions and the random stream."""
+        known = [dict(vars(each)) for each in self.known]
+        return {**super().state_dict(), "known": known, "random": self.generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(state)
+        self.known = [Known(**each) for each in state["known"]]
+        self.generator.set_state(state["random"])
+
+
+@dataclass
+class Known:
+    """What a member knows of its task: the id, the embedding z and the last transitions, oldest first."""
+
+    task: int | None = None
+    embedding: Tensor | None = None
+    recent: dict[str, Tensor] = field(default_factory=dict)
+
+    def see(self, batch: TensorDictBase, most: int) -> None:
+        """Keep the last transitions of a batch, [num_envs, num_steps], and of those before it."""
+        given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
+        for key, values in given.items():
+            new = values.transpose(0, 1).flatten(0, 1).cpu()
+            self.recent[key] = torch.cat([self.recent.get(key, new[:0]), new])[-most:].clone()
+
+    def sample(self, number: int, num_actions: int, generator: torch.Generator) -> Tensor:
+        """Draw transitions without replacement, as points; see `baselines.embedding.transitions`."""
+        drawn = torch.randperm(len(self.recent["action"]), generator=generator)[:number]
+        observation, action, reward = (self.recent[key][drawn] for key in ("observation", "action", "reward"))
+        return transitions(observation, action, reward.squeeze(-1), num_actions)
+
+
+def _of(message: Message, *names: str) -> dict[str, Any]:
+    return {name: message.content[name] for name in names}
