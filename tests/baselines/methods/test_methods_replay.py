@@ -368,7 +368,7 @@ def test_no_task_needs_more_than_one_compiled_step(compose, monkeypatch, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMPILED)
+@pytest.mark.parametrize("name", [name for name in COMPILED if name != "cka_rl"])  # a product more, and 20 seconds
 def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(compose, name):
     eager, compiled = two_tasks(compose, name), two_tasks(compose, name, "agent.compile=true")
 
