@@ -7,6 +7,7 @@ import pytest
 from helpers.paths import CHECKOUT
 
 import curricula
+from ctgraph_rl import metrics
 
 README = CHECKOUT / "README.md"
 
@@ -24,11 +25,16 @@ def test_the_python_in_readme_runs_in_its_order_and_prints_what_it_says(capsys):
     assert names["recorder"].metrics["average_performance"].value is not None
 
 
-def test_readme_is_short_and_counts_the_curricula():
+def test_readme_is_short_and_counts_what_there_is():
     text = README.read_text(encoding="utf-8")
+    agents, cells, methods = (
+        len(list((CHECKOUT / "conf" / group).glob("*.yaml"))) for group in ("agent", "cell", "method")
+    )
 
     assert len(text.splitlines()) <= 120
     assert f"{len(curricula.names())} named, versioned curricula" in text
+    assert f"{agents} agents, {cells} kinds of memory, {methods} lifelong-learning methods" in text
+    assert f"{len(metrics.definitions())} metrics, and runs" in text
 
 
 def test_every_example_with_stable_baselines3_sets_one_thread():
