@@ -5,7 +5,8 @@ has them: on `ctgraph_rl.sb3.SB3VecEnv`, and on what its ``make_vec_env`` makes 
 own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
 slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
 it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core. Ctrl-C ends a measurement, and what was measured until then is printed.
+core. ``--cells`` measures LSTM-PPO with each cell in place of the LSTM, alone. Ctrl-C ends a measurement, and what was
+measured until then is printed.
 
 ``--device cuda`` measures `baselines.ladder` instead, ``--startup`` how long a run takes to its first step, beside the
 bare imports of torch and torchrl.
@@ -105,6 +106,12 @@ def agent_named(name: str) -> Entry:
     return next(entry for entry in catalogue("agent") if entry.name == name)
 
 
+def cell_named(name: str) -> partial[Any]:
+    """Return what builds a cell with the settings of its file."""
+    entry = next(entry for entry in catalogue("cell") if entry.name == name)
+    return partial(entry.kind, **entry.settings)
+
+
 def settings(name: str) -> dict[str, Any]:
     """Return an agent's hyperparameters for `ROWS` rows, with as many frames in a batch as in its yaml file."""
     given = agent_named(name).settings
@@ -119,10 +126,11 @@ class Ours:
         name: the agent.
         task: what it learns.
         seed: decides weights, exploration and environment.
+        cell: what it remembers with, a file of ``conf/cell``; None: as the agent has it.
     """
 
-    def __init__(self, name: str, task: Task, seed: int) -> None:
-        given = settings(name)
+    def __init__(self, name: str, task: Task, seed: int, cell: str | None = None) -> None:
+        given = settings(name) | ({} if cell is None else {"cell": cell_named(cell)})
         torch.manual_seed(seed)
         env = CTGraphEnv([task] * given["num_envs"], seed)
         self.task = task
@@ -156,6 +164,13 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
 
             for who, way in ways().items():
                 yield Contender(name, label, who, partial(Stable, name, settings(name), task, way))
+
+
+def cells(names: list[str]) -> Iterator[Contender]:
+    """Yield LSTM-PPO with each of the cells, on the task that needs memory and has fewest different images."""
+    for name in names:
+        make = partial(Ours, "lstm_ppo", TASKS["CT-SU-B1"], cell=name)
+        yield Contender(f"lstm_ppo cell={name}", "CT-SU-B1", "ours", make)
 
 
 def table(measured: list[Contender]) -> str:
@@ -198,6 +213,8 @@ def main(arguments: list[str] | None = None) -> None:
     names = list(dict.fromkeys(name for name, _ in PAIRS))
     parser = argparse.ArgumentParser(prog="python -m baselines.benchmark", description=__doc__)
     parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
+    known = [entry.name for entry in catalogue("cell")]
+    parser.add_argument("--cells", nargs="*", choices=known, help="instead: lstm_ppo with these cells; none named: all")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
     parser.add_argument("--seconds", type=float, default=2.0, help="least time of a measurement")
     parser.add_argument("--seeds", type=int, default=3, help="how often each learns from scratch")
@@ -229,7 +246,8 @@ def main(arguments: list[str] | None = None) -> None:
     if not find_spec("sb3_contrib"):
         missing = "Stable-Baselines3 is missing, ours are measured alone: pip install 'ctgraph_rl[benchmark]'"
         console.print(missing, markup=False, soft_wrap=True)
-    measured = list(contenders(options.agents))
+    chosen = contenders(options.agents) if options.cells is None else cells(options.cells or known)
+    measured = list(chosen)
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]
     for learner in learners:
         learner.learn()

@@ -1,4 +1,4 @@
-"""The agents and methods of this package, as the yaml files in ``conf`` name them."""
+"""The agents, cells and methods of this package, as the yaml files in ``conf`` name them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Entry(NamedTuple):
     name: str
     target: str  # dotted name of the class
     settings: dict[str, Any]
-    comment: str  # its first line
+    comment: str  # its first line, but for that which says where its settings go
 
     @property
     def kind(self) -> Any:
@@ -41,7 +41,9 @@ def catalogue(group: str) -> Iterator[Entry]:
         settings = yaml.safe_load(text)
         if "_target_" in settings:
             target = settings.pop("_target_")
-            yield Entry(path.stem, target, settings, text.splitlines()[0].removeprefix("# "))
+            settings.pop("_partial_", None)
+            comments = [line for line in text.splitlines() if not line.startswith("# @package")]
+            yield Entry(path.stem, target, settings, comments[0].removeprefix("# "))
 
 
 def constants(target: str) -> dict[str, Any]:

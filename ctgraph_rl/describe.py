@@ -56,6 +56,10 @@ CHANGING_GOALS = (
 NOISE_AS_DICE = (
     "Noise and rotation on read may serve a deterministic policy as dice, up to the ceiling of stochastic ones."
 )
+NEEDS_MEMORY = "Memory is needed: a deterministic agent without it, as in greedy evaluation, reaches at most, in"
+MOST_LOST = 4
+"""Tasks that a note names."""
+
 SAME_DECISIONS = "although decision states look alike, as all decisions on the way to the goal are the same."
 
 OBSERVATION_NOTES = (
@@ -189,7 +193,7 @@ def _closed_forms(task: Task) -> tuple[str, ...]:
 
 def _ceilings(curriculum: Curriculum) -> Sheet:
     """The best mean returns of policies that see less than all, or why they are not known."""
-    rows, reasons, easy = [], [], []
+    rows, reasons, easy, lost = [], [], [], []
     for task, label in _labelled(curriculum):
         found = [_ceiling(task, ceiling) for ceiling in CEILINGS.values()]
         rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
@@ -198,11 +202,15 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
         alike = not task.observations.unique_decisions and task.goal_change is None
         if alike and None not in (memoryless, optimal) and memoryless == optimal:
             easy.append(label)
+        if memoryless is not None and optimal is not None and memoryless < optimal - 1e-9:
+            lost.append(f"{label} {_number(memoryless)} of {_number(optimal)}")
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
     limits = ((CHANGING_GOALS, _changes_goals), (NOISE_AS_DICE, _varies_on_read))
     limited = [note for note, applies in limits if any(map(applies, curriculum.tasks))]
     easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
-    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *limited, *easily)
+    shown = ", ".join(lost[:MOST_LOST]) + f" and {len(lost) - MOST_LOST} more" * (len(lost) > MOST_LOST)
+    needed = [f"{NEEDS_MEMORY} {shown}."] if lost else []
+    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *needed, *limited, *easily)
     return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
 
 

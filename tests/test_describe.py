@@ -127,7 +127,16 @@ def test_goals_that_change_are_not_said_to_need_no_memory():
 
     assert changing.notes[-1].startswith("Goals change: the ceilings are those of a goal that is known and stays.")
     assert instances.notes[-2].startswith("Noise and rotation on read may serve a deterministic policy as dice")
-    assert [len(sheet.notes) for sheet in (changing, instances, plain)] == [3, 4, 3]
+    assert [len(sheet.notes) for sheet in (changing, instances, plain)] == [4, 5, 4]
+
+
+def test_what_an_agent_without_memory_loses_is_said_of_each_task_that_needs_it():
+    def notes(name: str) -> list[str]:
+        ceilings = describe(curricula.load(name))[3]
+        return [note for note in ceilings.notes if note.startswith("Memory is needed")]
+
+    assert notes("su_b1_4tasks")[0].endswith("reaches at most, in goal1.2 0 of 1, goal2.1 0 of 1.")
+    assert notes("fo_b1_4tasks") == []
 
 
 def test_fully_observable_tasks_are_not_said_to_need_no_memory():

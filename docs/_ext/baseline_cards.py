@@ -1,4 +1,4 @@
-"""A card for each agent and each lifelong-learning method, from its yaml, its class and the raw results."""
+"""A card for each agent, each cell and each lifelong-learning method, from its yaml, its class and the raw results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from baselines.methods.__main__ import needs_ids
 
 def baseline_cards() -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each card, and of the lists of them, in Markdown."""
-    for group, facts in (("agent", _agent_facts), ("method", _method_facts)):
+    for group, facts in (("agent", _agent_facts), ("cell", _cell_facts), ("method", _method_facts)):
         entries = list(catalogue(group))
         yield f"{group}s/index.md", _index(group, entries)
         for entry in entries:
@@ -33,14 +33,19 @@ def _agent_facts(entry: Entry) -> dict[str, str]:
     return {"memory": "yes" if entry.kind.memory else "no", "can solve in principle": entry.kind.solves}
 
 
+def _cell_facts(entry: Entry) -> dict[str, str]:
+    return {"memory": "yes" if entry.kind.memory else "no", "can hold": entry.kind.holds}
+
+
 def _method_facts(entry: Entry) -> dict[str, str]:
     ids = {"yes": "yes", "no": "no"}.get(needs_ids(entry), f"only with `{needs_ids(entry)}`")
     return {"needs task ids": ids, "needs to know boundaries": "yes" if entry.kind.needs_boundaries else "no"}
 
 
 def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
-    command = f"ctgraph-rl agent={entry.name}" if group == "agent" else f"ctgraph-rl agent=ppo method={entry.name}"
-    results = agents_results(entry.name) if group == "agent" else methods_results(entry.name)
+    chosen = {"agent": "", "cell": "agent=lstm_ppo ", "method": "agent=ppo "}[group]
+    results = {"agent": agents_results, "method": methods_results}.get(group, lambda name: "")(entry.name)
+    prefix = "agent.cell." if group == "cell" else f"{group}."
     rows = ["| | |", "|---|---|", *(f"| {fact} | {value} |" for fact, value in facts.items())]
     settings = settings_of(f"{group}/{entry.name}")
     parts = [
@@ -49,8 +54,8 @@ def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
         f"[All {group}s](index.md)",
         escaped(entry.comment),
         "\n".join(rows),
-        f"```bash\n{command}\n```",
-        *(["## Settings", table(settings, f"{group}.")] if settings else []),
+        f"```bash\nctgraph-rl {chosen}{group}={entry.name}\n```",
+        *(["## Settings", table(settings, prefix)] if settings else []),
         *_variants(group, entry.name),
         *(["## Results", results] if results else []),
         *_source(entry),

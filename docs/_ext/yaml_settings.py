@@ -30,7 +30,7 @@ def settings_of(name: str) -> list[Setting]:
     text = _text(name)
     root = yaml.compose(text)
     found = _walk(root, "", text) if isinstance(root, yaml.MappingNode) else ()
-    return [setting for setting in found if not setting.key.startswith(("_target_", "defaults"))]
+    return [setting for setting in found if not setting.key.startswith(("_target_", "_partial_", "defaults"))]
 
 
 def first_comment(name: str) -> str:

@@ -253,6 +253,12 @@ def test_without_stable_baselines_ours_is_measured_alone(capsys, monkeypatch):
     assert [line.split("|")[3].strip() for line in printed.out.splitlines()[4:]] == ["ours"]
 
 
+def test_cells_are_measured_in_place_of_an_lstm(capsys):
+    benchmark.main(["--cells", "none", "--rounds", "1", "--seconds", "0.001", "--seeds", "0"])
+
+    assert [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines()[4:]] == ["lstm_ppo cell=none"]
+
+
 def test_a_benchmark_that_is_stopped_prints_what_it_has(capsys, monkeypatch):
     def stopped(*given):
         raise KeyboardInterrupt

@@ -123,7 +123,8 @@ def test_what_only_lists_imports_no_torch(checkout, tmp_path, words):
 
 
 @pytest.mark.parametrize(
-    ("group", "names"), [("agent", ("memory", "solves")), ("method", ("needs_task_id", "needs_boundaries"))]
+    ("group", "names"),
+    [("agent", ("memory", "solves")), ("cell", ("memory", "holds")), ("method", ("needs_task_id", "needs_boundaries"))],
 )
 def test_the_facts_of_a_list_are_those_of_the_classes(group, names):
     entries = list(catalogue(group))

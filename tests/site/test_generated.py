@@ -81,7 +81,7 @@ def test_every_source_of_a_curriculum_has_bibtex(site):
 def test_every_agent_method_and_metric_has_a_card(site):
     pages = {*dict(site("baseline_cards").baseline_cards()), *dict(site("metric_cards").metric_cards())}
 
-    for group in ("agent", "method"):
+    for group in ("agent", "cell", "method"):
         assert {f"{group}s/{entry.name}.md" for entry in catalogue(group)} <= pages
     assert {f"metrics/{name}.md" for name in metrics.definitions()} <= pages
 
@@ -90,6 +90,7 @@ def test_cards_show_settings_variants_results_and_examples(site):
     cards = {**dict(site("baseline_cards").baseline_cards()), **dict(site("metric_cards").metric_cards())}
 
     assert "| `method.coeff` | `100.0` | lambda |" in cards["methods/ewc.md"]
+    assert "| `agent.cell.num_frames` | `4` |" in cards["cells/frames.md"]
     assert "### `method=ewc_published`" in cards["methods/ewc.md"]
     assert "Raw: `methods.csv`" in cards["methods/ewc.md"]
     assert "Raw: `baselines_b1.csv`" in cards["agents/a2c.md"]
