@@ -17,9 +17,11 @@ from baselines.learner import Learner
 from baselines.methods.selection import STREAM, SelectedMasks, own_generator
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
+from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 DISTANCES = ("cosine", "l2")
+EPISODES = ("training", "evaluation", "none")
 
 SMALLEST_DEVIATION = 1e-3
 """Similarities are divided by no less."""
@@ -28,17 +30,17 @@ SMALLEST_DEVIATION = 1e-3
 class MaskAMSC(SelectedMasks):
     """`SelectedMasks` with the support of a sparsemax: w = sparsemax(t / temperature), selected are those with w > 0.
 
-    t are the similarities to all earlier tasks, standardised over them, without those of tasks that were not learned:
-    a task's competence is its mean training return in its last batches. AMSC takes the return of the evaluation right
-    after the task, an oracle here, as a learner sees no evaluation. With two earlier tasks exactly one is selected, and
-    so is an only one, however dissimilar.
+    t are the similarities to all earlier tasks, standardised over them, without those of tasks whose competence is 0.
+    A task's competence is its mean training return in its last batches, or as in AMSC the mean return of an evaluation
+    right after the task: that is an oracle's, as a learner has no episodes that do not count. With two earlier tasks
+    exactly one is selected, and so is an only one, however dissimilar.
 
     Args:
         distance: ``cosine`` of the embeddings is the similarity, or minus their Euclidean distance, ``l2``.
         z_score: standardise similarities over the earlier tasks.
         temperature: of the sparsemax.
-        competence_gate: leave out tasks whose competence is not above 0.
-        competence_batches: batches that the competence is the mean return of.
+        competence: ``training`` or ``evaluation``, the episodes that it is of; ``none`` leaves out no task.
+        competence_batches: batches that a training return is the mean of.
         shuffled: select as many tasks at random instead, by a random stream of its own.
         settings: the arguments of `SelectedMasks`.
     """
@@ -48,7 +50,7 @@ class MaskAMSC(SelectedMasks):
         distance: str,
         z_score: bool,
         temperature: float,
-        competence_gate: bool,
+        competence: str,
         competence_batches: int,
         shuffled: bool,
         **settings: Any,
@@ -56,12 +58,13 @@ class MaskAMSC(SelectedMasks):
         super().__init__(**settings)
         require(
             *one_of(DISTANCES, distance=distance),
-            *true_or_false(z_score=z_score, competence_gate=competence_gate, shuffled=shuffled),
+            *one_of(EPISODES, competence=competence),
+            *true_or_false(z_score=z_score, shuffled=shuffled),
             *positive(temperature=temperature),
             *at_least_one(competence_batches=competence_batches),
         )
         self.distance, self.z_score, self.temperature = distance, z_score, temperature
-        self.competence_gate, self.shuffled = competence_gate, shuffled
+        self.episodes, self.shuffled = competence, shuffled
         self.competence: dict[int, float] = {}
         """Of the tasks that have ended, by slot."""
 
@@ -88,8 +91,21 @@ class MaskAMSC(SelectedMasks):
     def end_task(self) -> None:
         """Store the task's scores and its competence."""
         super().end_task()
+        found = self._evaluated() if self.episodes == "evaluation" else self._trained()
+        self.competence[self.slot] = min(max(found, 0.0), 1.0)
+
+    def _trained(self) -> float:
+        """Return the mean return of the episodes that ended in the last batches; 0 if none did."""
         total, number = (sum(each) for each in zip(*self.returns, strict=True)) if self.returns else (0.0, 0)
-        self.competence[self.slot] = min(max(total / max(number, 1), 0.0), 1.0)
+        return total / max(number, 1)
+
+    def _evaluated(self) -> float:
+        """Return the mean return of an evaluation as the curriculum has them."""
+        how, agent = self.curriculum.evaluation, self.agent
+        given: dict[str, Any] = {"greedy": how.greedy, "episodes_per_row": how.episodes_per_row, "seed": self.slot}
+        given |= {"initial_state": agent.initial_state, "device": self.weights.device, "curriculum": self.curriculum}
+        played = evaluate(agent.policy, [self.task_in(self.slot)], how.num_episodes, **given)
+        return played["episode_reward"].mean().item()
 
     def choose(self) -> list[int]:
         """Return the support of the sparsemax, or as many others."""
@@ -99,7 +115,7 @@ class MaskAMSC(SelectedMasks):
             return []
         given = similarities(known[self.slot], torch.stack([known[slot] for slot in earlier]), self.distance)
         given = standardised(given) if self.z_score else given
-        able = torch.tensor([not self.competence_gate or self.competence[slot] > 0 for slot in earlier])
+        able = torch.tensor([self.episodes == "none" or self.competence[slot] > 0 for slot in earlier])
         candidates = torch.tensor(earlier)[able]
         support = candidates[sparsemax(given[able] / self.temperature) > 0]
         if self.shuffled:

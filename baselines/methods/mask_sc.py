@@ -11,11 +11,8 @@ from typing import Any
 
 import torch
 
-from baselines.learner import Learner
 from baselines.methods.selection import SelectedMasks
-from baselines.methods.weights import Weights
 from ctgraph_rl.checks import at_least_one, is_real, one_of, require
-from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task
 
 SELECTIONS = ("similarity", "random", "none", "all", "parent", "depth_prefix")
@@ -48,12 +45,6 @@ class MaskSC(SelectedMasks):
         self.selection, self.threshold, self.top_k = selection, threshold, top_k
         self.compares = selection == "similarity"
 
-    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
-        """See `Method`."""
-        super().setup(agent, weights, curriculum)
-        ids = curriculum.task_ids
-        self.task_of = {ids[task]: task for task in curriculum.tasks}
-
     def start_task(self, task: int | None) -> None:
         """Start with what an oracle selects, or nothing."""
         super().start_task(task)
@@ -69,8 +60,7 @@ class MaskSC(SelectedMasks):
             return torch.randperm(len(earlier), generator=self.generator)[: self.top_k].tolist()
         if self.selection in ("all", "none"):
             return [*earlier] if self.selection == "all" else []
-        tasks = [self.task_of[number] for number in self.started]
-        family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[self.slot])]
+        family = [slot for slot in earlier if is_prefix(self.task_in(slot), self.task_in(self.slot))]
         return family if self.selection == "depth_prefix" else family[-1:]
 
     def _similar(self) -> list[int]:

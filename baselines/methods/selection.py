@@ -17,6 +17,7 @@ from baselines.methods.masks import combined
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import at_least_one, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
 
 EMBEDDINGS = ("lwe", "swe")
 
@@ -157,10 +158,15 @@ class SelectedMasks(MaskLC):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        self.generator = own_generator()
+        self.generator, self.curriculum = own_generator(), curriculum
+        self.of_id = {number: task for task, number in curriculum.task_ids.items()}
         self.num_actions = max(task.graph.branching_factor for task in curriculum.tasks) + 1
         for name in ("community", "places", "offsets"):
             self.register_buffer(name, torch.zeros(0), persistent=False)
+
+    def task_in(self, slot: int) -> Task:
+        """Return the task of a slot."""
+        return self.of_id[self.started[slot]]
 
     def choose(self) -> list[int]:
         """Return the slots of the tasks to select, among the first `num_combined`."""

@@ -29,7 +29,7 @@ SETTINGS = {
     "ewc_published": ["method.num_samples=8"],
     "l2": ["method.heads=multi"],
     "mas": ["method.num_samples=8"],
-    "mask_amsc": ["method.num_samples=8", "method.competence_gate=false", "method.shuffled=true"],
+    "mask_amsc": ["method.num_samples=8", "method.competence=none", "method.shuffled=true"],
     "mask_sc": ["method.num_samples=8", "method.every=1", "method.threshold=-1"],
     "si": ["method.heads=single"],
 }
@@ -173,6 +173,7 @@ WRONG = [
     ("l2", "heads=two", "heads must be one of auto, single, multi, got 'two'"),
     ("mas", "num_samples=1.5", "num_samples must be an integer >= 1, got 1.5"),
     ("mask_amsc", "distance=near", "distance must be one of cosine, l2, got 'near'"),
+    ("mask_amsc", "competence=test", "competence must be one of training, evaluation, none, got 'test'"),
     ("mask_amsc", "temperature=0", "temperature must be a number > 0, got 0"),
     ("mask_amsc", "num_samples=20000", "at least num_samples=20000, or no task is embedded, got 10000"),
     ("mask_sc", "embedding=ot", "embedding must be one of lwe, swe, got 'ot'"),

@@ -288,7 +288,7 @@ def test_the_samples_of_a_task_are_stored_until_its_end(compose):
 
 
 AMSC = {"distance": "cosine", "z_score": True, "temperature": 1.0, "shuffled": False, "every": 1, "embedding": "lwe"}
-AMSC |= {"competence_gate": False, "competence_batches": 1, "num_samples": 8, "buffer_size": 64}
+AMSC |= {"competence": "none", "competence_batches": 1, "num_samples": 8, "buffer_size": 64}
 AMSC |= {"num_references": 4, "num_directions": 4, "num_quantiles": 4}
 
 COMPILED = {

@@ -15,12 +15,14 @@ from torch.testing import assert_close
 
 import curricula
 from baselines.embedding import linear_wasserstein, reference_points, transitions
+from baselines.methods import mask_amsc
 from baselines.methods.mask_amsc import MaskAMSC, sparsemax
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
 from baselines.methods.mask_sc import MaskSC
 from baselines.methods.method import AgentWithMethod
 from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import OptimalPolicy, RandomPolicy
 
 AXIS = torch.eye(4)
@@ -28,7 +30,7 @@ AXIS = torch.eye(4)
 
 EMBEDDING = {"embedding": "lwe", "num_samples": 8, "buffer_size": 100, "num_references": 50}
 EMBEDDING |= {"num_directions": 128, "num_quantiles": 128}
-GATE = {"competence_gate": True, "competence_batches": 2, "shuffled": False}
+GATE = {"competence": "training", "competence_batches": 2, "shuffled": False}
 
 
 def sc(**changes: Any) -> MaskSC:
@@ -236,7 +238,7 @@ def test_an_only_earlier_task_is_selected_however_dissimilar():
 def test_tasks_without_competence_are_left_out_behind_the_standardisation():
     its = after(amsc(), *AXIS[:3], mixed(0.9, 0.1, 0.2))
     its.competence[0] = 0.0
-    free = after(amsc(competence_gate=False), *AXIS[:3], mixed(0.9, 0.1, 0.2))
+    free = after(amsc(competence="none"), *AXIS[:3], mixed(0.9, 0.1, 0.2))
     free.competence[0] = 0.0
 
     assert its.choose() == [1, 2]  # t = (1.40, -0.84, -0.56), and without the first both are near
@@ -258,6 +260,23 @@ def test_competence_is_the_mean_return_of_the_last_batches():
     its.end_task()
 
     assert its.competence == {0: pytest.approx(1.75 / 4)}
+
+
+def test_competence_can_be_the_return_of_an_evaluation_which_is_an_oracle_s(compose, monkeypatch):
+    def optimal(policy: Any, tasks: Any, number: int, **given: Any) -> Any:
+        assert policy is attached.agent.policy and tasks == [TWO] and number == its.curriculum.evaluation.num_episodes
+        return evaluate(OptimalPolicy, tasks, number, **given)
+
+    monkeypatch.setattr(mask_amsc, "evaluate", optimal)
+    attached = with_method(compose, "a2c", amsc(competence="evaluation"))
+    its = attached.method
+    attached.start_task(1)
+    stream = torch.get_rng_state()
+
+    attached.end_task()
+
+    assert its.competence == {0: 1.0}
+    assert torch.equal(torch.get_rng_state(), stream)
 
 
 def test_a_shuffled_selection_has_as_many_tasks_and_leaves_other_streams_alone():
