@@ -126,7 +126,11 @@ class Group:
         """
         self._acting = None
         parts = batch.chunk(len(self.agents))
-        return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
+        measured = self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
+        for learner, each in zip(self.learners, measured, strict=True):
+            if isinstance(each, FloatingPointError):
+                _clear(learner)
+        return measured
 
     def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
         measured = []
@@ -150,16 +154,22 @@ class Group:
         learners = [self.learners[number] for number in numbers]
         minibatches = {number: self.learners[number].minibatches(parts[number]) for number in numbers}
         stack, steps = Stack(self.template, learners), []
+        errors: dict[Learner, FloatingPointError] = {}
         while given := self._next(minibatches):
-            steps.append(self._update(stack, given))
+            steps.append(self._update(stack, given, errors))
         stack.write()
         for agent in self.agents:
             if isinstance(agent, AgentWithMethod):
                 agent.method.after_learning()
         names = list(steps[0])
         table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
-        pairs = zip(learners, table, strict=True)
-        return [_or_error(lambda of, column: of.after_batch(of.means(names, column)), *pair) for pair in pairs]
+
+        def measured(learner: Learner, column: Tensor) -> dict[str, float]:
+            if learner in errors:
+                raise errors[learner]
+            return learner.after_batch(learner.means(names, column))
+
+        return [_or_error(measured, *pair) for pair in zip(learners, table, strict=True)]
 
     def _next(self, minibatches: Mapping[int, Iterator[dict[Any, Tensor]]]) -> list[Data]:
         """Return the next minibatch of each of these agents; none after the last."""
@@ -170,8 +180,10 @@ class Group:
                 given += [] if minibatch is None else [self.learners[number].method.transform_minibatch(minibatch)]
         return given
 
-    def _update(self, stack: Stack, minibatches: Sequence[Data]) -> dict[str, Tensor]:
-        """Take a gradient step of a stack; return what was measured, [seeds] each."""
+    def _update(
+        self, stack: Stack, minibatches: Sequence[Data], errors: dict[Learner, FloatingPointError]
+    ) -> dict[str, Tensor]:
+        """Take a gradient step of a stack; return what was measured, [seeds] each, and add to the learners' errors."""
         needs_weights = stack.learners[0].needs_weights
         batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
         measured = self._step(stack, batch)
@@ -180,10 +192,14 @@ class Group:
         if needs_weights:
             stack.write()
         for number, learner in enumerate(stack.learners):
-            kept = learner.after_update({key: value[number] for key, value in measured.items()})
+            if learner not in errors:
+                try:
+                    learner.after_update({key: value[number] for key, value in measured.items()})
+                except FloatingPointError as error:
+                    errors[learner] = error
         if needs_weights:
             stack.read_others()
-        return {key: measured[key] for key in kept}
+        return {key: value for key, value in measured.items() if value.ndim == 1}
 
     def _step(self, stack: Stack, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
         """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents say so."""
@@ -219,6 +235,17 @@ def _or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str
         return measure(*given)
     except FloatingPointError as error:
         return error
+
+
+@torch.no_grad()
+def _clear(learner: Learner) -> None:
+    """Set the weights of an agent that has failed to zero, so that it keeps its place in the batch and raises nothing.
+
+    Without it the others would be a batch of another size, whose products may be rounded otherwise.
+    """
+    learner.clear_optimiser_state(learner.trainable)
+    for parameter in learner.parameters():
+        parameter.zero_()
 
 
 def sampled(outputs: Mapping[str, Tensor], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:

@@ -54,7 +54,10 @@ class Group(Protocol):
         ...
 
     def learn(self, batch: TensorDictBase) -> Sequence[dict[str, float] | FloatingPointError]:
-        """Learn from a batch, [seeds * num_envs, num_steps]; return what each agent measured, or raised."""
+        """Learn from a batch, [seeds * num_envs, num_steps]; return what each agent measured, or raised.
+
+        An agent that raised gets batches as before. Neither then nor later does it change a bit of another's.
+        """
         ...
 
 
@@ -76,11 +79,12 @@ def learn_together(
     device: torch.device | str = "cpu",
     saved: Sequence[Mapping[str, Any]] | None = None,
     checkpoint: OfferCheckpoints | None = None,
-) -> None:
+) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
     Each seed has the rows of the environment, the generator, the evaluations and the log that it has alone; no seed's
-    numbers depend on another's data. Losses and actions differ from those of a run alone by rounding.
+    numbers depend on another's data. Losses and actions differ from those of a run alone by rounding. A seed with a
+    loss or weight that is not finite has failed: it measures nothing from then on, and the others learn on as ever.
 
     Args:
         curriculum: what to learn; `why_not_together` has no objection.
@@ -93,9 +97,11 @@ def learn_together(
             group had never stopped.
         checkpoint: is offered the states after every batch.
 
+    Returns:
+        The error of each seed that failed, by its position in ``seeds``; names the seed, the block and the frames.
+
     Raises:
         ValueError: before any work, as `learn_curriculum` does.
-        FloatingPointError: if a loss or weight of a seed is not finite; names the seed, the block and the frames.
     """
     device, [agent, *_] = checked_device(device), group.agents
     check_rows(curriculum, agent.num_envs)
@@ -103,10 +109,12 @@ def learn_together(
     env = _make_env(curriculum, agent.num_envs, seeds, device)
     evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
     actor = _Actor(group, agent.num_steps)
+    failed = {} if saved is None else _saved_failures(saved)
 
     def evaluate(frames: int) -> None:
-        for evaluator, each in zip(evaluators, group.agents, strict=True):
-            evaluator.evaluate_if_due(each, frames)
+        for number, (evaluator, each) in enumerate(zip(evaluators, group.agents, strict=True)):
+            if number not in failed:
+                evaluator.evaluate_if_due(each, frames)
 
     if saved is None:
         evaluate(0)
@@ -121,15 +129,27 @@ def learn_together(
             start, frames = frames, frames + batch.numel() // len(seeds)
             block = curriculum.block_at(frames)
             where = f"in block {block} after {frames} frames; the run stops here"
-            measured = [_finite(seed, each, where) for seed, each in zip(seeds, group.learn(batch), strict=True)]
-            given = zip(logs, batch.chunk(len(seeds)), measured, strict=True)
-            returns = [log_training(log, curriculum, part, start, each) for log, part, each in given]
+            measured = group.learn(batch)
+            for number, (seed, each) in enumerate(zip(seeds, measured, strict=True)):
+                error = _failure(seed, each, where)
+                if error is not None:
+                    failed.setdefault(number, error)
+            if len(failed) == len(seeds):
+                return failed
+            given = enumerate(zip(logs, batch.chunk(len(seeds)), measured, strict=True))
+            returns = [
+                log_training(log, curriculum, part, start, each)
+                for number, (log, part, each) in given
+                if number not in failed and not isinstance(each, FloatingPointError)
+            ]
             if progress is not None:
                 progress.update(block, frames, sum(returns) / len(returns))
             if checkpoint is not None:
-                checkpoint(partial(_states, frames, group, env, carried, logs=logs), curriculum.is_end(frames))
+                make_states = partial(_states, frames, group, env, carried, logs=logs, failed=failed)
+                checkpoint(make_states, curriculum.is_end(frames))
         group.end_task()
         evaluate(frames)
+    return failed
 
 
 class _Actor:
@@ -151,19 +171,30 @@ def _make_env(curriculum: Curriculum, num_envs: int, seeds: Sequence[int], devic
     return env
 
 
-def _finite(seed: int, measured: dict[str, float] | FloatingPointError, where: str) -> dict[str, float]:
-    """Return the measurements of a seed, which must be finite."""
+def _failure(seed: int, measured: dict[str, float] | FloatingPointError, where: str) -> FloatingPointError | None:
+    """Return the error of a seed whose measurements are not finite; None where they are."""
     try:
         if isinstance(measured, FloatingPointError):
             raise measured
         require_finite(measured)
     except FloatingPointError as error:
-        raise FloatingPointError(f"seed {seed}: {error} {where}") from None
-    return measured
+        return FloatingPointError(f"seed {seed}: {error} {where}")
+    return None
+
+
+def _saved_failures(saved: Sequence[Mapping[str, Any]]) -> dict[int, FloatingPointError]:
+    """Return the errors of seeds that had failed when the states were saved."""
+    return {number: FloatingPointError(state["failed"]) for number, state in enumerate(saved) if "failed" in state}
 
 
 def _states(
-    frames: int, group: Group, env: CTGraphEnv, carried: TensorDictBase, logs: Sequence[RunLog]
+    frames: int,
+    group: Group,
+    env: CTGraphEnv,
+    carried: TensorDictBase,
+    *,
+    logs: Sequence[RunLog],
+    failed: Mapping[int, FloatingPointError],
 ) -> list[dict[str, Any]]:
     """Return the state of each seed's run, as `learn_curriculum` saves that of one; a run alone cannot resume it."""
     count = len(group.agents)
@@ -178,6 +209,7 @@ def _states(
             "random": generator.get_state(),
             "random_cuda": None,
             "log": log.position(),
+            **({"failed": str(failed[number])} if number in failed else {}),
         }
         for number, (agent, generator, part, log) in enumerate(given)
     ]

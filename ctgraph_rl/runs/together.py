@@ -6,7 +6,7 @@ import logging
 import shutil
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
 
     Raises:
         ValueError: before any work, for a value out of range.
-        RuntimeError: if seeds that learned one after the other have failed.
+        RuntimeError: if seeds have failed.
     """
     if isinstance(cfg.together, bool) or not config.in_sweep():
         run_job(cfg, run_dir)
@@ -78,7 +78,7 @@ def _run_in_turn(runs: Sequence[Run]) -> None:
 
 
 def _run_as_one(runs: Sequence[Run]) -> None:
-    """Run those that are not finished, as one batch."""
+    """Run those that are not finished, as one batch; a seed that fails stops no other."""
     with ExitStack() as stack:
         for _, run_dir in runs:
             stack.enter_context(locked(run_dir))
@@ -87,15 +87,26 @@ def _run_as_one(runs: Sequence[Run]) -> None:
         for (_, run_dir), done in zip(runs, finished, strict=True):
             if done:
                 shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
-        if left:
-            interrupt = stack.enter_context(Interrupt())
-            for _, run_dir in left:
-                stack.enter_context(marked_if_it_fails(run_dir))
-            _learn(left, interrupt)
+        failed = _marked(left) if left else {}
+    if failed:
+        raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
 
 
-def _learn(runs: Sequence[Run], interrupt: Interrupt) -> None:
-    """Build the objects of all runs, and let them learn."""
+def _marked(runs: Sequence[Run]) -> dict[int, FloatingPointError]:
+    """Run all as one batch; leave in the directory of each that fails, or of all, why."""
+    with ExitStack() as stack:
+        interrupt = stack.enter_context(Interrupt())
+        for _, run_dir in runs:
+            stack.enter_context(marked_if_it_fails(run_dir))
+        failed = _learn(runs, interrupt)
+    for number, error in failed.items():
+        with suppress(FloatingPointError), marked_if_it_fails(runs[number][1]):
+            raise error
+    return failed
+
+
+def _learn(runs: Sequence[Run], interrupt: Interrupt) -> dict[int, FloatingPointError]:
+    """Build the objects of all runs, and let them learn; return the errors of those that failed."""
     jobs, generators = [], []
     for cfg, _ in runs:
         jobs.append(Job.of(cfg, interrupt))
@@ -105,4 +116,4 @@ def _learn(runs: Sequence[Run], interrupt: Interrupt) -> None:
         given = zip(jobs, runs, strict=True)
         directories = [stack.enter_context(job.prepared(run_dir, seeds)) for job, (_, run_dir) in given]
         group = agents_together([job.agent for job in jobs], generators)
-        train_together(jobs[0].curriculum, group, seeds, jobs[0].device, directories)
+        return train_together(jobs[0].curriculum, group, seeds, jobs[0].device, directories)

@@ -229,7 +229,7 @@ def train_together(
     seeds: Sequence[int],
     device: torch.device,
     directories: Sequence[RunDirectory],
-) -> None:
+) -> dict[int, FloatingPointError]:
     """Let the agents of several seeds learn a curriculum as one batch; each is a run in a directory of its own.
 
     Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
@@ -240,6 +240,9 @@ def train_together(
         seeds: of each.
         device: where the environment lives, and the agents.
         directories: of each.
+
+    Returns:
+        The error of each seed that failed, see `learn_together`. It has no results and no checkpoint.
 
     Raises:
         ValueError: before any work, for an agent that cannot learn the curriculum, and runs that cannot be resumed.
@@ -256,9 +259,15 @@ def train_together(
     done, console = 0 if saved is None else saved[0]["frames"], directories[0].console
     with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
         offer = partial(offer_all, checkpoints)
-        learn_together(curriculum, group, seeds, logs, progress, device=device, saved=saved, checkpoint=offer)
-    for (directory, agent), log in zip(members, logs, strict=True):
-        directory.finish(curriculum, agent, log)
+        more: dict[str, Any] = {"device": device, "saved": saved, "checkpoint": offer}
+        failed = learn_together(curriculum, group, seeds, logs, progress, **more)
+    for number, ((directory, agent), log) in enumerate(zip(members, logs, strict=True)):
+        if number in failed:
+            log.close()
+            directory.checkpoints.clear()
+        else:
+            directory.finish(curriculum, agent, log)
+    return failed
 
 
 def _same_group(run_dir: Path, together: Sequence[int]) -> tuple[bool, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -151,7 +152,7 @@ def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_ru
         start(group, task)
         found.append(None)
 
-    def compared(group, stack, minibatches):
+    def compared(group, stack, minibatches, errors):
         if found[-1] is None:
             for learner in group.learners:
                 learner.double()
@@ -161,7 +162,7 @@ def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_ru
             )
             for learner in group.learners:
                 learner.float()
-        return update(group, stack, minibatches)
+        return update(group, stack, minibatches, errors)
 
     monkeypatch.setattr(Group, "start_task", started)
     monkeypatch.setattr(Group, "_update", compared)
@@ -369,18 +370,56 @@ def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generato
         assert torch.equal(alone.get_state(), generators[number].get_state())
 
 
-def test_a_seed_whose_loss_is_not_finite_is_named(make, monkeypatch):
-    its = make("ppo")
-    start = Group.start_task
+def spoil(monkeypatch, numbers=(1,)) -> None:
+    """Let weights of some seeds be nan when the first batch of the second task is learned from."""
+    learn, batches = Group.learn, []
 
-    def spoiled(group, task=None):
-        start(group, task)
-        group.learners[1].weights[0].data.fill_(torch.nan)
+    def spoiled(group, batch):
+        batches.append(batch)
+        for number in numbers if len(batches) == 4 else ():
+            group.learners[number].weights[0].data.fill_(torch.nan)
+        return learn(group, batch)
 
-    monkeypatch.setattr(Group, "start_task", spoiled)
+    monkeypatch.setattr(Group, "learn", spoiled)
 
-    with pytest.raises(FloatingPointError, match=r"seed 3: loss_objective is nan in block 1 after 32 frames; the run"):
-        its.learn()
+
+@pytest.mark.parametrize(("name", "method"), [("ppo", "ewc"), ("prioritized dqn", "finetune")])
+def test_a_seed_that_is_not_finite_fails_alone_and_changes_no_bit_of_another(make, monkeypatch, tmp_path, name, method):
+    its, kept = make(name, method), []
+    group, logs = its.learn()
+
+    spoil(monkeypatch)
+    spoiled = its.group()
+    spoiled_logs = [RunLog(tmp_path / f"{seed}.jsonl") for seed in SEEDS]
+    more = {"checkpoint": lambda make_states, end: kept.append(saved_and_loaded(make_states()))}
+    failed = learn_together(CURRICULUM, spoiled, SEEDS, spoiled_logs, **more)
+
+    assert list(failed) == [1]
+    assert re.match(
+        r"seed 3: (loss_\w+|the largest weight) is nan in block 2 after 112 frames; the run stops here", str(failed[1])
+    )
+    for number in (0, 2):
+        assert equal(states(group)[number], states(spoiled)[number])
+        assert lines(logs[number]) == lines(spoiled_logs[number])
+    assert lines(spoiled_logs[1]) == lines(logs[1])[: len(lines(spoiled_logs[1]))]
+    assert all(line["frames"] < 112 for line in lines(spoiled_logs[1]))
+    resumed_logs = [
+        RunLog.resume(tmp_path / f"{seed}.jsonl", state["log"]) for seed, state in zip(SEEDS, kept[5], strict=True)
+    ]
+    resumed = its.group()
+    again = learn_together(CURRICULUM, resumed, SEEDS, resumed_logs, saved=kept[5])
+    assert str(again[1]) == str(failed[1])
+    assert equal(states(resumed), states(spoiled))
+
+
+def test_a_group_of_which_every_seed_has_failed_stops(make, monkeypatch):
+    its, logs = make("ppo"), [RunLog() for _ in SEEDS]
+    spoil(monkeypatch, range(3))
+
+    failed = learn_together(CURRICULUM, its.group(), SEEDS, logs)
+
+    assert list(failed) == [0, 1, 2]
+    assert all(lines(log)[-1]["frames"] < 112 for log in logs)
 
 
 def test_what_cannot_be_one_batch_says_why(compose):

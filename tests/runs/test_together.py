@@ -10,6 +10,7 @@ import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
+from baselines.together import Group
 from ctgraph_rl import RunLog
 from ctgraph_rl.compare import compare
 from ctgraph_rl.runs import checkpoints, train
@@ -135,6 +136,31 @@ def test_seeds_that_cannot_be_one_batch_are_trained_as_alone_one_after_the_other
     sweep(monkeypatch, *settings, "hydra.sweep.dir=alone")
 
     assert all(same(one, other) for one, other in zip(runs(), runs("alone"), strict=True))
+
+
+def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(monkeypatch, capsys):
+    settings = (SEEDS, "together=true", *PPO)
+    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
+    start = Group.start_task
+
+    def spoiled(group, task=None):
+        start(group, task)
+        group.learners[1].weights[0].data.fill_(torch.nan)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Group, "start_task", spoiled)
+        assert sweep(patch, *settings) == 1
+    shown = capsys.readouterr().out
+    assert "2 done, 1 failed" in shown and "FloatingPointError: seed 1: loss_objective is nan in block 1" in shown
+
+    done, failed = [runs()[number] for number in (0, 2)], runs()[1]
+    assert all(same(run, Path("whole", run.relative_to("runs"))) for run in done)
+    assert [name for name in ("metrics.json", "agent.pt", "checkpoints", "failed.txt") if (failed / name).exists()] == [
+        "failed.txt"
+    ]
+    assert not any((run / "failed.txt").exists() for run in done)
+    assert sweep(monkeypatch, *settings) == 0
+    assert "together" not in first_line(failed) and not (failed / "failed.txt").exists()
 
 
 @pytest.mark.parametrize(
