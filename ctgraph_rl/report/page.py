@@ -21,7 +21,7 @@ from ctgraph_rl.report.names import displayed
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
-from ctgraph_rl.report.terminal import code_notes, mixed_code
+from ctgraph_rl.report.terminal import code_notes, group_size, mixed_code
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
 
@@ -248,7 +248,8 @@ def _system(run: Run) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in (run.about.get("versions") or {}).items())
     threads, device = run.about.get("num_threads", "?"), run.about["config"].get("device", "not said")
     machine = run.about.get("machine", "not said")
-    return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}"
+    group = f"; trained in a group of {group_size(run)} seeds" if group_size(run) > 1 else ""
+    return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}{group}"
 
 
 def _definitions(parts: Sequence[Part]) -> list[tuple[str, str, str, str]]:

@@ -225,11 +225,21 @@ def print_problems(problems: Iterable[Problem], runs: Sequence[Run]) -> bool:
     return bool(left_out or mixed)
 
 
+def group_size(run: Run) -> int:
+    """Return how many seeds a run was trained with, itself among them; 1 for a run alone."""
+    together = run.about.get("together")
+    return len(together) if isinstance(together, list) and together else 1
+
+
 def code_notes(runs: Sequence[Run]) -> list[str]:
-    """Return sentences on runs of an older numbers version, and on those that do not say of which source they are."""
+    """Return sentences on runs of an older numbers version, of unknown source, and of groups where others are not."""
     older = [run for run in runs if run.code["numbers version"] < NUMBERS]
     unknown = [run for run in runs if None in run.code.values()]
     versions = ", ".join(sorted({str(run.code["numbers version"]) for run in older}))
     said = f"of numbers version {versions}, this package is of {NUMBERS}: it may give other numbers"
     found = [(older, said), (unknown, "of unknown code: they do not say of which source they are")]
+    sizes = [group_size(run) for run in runs]
+    for size in sorted({*sizes} - {1}) if len({*sizes}) > 1 else ():
+        of_size = [run for run in runs if group_size(run) == size]
+        found.append((of_size, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
     return [f"{len(some)} of {len(runs)} runs are {what}" for some, what in found if some]

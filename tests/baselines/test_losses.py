@@ -1,4 +1,4 @@
-"""What agents minimise, by hand."""
+"""What agents minimise, by hand; and the steps of several seeds in one operation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from helpers.small_agents import ONE_HOT_TASK, batches, learnt_from
 from torch import nn
 
 from baselines.networks import Encoder
+from baselines.optimisers import StackedOptimiser, make_optimiser, stacked
+from baselines.together import sampled
 from curricula.paper import ct_su_b1
+
+SEEDS = (0, 3, 8)
 
 
 def test_images_reach_the_network_between_zero_and_one():
@@ -70,3 +74,55 @@ def _observed(observation):
 
 def _values(agent, observation):
     return agent.greedy(_observed(observation))["action_value"]
+
+
+@pytest.mark.parametrize("functional", [False, True])
+@pytest.mark.parametrize("name", ["adam", "rmsprop"])
+def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name, functional):
+    torch.manual_seed(0)
+    own = [[torch.nn.Parameter(torch.randn(*shape).double()) for shape in ((3, 3), (4,))] for _ in SEEDS]
+    optimisers = [make_optimiser(name, parameters, 0.1) for parameters in own]
+    copies = [[torch.nn.Parameter(each.detach().clone()) for each in parameters] for parameters in own]
+    others = [make_optimiser(name, parameters, 0.1) for parameters in copies]
+
+    for _ in range(2):  # the second time with the state of the first
+        kept = [stacked([each.detach() for each in pair]).requires_grad_() for pair in zip(*own, strict=True)]
+        stack = StackedOptimiser(optimisers, kept)
+        for _ in range(3):
+            gradients = [torch.randn_like(parameter) for parameter in kept]
+            one = stack.functional(kept, stack.tensors) if functional else stack
+            norms = one.step(gradients, 0.5)
+            stack.num_steps += functional
+            for number, parameters in enumerate(copies):
+                parameters[0].grad, parameters[1].grad = (
+                    gradients[0][number].mT.contiguous(),
+                    gradients[1][number].clone(),
+                )
+                norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
+                assert norms[number] == pytest.approx(norm.item(), rel=1e-12)
+                others[number].step()
+        stack.write()
+        for number, parameters in enumerate(own):
+            parameters[0].data.copy_(kept[0][number].mT.detach())
+            parameters[1].data.copy_(kept[1][number].detach())
+
+    for number in range(len(SEEDS)):
+        for one, other in zip(own[number], copies[number], strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+            mine, its = optimisers[number].state[one], others[number].state[other]
+            assert mine.keys() == its.keys()
+            for key in its:
+                torch.testing.assert_close(mine[key], its[key], rtol=1e-12, atol=1e-12)
+
+
+def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generator():
+    log_probs = torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(0)).log_softmax(dim=-1)
+    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
+
+    written = sampled({"log_probs": log_probs, "state_value": log_probs[..., :1]}, generators)
+
+    for number, seed in enumerate(SEEDS):
+        alone = torch.Generator().manual_seed(seed)
+        chances = log_probs[number].softmax(dim=-1)
+        assert torch.equal(written["action"][number], chances.multinomial(1, generator=alone).squeeze(-1))
+        assert torch.equal(alone.get_state(), generators[number].get_state())

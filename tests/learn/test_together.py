@@ -14,8 +14,9 @@ from helpers.scripted import ONE, THREE, TWO, Told, decide, of
 from helpers.small_agents import MINIBATCHES, REPLAY, TINY, saved_and_loaded
 
 from baselines import together
-from baselines.optimisers import StackedOptimiser, make_optimiser, stacked
-from baselines.together import Group, Stack, Template, sampled
+from baselines.learner import total_loss
+from baselines.stack import Stack, Template
+from baselines.together import Group
 from ctgraph_rl import Block, Curriculum, RunLog, learn_curriculum
 from ctgraph_rl.learn.together import learn_together, why_not_together
 from ctgraph_rl.runs.config import target
@@ -37,7 +38,7 @@ AGENTS = {
 
 COMPILED = [("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
 
-METHODS = ("scratch", "l2", "ewc", "mask_ri", "mask_lc", "mask_blc")
+METHODS = ("scratch", "l2", "ewc", "ewc_published", "mask_ri", "mask_lc", "mask_blc")
 
 CURRICULUM = of(Block(ONE, 80), Block(THREE, 120), Block(ONE, 56), task_id="at_boundaries")
 """Blocks of no whole number of batches, which are of 32 frames, and a task that returns."""
@@ -191,7 +192,7 @@ def of_all(group: Group, minibatches) -> tuple[dict[str, torch.Tensor], list[tor
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     losses = learner.losses({key: wide(value) for key, value in minibatch.items()})
-    gradients = torch.autograd.grad(together.total_loss(losses), learner.weights)
+    gradients = torch.autograd.grad(total_loss(losses), learner.weights)
     return losses, list(learner.method.transform_gradients(gradients))
 
 
@@ -316,58 +317,6 @@ def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_
         resumed, _ = its.learn(saved=kept[place], logs=resumed_logs)
         assert equal(states(resumed), states(group))
         assert list(map(lines, resumed_logs)) == list(map(lines, logs))
-
-
-@pytest.mark.parametrize("functional", [False, True])
-@pytest.mark.parametrize("name", ["adam", "rmsprop"])
-def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name, functional):
-    torch.manual_seed(0)
-    own = [[torch.nn.Parameter(torch.randn(*shape).double()) for shape in ((3, 3), (4,))] for _ in SEEDS]
-    optimisers = [make_optimiser(name, parameters, 0.1) for parameters in own]
-    copies = [[torch.nn.Parameter(each.detach().clone()) for each in parameters] for parameters in own]
-    others = [make_optimiser(name, parameters, 0.1) for parameters in copies]
-
-    for _ in range(2):  # the second time with the state of the first
-        kept = [stacked([each.detach() for each in pair]).requires_grad_() for pair in zip(*own, strict=True)]
-        stack = StackedOptimiser(optimisers, kept)
-        for _ in range(3):
-            gradients = [torch.randn_like(parameter) for parameter in kept]
-            one = stack.functional(kept, stack.tensors) if functional else stack
-            norms = one.step(gradients, 0.5)
-            stack.num_steps += functional
-            for number, parameters in enumerate(copies):
-                parameters[0].grad, parameters[1].grad = (
-                    gradients[0][number].mT.contiguous(),
-                    gradients[1][number].clone(),
-                )
-                norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
-                assert norms[number] == pytest.approx(norm.item(), rel=1e-12)
-                others[number].step()
-        stack.write()
-        for number, parameters in enumerate(own):
-            parameters[0].data.copy_(kept[0][number].mT.detach())
-            parameters[1].data.copy_(kept[1][number].detach())
-
-    for number in range(len(SEEDS)):
-        for one, other in zip(own[number], copies[number], strict=True):
-            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
-            mine, its = optimisers[number].state[one], others[number].state[other]
-            assert mine.keys() == its.keys()
-            for key in its:
-                torch.testing.assert_close(mine[key], its[key], rtol=1e-12, atol=1e-12)
-
-
-def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generator():
-    log_probs = torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(0)).log_softmax(dim=-1)
-    generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
-
-    written = sampled({"log_probs": log_probs, "state_value": log_probs[..., :1]}, generators)
-
-    for number, seed in enumerate(SEEDS):
-        alone = torch.Generator().manual_seed(seed)
-        chances = log_probs[number].softmax(dim=-1)
-        assert torch.equal(written["action"][number], chances.multinomial(1, generator=alone).squeeze(-1))
-        assert torch.equal(alone.get_state(), generators[number].get_state())
 
 
 def spoil(monkeypatch, numbers=(1,)) -> None:

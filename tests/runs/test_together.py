@@ -13,8 +13,11 @@ from helpers.sweeping import command_line, sweep
 from baselines.together import Group
 from ctgraph_rl import RunLog
 from ctgraph_rl.compare import compare
+from ctgraph_rl.report.page import write_report
+from ctgraph_rl.report.terminal import code_notes
 from ctgraph_rl.runs import checkpoints, train
 from ctgraph_rl.runs.load import load
+from ctgraph_rl.runs.read import find_runs
 
 TINY = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
 PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
@@ -126,6 +129,11 @@ def test_what_is_done_is_left_as_it_is_and_one_seed_is_trained_alone(monkeypatch
 
     assert [content(run)[0] for run in runs()[:2]] == [lines for lines, _ in before]
     assert "together" not in first_line(runs()[2])
+    said = "2 of 3 runs are of seeds trained together, 2 at a time; they differ from others by rounding"
+    assert code_notes(find_runs(["runs"])[0]) == [said]
+    write_report(["runs"], Path("report"))
+    page = Path("report", "report.html").read_text()
+    assert said in page and "1 run: " in page and "; trained in a group of 2 seeds" in page
 
 
 def test_seeds_that_cannot_be_one_batch_are_trained_as_alone_one_after_the_other(monkeypatch, capsys):
