@@ -294,8 +294,10 @@ def test_the_name_of_a_run_holds_curriculum_agent_seed_and_what_else_changes_res
     assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", plain)
     assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-seed3-[0-9a-f]{12}", other)
     assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-l2-seed3-[0-9a-f]{12}", worn)
+    assert re.fullmatch(r"runs/su_b1_4tasks/lstm_ppo-gru-l2-seed3-[0-9a-f]{12}", directory("cell=gru", "method=l2"))
     assert other != plain
-    assert same == plain
+    assert same == directory("cell=lstm") == plain
+    assert directory("cell=lstm", "agent.cell.reads_action=true") != plain
 
 
 def test_a_folder_that_shadows_our_curricula_is_refused_with_its_path(checkout, tmp_path):

@@ -140,15 +140,15 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
-    """Return what builds the agent or method that a configuration names, if its class is one of ``baselines``."""
+    """Return what builds the agent, cell or method that a configuration names, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours = OURS[part].fullmatch(name)
+    ours, maker = OURS[part].fullmatch(name), "make_method" if part == "method" else "make_agent"
     if ours is None:
-        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., make_{part}=), in Python")
+        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., {maker}=), in Python")
     kind: Any = class_named(ours[1], ours[2])
     defined = kind is not None and issubclass(kind, torch.nn.Module)
-    require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., make_{part}=)"))
+    require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., {maker}=)"))
     return partial(kind, **_settings(run_dir, with_added(settings)))
 
 

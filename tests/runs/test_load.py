@@ -12,16 +12,20 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, TWO
+from helpers.small_agents import TINY
 from helpers.stopped_runs import LEARNED, OWN, SETTINGS, bombs, learn_into, make_agent, stopped_run
+from helpers.sweeping import command_line
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from baselines.a2c import A2C
+from baselines.cells.frames import Frames
 from baselines.methods.l2 import L2
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, evaluate, learn_curriculum
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
+from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent, train, with_method
 
 METHODS = sorted(path.stem for path in Path(conf_dir(), "method").glob("*.yaml"))
@@ -124,6 +128,21 @@ def test_what_a_method_keeps_for_a_task_acts_in_it(tmp_path):
 
 class Own(L2):
     """A method that is no baseline's."""
+
+
+def test_an_agent_comes_back_with_its_cell_and_a_cell_of_someone_else_must_be_given(tmp_path, monkeypatch):
+    own = ("cell=frames", "agent.cell.num_frames=3", "curriculum=co_hard", "curriculum.num_frames=64")
+    assert command_line(monkeypatch, *own, *TINY, "agent.num_minibatches=1", f"hydra.run.dir={tmp_path / 'run'}") == 0
+
+    trained = load(tmp_path / "run")
+
+    cell = trained.agent.trunk.cell
+    assert (type(cell), cell.num_frames, read_run(tmp_path / "run").agent) == (Frames, 3, "LSTMPPO + Frames")
+    config = trained.log.of_kind("run")[0]["config"]
+    config["agent"]["cell"]["_target_"] = "os.system"
+    rewrite(tmp_path / "run", config=config)
+    with pytest.raises(ValueError, match=r"is of the cell os.system, no baseline: give load\(..., make_agent=\)"):
+        load(tmp_path / "run")
 
 
 def test_a_method_of_someone_else_must_be_given(tmp_path):
