@@ -9,7 +9,7 @@ core. ``--cells`` measures LSTM-PPO with each cell in place of the LSTM, alone. 
 measured until then is printed.
 
 ``--device cuda`` measures `baselines.ladder` instead, ``--startup`` how long a run takes to its first step, beside the
-bare imports of torch and torchrl.
+bare imports of torch and torchrl; ``--roofline`` how fast the matrix products of learning are alone, which bounds it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -28,7 +28,7 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from baselines import _startup, ladder
+from baselines import _roofline, _startup, ladder
 from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.benchmark import machine
@@ -208,6 +208,17 @@ def on_device(device: torch.device, options: argparse.Namespace) -> str:
     return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, ladder.ENVIRONMENT)}"
 
 
+def roofline(agents: list[str], rounds: int) -> str:
+    """Format how fast agents learn, LSTM-PPO also with pixel noise, beside their matrix products alone."""
+    task = ct_su_b1(GOAL)
+    noisy = replace(task, observations=replace(task.observations, read_noise=10))
+    pairs = [*((name, label, TASKS[label]) for name, label in PAIRS), ("lstm_ppo", "CT-SU-B1, noise", noisy)]
+    learners = [(name, label, Ours(name, task, 0).learn) for name, label, task in pairs if name in agents]
+    for *_, learn in learners:
+        learn()
+    return _roofline.table(learners, rounds)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
     names = list(dict.fromkeys(name for name, _ in PAIRS))
@@ -226,6 +237,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", default=None, help="instead: PPO and LSTM-PPO on one device, such as cuda")
     parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
     parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
+    parser.add_argument("--roofline", action="store_true", help="instead: learning beside its matrix products alone")
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
@@ -239,6 +251,9 @@ def main(arguments: list[str] | None = None) -> None:
         return
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    if options.roofline:
+        print(f"{machine()}; medians of {options.rounds} rounds\n\n{roofline(options.agents, options.rounds)}")
+        return
     if options.device:
         print(on_device(checked_device(options.device), options))
         return

@@ -16,6 +16,7 @@ from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
 from baselines import benchmark
+from baselines._roofline import Products
 from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
 from baselines.learner import functional_gradient_step
@@ -293,6 +294,26 @@ def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
     rows = [[cell.strip() for cell in line.split("|")[3:-1]] for line in benchmark.table([ours, theirs]).splitlines()]
 
     assert rows[2:] == [["ours", "200", "", "12", "2.00"], ["SB3", "40", "5.0 x", "1 of 3 seeds", ""]]
+
+
+def test_the_roofline_counts_the_multiply_adds_of_products_and_of_an_lstm():
+    linear, lstm = nn.Linear(5, 3), nn.LSTM(3, 4, batch_first=True)
+    inputs = torch.ones(7, 5)
+
+    with Products() as products:
+        linear(inputs).sum().backward()
+        with torch.no_grad():
+            lstm(torch.ones(2, 6, 3))
+
+    once = {
+        (7, 5, 3): 1,
+        (3, 7, 5): 1,
+        (12, 3, 16): 1,
+        (12, 4, 16): 1,
+    }  # forward, backward; the LSTM
+    assert products.shapes == once
+    assert products.multiply_adds == 7 * 5 * 3 * 2 + 12 * 16 * (3 + 4)
+    assert products.seconds() > 0
 
 
 @pytest.mark.slow
