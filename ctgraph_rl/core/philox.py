@@ -71,7 +71,9 @@ def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | i
         stream: one of the ``STREAM_*`` constants.
         block: number of the block in [0, 2**28), for uses that need more than four words.
     """
-    last = torch.as_tensor(block, device=tick.device) + (stream << _STREAM_SHIFT)
+    last = block + (stream << _STREAM_SHIFT)
+    if not isinstance(last, Tensor):
+        last = torch.full((), last, device=tick.device)  # written there: `torch.as_tensor` copies from the CPU
     return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
 
 

@@ -6,14 +6,16 @@ on data, is an error there, and so is one with a tensor of another device.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import pytest
 import torch
 from helpers.oracles import confounding
 from helpers.small_agents import POLICY_GRADIENTS, agent_of, parameters_equal
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import baselines.learner
@@ -46,6 +48,30 @@ def swapped() -> Iterator[None]:
     torch.__future__.set_swap_module_params_on_conversion(False)
 
 
+class Alone(TorchDispatchMode):
+    """Refuses copies from the CPU, for which a CUDA graph has no place."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        moved = func is torch.ops.aten._to_copy.default and kwargs.get("device", args[0].device) != args[0].device
+        copied = func is torch.ops.aten.copy_.default and args[1].device != args[0].device
+        assert not (moved or copied), f"{func} from {args[-1].device}"
+        return func(*args, **kwargs)
+
+
+@pytest.fixture
+def alone(monkeypatch) -> Alone:
+    """Refuses what copies from the CPU, also by functions that hide it."""
+
+    def on_the_cpu(make: Callable[..., torch.Tensor], *data: object, **how: object) -> torch.Tensor:
+        assert how.get("device") in (None, "cpu", torch.device("cpu")), f"{data} is copied to {how['device']}"
+        return make(*data, **how)
+
+    for name in ("tensor", "as_tensor"):
+        monkeypatch.setattr(torch, name, partial(on_the_cpu, getattr(torch, name)))
+    return Alone()
+
+
 def test_a_region_returns_the_results_of_its_function_and_overwrites_them():
     region = Region(lambda given: {"sum": given["x"] + 1, "x": given["x"]})
 
@@ -57,16 +83,17 @@ def test_a_region_returns_the_results_of_its_function_and_overwrites_them():
 
 
 @pytest.mark.parametrize("name", configurations())
-def test_no_step_of_the_tensor_engine_needs_the_host(name):
+def test_no_step_of_the_tensor_engine_needs_the_host(name, request):
     batch = Rows([configurations()[name]] * 4, kernel="off").to(META)
 
-    steps = rollout(batch, torch.zeros(2, 4, dtype=torch.int64, device=META), Steps.empty(batch, 2))
+    with request.getfixturevalue("alone"):
+        steps = rollout(batch, torch.zeros(2, 4, dtype=torch.int64, device=META), Steps.empty(batch, 2))
 
     assert {value.device for value in (*steps, *batch.state)} == {META}
 
 
 @pytest.mark.parametrize("name", POLICY_GRADIENTS)
-def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swapped):
+def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swapped, request):
     env = CTGraphEnv([confounding(p=0.3)] * 16, kernel="off")
     agent = agent_of(compose, name, env).to(META)
     for optimiser in (each for each in vars(agent).values() if isinstance(each, torch.optim.Optimizer)):
@@ -76,7 +103,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
     env.rows.to(META)
     env._device = META
 
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+    with request.getfixturevalue("alone"), torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         for _ in range(agent.num_steps):
             step, carried = act(carried)
             steps.append(step)
