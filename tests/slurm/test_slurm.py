@@ -182,7 +182,7 @@ def test_preempted_groups_of_an_array_go_back_into_the_queue_and_each_seed_ends_
     uninterrupted = subprocess.Popen(command, cwd=whole, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     head = sweep(*GROUPS, "hydra.launcher.partition=low")
-    wait_for(lambda: len(list(tmp_path.glob("runs/*/*/checkpoints/*.pt"))) > 3)
+    wait_for(lambda: len({path.parent for path in tmp_path.glob("runs/*/*/checkpoints/*.pt")}) == 4)
     slurm("sbatch", "--partition=high", "--exclusive", "--output=/dev/null", "--wrap=sleep 1")
 
     runs = end_after_one_requeue(slurm, head, tmp_path, 2)
