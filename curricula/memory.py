@@ -17,7 +17,7 @@ from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.task import Task
 from curricula.order import sequence
 
-SOURCE = "after Ladosz et al. 2021 and Soltoggio et al. 2023, arXiv 2302.10887"
+SOURCE = "Ladosz et al. 2021; the numbers of its graph in Soltoggio et al. 2023, arXiv 2302.10887"
 
 MOST_DEPTH = 16
 """A goal at random is one end state of 2^d."""
