@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 
 from ctgraph_rl.checks import as_tuple, at_least_one, is_int, one_of, require, true_or_false
 from ctgraph_rl.tasks.switch import Switch, switch_rule
@@ -167,7 +167,7 @@ class Protocol:
     boundaries: str = "announced"
     num_task_ids: int | None = None
     task_ids: tuple[int, ...] | None = None
-    guide_frames: int = 0
+    guide_frames: int = field(default=0, metadata={"added": True})
 
     def __post_init__(self) -> None:
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
