@@ -10,6 +10,7 @@ from results_of import agents_results, methods_results
 from yaml_settings import ALONE, base_of, escaped, first_comment, names_in, settings_of, table
 
 from baselines.catalogue import Entry, catalogue
+from baselines.cells.cell import Cell
 from baselines.methods.__main__ import needs_ids
 
 
@@ -18,15 +19,17 @@ def baseline_cards() -> Iterator[tuple[str, str]]:
     for group, facts in (("agent", _agent_facts), ("cell", _cell_facts), ("method", _method_facts)):
         entries = list(catalogue(group))
         yield f"{group}s/index.md", _index(group, entries)
+        first = {entry.kind: entry.name for entry in reversed(entries)}
         for entry in entries:
-            yield f"{group}s/{entry.name}.md", _card(group, entry, facts(entry))
+            yield f"{group}s/{entry.name}.md", _card(group, entry, facts(entry), first[entry.kind] == entry.name)
 
 
 def _index(group: str, entries: list[Entry]) -> str:
     rows = [f"| [`{entry.name}`]({entry.name}.md) | {escaped(entry.comment)} |" for entry in entries]
     words = f"Choose one with `{group}=NAME`. Each card has all settings with their defaults."
     listing = "\n".join([f"| `{group}=` | |", "|---|---|", *rows])
-    return f"# {group.title()} cards\n\n{words}\n\n{listing}\n"
+    base = f"\n## Base class\n\n{_class(Cell)}\n" if group == "cell" else ""
+    return f"# {group.title()} cards\n\n{words}\n\n{listing}\n{base}"
 
 
 def _agent_facts(entry: Entry) -> dict[str, str]:
@@ -42,7 +45,7 @@ def _method_facts(entry: Entry) -> dict[str, str]:
     return {"needs task ids": ids, "needs to know boundaries": "yes" if entry.kind.needs_boundaries else "no"}
 
 
-def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
+def _card(group: str, entry: Entry, facts: dict[str, str], is_first: bool) -> str:
     chosen = {"agent": "", "cell": "agent=lstm_ppo ", "method": "agent=ppo "}[group]
     results = {"agent": agents_results, "method": methods_results}.get(group, lambda name: "")(entry.name)
     prefix = "agent.cell." if group == "cell" else f"{group}."
@@ -60,9 +63,15 @@ def _card(group: str, entry: Entry, facts: dict[str, str]) -> str:
         *(["## Results", results] if results else []),
         *_source(entry),
         "## Class",
-        f"```{{eval-rst}}\n.. autoclass:: {entry.kind.__module__}.{entry.kind.__name__}\n   :members:\n```",
+        _class(entry.kind, is_first),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _class(kind: type, is_first: bool = True) -> str:
+    """Return the reference of a class, which is indexed where it stands first."""
+    options = "   :members:" + ("" if is_first else "\n   :no-index:")
+    return f"```{{eval-rst}}\n.. autoclass:: {kind.__module__}.{kind.__name__}\n{options}\n```"
 
 
 def _variants(group: str, name: str) -> list[str]:
