@@ -28,6 +28,7 @@ from ctgraph_rl.batch.text_render import as_text
 from ctgraph_rl.checks import as_tuple, is_int, require
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
+from ctgraph_rl.tasks.protocol import MOST_ROWS
 from ctgraph_rl.tasks.task import Task
 
 Frame = NDArray[np.uint8] | str
@@ -169,7 +170,8 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         kernel: str = "auto",
         **changes: Any,
     ) -> None:
-        require((is_int(num_envs, 1), f"num_envs must be an integer >= 1, got {num_envs!r}"))
+        within = f"num_envs must be an integer in 1..{MOST_ROWS}, got {num_envs!r:.80}"
+        require((is_int(num_envs, 1, MOST_ROWS), within))
         rows = as_tuple(task)
         given = rows if isinstance(rows, tuple) else (task,)
         require((len(given) in (1, num_envs), f"task must be one, or one per row of {num_envs}, got {len(given)}"))

@@ -164,5 +164,7 @@ def test_tasks_outside_of_the_pool_and_of_another_number_are_refused():
         envs.set_tasks([surjective()])
     with pytest.raises(ValueError, match="task must be one, or one per row of 2, got 3"):
         CTGraphVectorEnv(2, [surjective()] * 3)
-    with pytest.raises(ValueError, match="num_envs must be an integer >= 1, got 0"):
+    with pytest.raises(ValueError, match=r"num_envs must be an integer in 1\.\.16777216, got 0"):
         CTGraphVectorEnv(0)
+    with pytest.raises(ValueError, match=r"num_envs must be an integer in 1\.\.16777216, got 1000"):
+        CTGraphVectorEnv(10**200)
