@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 import curricula
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.report import statistics
 from ctgraph_rl.tasks.configurations import ct_fo_b2
 
 
@@ -18,6 +19,7 @@ def words(path: str) -> str:
     return " ".join((CHECKOUT / path).read_text(encoding="utf-8").split())
 
 
+SWEEPS = (CHECKOUT / "docs/how-to/sweeps.md").read_text(encoding="utf-8")
 RESULTS, LIFELONG, README = words("docs/results/baselines.md"), words("docs/results/lifelong.md"), words("README.md")
 
 
@@ -26,7 +28,7 @@ def make():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
         yield __import__("make")
-        for name in ("make", "alone", "comparison", "raw", "reruns", "search"):
+        for name in ("make", "alone", "as_alone", "comparison", "raw", "reruns", "search"):
             sys.modules.pop(name, None)
 
 
@@ -278,3 +280,16 @@ def test_a_cell_that_was_run_again_takes_the_place_of_its_line(make, monkeypatch
     assert written == [reruns.line_of("baselines_b1", cell, 4, 3)]
     with pytest.raises(ValueError, match="holds no run of main_job: give the folder of its runs"):
         reruns.compare("main_job", tmp_path)
+
+
+def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have_been_found(make):
+    as_alone = __import__("as_alone")
+    found = as_alone.comparisons()
+    sizes = {(line["way"], line["group_size"]) for line in make.read(as_alone.NAME)}
+
+    assert {agent for agent, _ in found} == {"ppo", "ppo_published", "ppo_count", "a2c", "reinforce", "dqn"}
+    assert {(len(alone), len(together)) for _, alone, together in found.values()} == {(30, 30)}
+    assert sizes == {("alone", "1"), ("together", "30")}
+    corrected = statistics.holm([comparison.p_value for comparison, *_ in found.values()])
+    assert min(corrected) > 0.05
+    assert as_alone.page_table() in SWEEPS
