@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.rnn import PackedSequence
 
 from baselines.cells.cell import Cell, State, zeros_like_weights
 from baselines.cells.segments import segments
@@ -55,8 +54,6 @@ def packed_gru(gru: nn.GRU, features: Tensor, groups: Tensor, sizes: Tensor, h: 
     Returns:
         The states at all frames in packed order, [num_frames, hidden_size].
     """
-    if features.is_cuda:
-        return gru(PackedSequence(features.index_select(0, groups), sizes), h.unsqueeze(0))[0].data
     of_features, of_h, bias, of_h_bias = gru.all_weights[0]
     given = nn.functional.linear(features, of_features, bias)
     memory = []

@@ -144,12 +144,7 @@ class CKARL(TaskMethod):
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
         """Return the weights of a task in scope, and the present ones elsewhere."""
-        slot = self.slot_of(task)
-        if not self.started or slot == self.slot:
-            return None
-        weights = self.weights.vector()
-        weights[self.in_scope.to(weights.device)] = self.kept[slot]
-        return weights
+        return self.present_with(task, self.in_scope, self.kept)
 
     def _network(self) -> list[nn.Parameter]:
         """Return the network's parameters in scope."""

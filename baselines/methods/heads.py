@@ -54,9 +54,4 @@ class Heads(TaskMethod):
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
         """Return the present weights with the task's output layers."""
-        slot = self.slot_of(task)
-        if not self.started or slot == self.slot:
-            return None
-        weights = self.weights.vector()
-        weights[self.in_heads.to(weights.device)] = self.kept[slot]
-        return weights
+        return self.present_with(task, self.in_heads, self.kept)

@@ -155,6 +155,21 @@ class TaskMethod(Method):
         """Return the slot of a task."""
         return self.started.index(task) if task in self.started else 0
 
+    def present_with(self, task: int, inside: Tensor, kept: Tensor) -> Tensor | None:
+        """Return the present weights with a part that each task has of its own; None if that is the present one.
+
+        Args:
+            task: its id.
+            inside: where in the vector of all weights the part is, bool [P].
+            kept: the part of each slot, [slots, n].
+        """
+        slot = self.slot_of(task)
+        if not self.started or slot == self.slot:
+            return None
+        weights = self.weights.vector()
+        weights[inside.to(weights.device)] = kept[slot]
+        return weights
+
     def get_extra_state(self) -> dict[str, Any]:
         """Return the slots of the tasks."""
         return {"begun": list(self.started), "place": self.slot}
