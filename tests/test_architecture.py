@@ -30,7 +30,7 @@ FLOORS = (
     ("runs", "baselines"),
     ("visualize", "hydra_plugins"),
     ("report",),
-    ("collective",),
+    ("collective", "board"),
     ("cli", "run", "describe", "compare"),
     ("benchmark",),
 )

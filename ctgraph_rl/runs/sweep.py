@@ -54,6 +54,13 @@ SUBDIR = "${run_name:}"
 """Names a directory after the configuration; a cell can then be found before it is run."""
 
 
+def swept(params: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the choices of each swept setting as on a command line: ``seed=0``, ``seed=1`` of ``range(2)``."""
+    parser = OverridesParser.create()
+    parsed = {key: parser.parse_override(f"{key}={value}") for key, value in params.items()}
+    return {key: [f"{key}={value}" for value in each.sweep_string_iterator()] for key, each in parsed.items()}
+
+
 class Sweeper(Base):
     """Sweeps over all combinations of choices, with any launcher; to be mixed into Hydra's ``BasicSweeper``.
 

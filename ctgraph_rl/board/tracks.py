@@ -1,0 +1,214 @@
+"""Tracks of the board: named and versioned tasks, each a file in ``conf/track``.
+
+A track fixes curriculum, protocol, budget and seeds; agent, cell and method are free. ``ctgraph-rl -m track=small
+agent=ppo method=ewc`` runs exactly what the track ``small`` asks for. A ladder has several rungs, each with a
+curriculum of its own, and a learner may be given less than the track gives: each of these is a `Variant`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctgraph_rl.checks import at_least_one, did_you_mean, is_int, require
+from ctgraph_rl.metrics import METRICS
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.job import with_changes
+from ctgraph_rl.runs.sweep import swept
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Protocol
+
+TUNING_SEEDS = range(100, 200)
+"""Seeds on which the hyperparameters of a submission may be chosen."""
+
+HELD_OUT_SEEDS = range(10**6, 2**31)
+"""Seeds that a verifier draws from."""
+
+KEYS = ("version", "title", "measures", "breakthrough", "score", "less_given")
+"""What a file says under ``track``."""
+
+GROUP = "track"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What a submission to a track may learn.
+
+    Args:
+        settings: how its curriculum differs from that of ``track=NAME``, as on the command line.
+        rung: which rung of a ladder it is, in words; empty if the track has one curriculum.
+        curriculum: with protocol and evaluation.
+    """
+
+    settings: tuple[str, ...]
+    rung: str
+    curriculum: Curriculum
+
+    @property
+    def given(self) -> str:
+        """What the learner is given to know of tasks, in words."""
+        return given(self.curriculum.protocol, len(self.curriculum.blocks))
+
+
+@dataclass(frozen=True)
+class Track:
+    """A track.
+
+    Args:
+        name: of its file in ``conf/track``.
+        version: rises with every change that makes results incomparable.
+        title: for readers.
+        measures: what it measures, a sentence.
+        breakthrough: a result that would be one, a sentence.
+        score: name of the metric that orders a table.
+        seeds: of a submission, all of them.
+        rungs: settings of each rung of a ladder; one without settings for a track of one curriculum.
+        less_given: changes of the protocol for learners that are given less.
+        config_dir: where its file is, if it is not one of ours.
+    """
+
+    name: str
+    version: int
+    title: str
+    measures: str
+    breakthrough: str
+    score: str
+    seeds: tuple[int, ...]
+    rungs: tuple[tuple[str, ...], ...]
+    less_given: tuple[Mapping[str, Any], ...] = ()
+    config_dir: Path | None = None
+
+    @property
+    def id(self) -> str:
+        """Name and version, such as ``small-v1``."""
+        return f"{self.name}-v{self.version}"
+
+    @property
+    def tuning_seeds(self) -> range:
+        """Seeds on which hyperparameters may be chosen."""
+        return TUNING_SEEDS
+
+    @property
+    def held_out_seeds(self) -> range:
+        """Seeds that a verifier draws from; see `draw_held_out_seeds`."""
+        return HELD_OUT_SEEDS
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The settings of its first variant, as on the command line."""
+        return f"{GROUP}={self.name}", *self.rungs[0]
+
+    @cached_property
+    def variants(self) -> tuple[Variant, ...]:
+        """What may be submitted: each rung as the track gives it, and then with less."""
+        return tuple(variant for rung in self.rungs for variant in self._of_rung(rung))
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """The curriculum of the first variant."""
+        return self.variants[0].curriculum
+
+    def variant_of(self, curriculum: Curriculum) -> Variant | None:
+        """Return the variant with this curriculum; None if the track has no such."""
+        return next((each for each in self.variants if each.curriculum.fingerprint == curriculum.fingerprint), None)
+
+    def draw_held_out_seeds(self, digest: str, number: int, count: int) -> tuple[int, ...]:
+        """Return different seeds that follow from a submission and a number of the verifier.
+
+        Neither the submitter, who does not know the number, nor the verifier, who does not choose the digest, can pick
+        them.
+
+        Args:
+            digest: of the submission.
+            number: of the verifier, >= 0.
+            count: how many seeds, >= 1.
+        """
+        require((is_int(number, 0), f"number must be an integer >= 0, got {number!r}"), *at_least_one(count=count))
+        drawn: dict[int, None] = {}
+        for place in range(2**20):
+            text = f"{self.id} {digest} {number} {place}"
+            value = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+            drawn[HELD_OUT_SEEDS[value % len(HELD_OUT_SEEDS)]] = None
+            if len(drawn) == count:
+                break
+        return tuple(drawn)
+
+    def _of_rung(self, rung: Sequence[str]) -> Iterator[Variant]:
+        """Yield the variants of a rung."""
+        cfg = config.composed([f"{GROUP}={self.name}", *rung], self.config_dir)
+        made = config.target(cfg, "curriculum")()
+        for less in ({}, *self.less_given):
+            own = deepcopy(cfg)
+            own.protocol.update(less)
+            settings = (*rung, *(f"protocol.{key}={value}" for key, value in less.items()))
+            yield Variant(settings, _in_words(rung), with_changes(made, own))
+
+
+def given(protocol: Protocol, blocks: int) -> str:
+    """Return in words what a learner is given to know of the tasks that it learns.
+
+    Args:
+        protocol: of the curriculum.
+        blocks: how many the curriculum has; between several there are boundaries.
+    """
+    parts = {"one_hot": ["task ids"], "at_boundaries": ["task ids at boundaries"], "hidden": []}[protocol.task_id]
+    if blocks > 1 and protocol.boundaries == "announced" and protocol.task_id != "at_boundaries":
+        parts.append("boundaries")
+    if protocol.guide_frames:
+        parts.append("first rewards")
+    return ", ".join(parts) or "nothing"
+
+
+def track(name: str, config_dir: Path | None = None) -> Track:
+    """Return a track by name.
+
+    Args:
+        name: of a file in ``conf/track``.
+        config_dir: a directory with tracks of the user, ``track/NAME.yaml``, which come first.
+
+    Raises:
+        ValueError: for an unknown name, with the one that was probably meant, and for a file that lacks a part.
+    """
+    folders = [Path(folder) for folder in (config_dir, conf_dir()) if folder is not None]
+    home = next((folder for folder in folders if name in config.names_in(folder, GROUP)), None)
+    choices = [each for folder in folders for each in config.names_in(folder, GROUP)]
+    require((home is not None, f"unknown track {name!r}: {did_you_mean(str(name), choices)}"))
+    assert home is not None
+    file = home / GROUP / f"{name}.yaml"
+    settings = yaml.safe_load(file.read_text(encoding="utf-8"))
+    about = settings.get(GROUP) or {}
+    values = swept(settings.get("hydra", {}).get("sweeper", {}).get("params", {}))
+    missing = [key for key in KEYS if key not in about]
+    require(
+        (not missing, f"{file} must say track.{', track.'.join(missing)}"),
+        ("seed" in values, f"{file} must have hydra.sweeper.params.seed, the seeds of a submission"),
+        (
+            not missing and about["score"] in METRICS,
+            f"{file}: track.score must be a metric, got {about.get('score')!r}",
+        ),
+    )
+    seeds = tuple(int(setting.partition("=")[2]) for setting in values.pop("seed"))
+    less = tuple(about.pop("less_given"))
+    rungs = tuple(product(*values.values()))
+    return Track(name, **about, seeds=seeds, rungs=rungs, less_given=less, config_dir=config_dir)
+
+
+def tracks() -> tuple[Track, ...]:
+    """Return the tracks of this package; the small one is the first."""
+    names = config.names_in(conf_dir(), GROUP)
+    return tuple(track(name) for name in sorted(names, key=lambda name: (name != "small", name)))
+
+
+def _in_words(rung: Sequence[str]) -> str:
+    """Return a rung as ``depth 2, expected length 10``."""
+    parts = (setting.rpartition(".")[2].partition("=") for setting in rung)
+    return ", ".join(value if key == "curriculum" else f"{key.replace('_', ' ')} {value}" for key, _, value in parts)
