@@ -17,9 +17,10 @@ import torch
 from ctgraph_rl.checks import is_real, positive, require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
+from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import content_of, read_plain
+from ctgraph_rl.log.saved import bits_of, content_of, read_plain
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
 
 BOUND = 1e-4
@@ -60,7 +61,7 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     """
     logs = [_log(path) for path in (one, other)]
     first = [log.measurements[0] for log in logs]
-    found = [list(map(_measured, log.measurements[1:])) for log in logs]
+    found = [list(map(without_time, log.measurements[1:])) for log in logs]
     code, verdict = _verdict(found, bound)
     weights = _weights(one, other)
     if code == EQUAL and weights.startswith("different"):
@@ -77,19 +78,6 @@ def _log(path: Path) -> RunLog:
     begins = bool(log.measurements) and log.measurements[0]["kind"] == "run"
     require((begins, f"{path / LOG} does not say what was run in its first line"))
     return log
-
-
-def _measured(line: Line) -> dict[str, Any]:
-    """Return a measurement without its time, and without where the runs of experts are."""
-    kept = {key: value for key, value in line.items() if key != "seconds"}
-    if isinstance(kept.get("experts"), list):
-        kept["experts"] = [_without_place(each) for each in kept["experts"]]
-    return kept
-
-
-def _without_place(expert: Any) -> Any:
-    """Return what the log says of an expert, but for its directory."""
-    return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
 
 
 def _verdict(found: Sequence[Sequence[Line]], bound: float) -> tuple[int, str]:
@@ -182,17 +170,12 @@ def _same(one: Any, other: Any) -> bool:
     """Return whether two plain values are equal, tensors bit by bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         alike = (one.dtype, one.shape) == (other.dtype, other.shape)
-        return alike and torch.equal(_bits(one), _bits(other))
+        return alike and torch.equal(bits_of(one), bits_of(other))
     if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
         return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return list(one) == list(other) and all(_same(one[key], other[key]) for key in one)
     return type(one) is type(other) and bool(one == other)
-
-
-def _bits(tensor: torch.Tensor) -> torch.Tensor:
-    """Return the bytes of a tensor."""
-    return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
 
 
 def _origins(one: Line, other: Line) -> list[str]:

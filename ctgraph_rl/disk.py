@@ -11,8 +11,9 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -118,6 +119,32 @@ def made_folder(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         sync_folder(folder.parent)
     return folder
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that is there whole, or not at all: it is filled beside its place and then renamed.
+
+    Args:
+        path: the folder; must not exist.
+
+    Raises:
+        FileExistsError: if something is there.
+        OSError: if it cannot be written; nothing is left.
+    """
+    if os.path.lexists(path):
+        raise FileExistsError(f"{path} exists: choose another folder, nothing is overwritten")
+    made_folder(path.absolute().parent)
+    part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.absolute().parent))
+    try:
+        yield part
+        part.chmod(0o755)
+        sync_folder(part)
+        os.rename(part, path)
+        sync_folder(path.absolute().parent)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
 
 
 def require_no_link(path: Path) -> None:

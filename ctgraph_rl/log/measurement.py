@@ -106,6 +106,19 @@ def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
     require((highest <= most, rule))
 
 
+def without_time(measurement: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a measurement without its time, and without the directories of experts: equal in equal runs."""
+    kept = {key: value for key, value in measurement.items() if key != "seconds"}
+    if isinstance(kept.get("experts"), list):
+        kept["experts"] = [_without_place(each) for each in kept["experts"]]
+    return kept
+
+
+def _without_place(expert: Any) -> Any:
+    """Return what the log says of an expert, but for its directory."""
+    return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
+
+
 def _numbers(measurement: Mapping[str, Any]) -> Iterator[int]:
     """Yield the numbers of blocks and tasks."""
     yield from (measurement[name] for name in ("block", "task") if name in measurement)

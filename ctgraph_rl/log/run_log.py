@@ -148,8 +148,12 @@ class RunLog:
             ValueError: for any other line that is no measurement, for a newer schema, for what is no regular file of at
                 most `MOST_BYTES`, and for numbers of blocks and tasks that a file of its size cannot measure.
         """
+        return cls.of_content(read_regular(as_path("path", path), MOST_BYTES), path)
+
+    @classmethod
+    def of_content(cls, content: bytes, path: Path | str) -> RunLog:
+        """Return the log whose file has this content; see `read`. Errors name ``path``."""
         log = cls()
-        content = read_regular(as_path("path", path), MOST_BYTES)
         lines, log._num_bytes = content.splitlines(), len(content)
         most = FEW + len(content) // BYTES_OF_A_NUMBER
         for number, line in enumerate(lines, 1):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickletools
 import re
 import struct
 import zipfile
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,47 @@ def _require_small(value: Any, num_bytes: int) -> None:
         (count <= num_bytes, f"has more parts than its {num_bytes:,} bytes, as some stand in many places"),
         (total <= most, f"has tensors of {total:,} bytes, the limit is {most:,}"),
     )
+
+
+def sum_of_state(state: Any) -> str:
+    """Return the SHA-256 of tensors and plain values: names, types, shapes and bits, in the order of their names.
+
+    It does not depend on how a version of `torch.save` writes them.
+    """
+    found = hashlib.sha256()
+    for name, value in sorted(_leaves(state), key=itemgetter(0)):
+        found.update(f"{name}\n{_described(value)}\n".encode("utf-8", "backslashreplace"))
+        if isinstance(value, torch.Tensor):
+            found.update(bits_of(value).numpy().tobytes())
+    return found.hexdigest()
+
+
+def num_bytes_of(state: Any) -> int:
+    """Return the bytes of all tensors of a state."""
+    return sum(value.nbytes for _, value in _leaves(state) if isinstance(value, torch.Tensor))
+
+
+def bits_of(tensor: torch.Tensor) -> torch.Tensor:
+    """Return the bytes of a tensor, uint8 [bytes], on the CPU."""
+    return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the tensors, plain values and empty parts within a value, each by its place."""
+    if isinstance(value, Mapping) and value:
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}/{key!r}")
+    elif isinstance(value, (list, tuple)) and value:
+        for number, item in enumerate(value):
+            yield from _leaves(item, f"{name}[{number}]")
+    else:
+        yield name, value
+
+
+def _described(value: Any) -> str:
+    """Return type and shape of a tensor, and a plain value with its type."""
+    is_tensor = isinstance(value, torch.Tensor)
+    return f"{value.dtype} {list(value.shape)}" if is_tensor else f"{type(value).__name__} {value!r}"
 
 
 def require_records(content: bytes) -> None:

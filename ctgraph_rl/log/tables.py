@@ -14,7 +14,7 @@ and in one, ``pandas.read_csv("evaluations.csv")`` or ``pandas.read_parquet("eva
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +88,31 @@ def write_tables(log: RunLog, folder: Path | str, parquet: bool | None = None) -
         arrow = None if parquet is False else _pyarrow(needed=parquet is True)
         if arrow is not None:
             written.append(Path(folder) / f"{name}.parquet")
-            _write_parquet(arrow, written[-1], types, rows)
+            write_whole(written[-1], _parquet(arrow, types, rows))
     return written
+
+
+def evaluations_parquet(logs: Iterable[RunLog]) -> bytes:
+    """Return the content of a Parquet file with the evaluations of several runs, in their order.
+
+    Raises:
+        ModuleNotFoundError: without pyarrow; names the extra to install.
+        ValueError: for more columns than a table may have.
+    """
+    arrow, logs = _pyarrow(needed=True), list(logs)
+    types: dict[str, str] = {}
+    for log in logs:
+        types |= _types(log, "evaluation", EVALUATIONS)
+    return _parquet(arrow, types, [row for log in logs for row in _rows(log, "evaluation", list(types))])
+
+
+def require_parquet() -> None:
+    """Refuse work that needs pyarrow where it is not installed.
+
+    Raises:
+        ModuleNotFoundError: names the extra to install.
+    """
+    _pyarrow(needed=True)
 
 
 def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[str, str]:
@@ -109,7 +132,8 @@ def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
         yield [row.get(name) for name in names]
 
 
-def _write_parquet(arrow: Any, path: Path, types: dict[str, str], rows: Sequence[Sequence[Any]]) -> None:
+def _parquet(arrow: Any, types: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> bytes:
+    """Return the content of a Parquet file."""
     from pyarrow import parquet
 
     schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])
@@ -117,7 +141,7 @@ def _write_parquet(arrow: Any, path: Path, types: dict[str, str], rows: Sequence
     values = [[utf8_text(value) for value in column] for column in columns]
     buffer = io.BytesIO()
     parquet.write_table(arrow.table(values, schema=schema), buffer)
-    write_whole(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _pyarrow(needed: bool) -> Any:

@@ -225,10 +225,7 @@ class Recorder:
     @property
     def moments(self) -> tuple[int, ...]:
         """All numbers of frames after which the protocol wants an evaluation."""
-        how = self.curriculum.evaluation
-        within = range(how.every, self.curriculum.num_frames + 1, how.every) if how.every else ()
-        candidates = sorted({0, *self.curriculum.ends, *within})
-        return tuple(frames for frames in candidates if self.curriculum.moment(frames) is not None)
+        return self.curriculum.moments
 
     def evaluate(
         self, policy: Any = None, frames: int = 0, policy_for: Callable[[int], Any] | None = None

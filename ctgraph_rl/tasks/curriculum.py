@@ -144,6 +144,13 @@ class Curriculum:
         return "during" if within else None
 
     @property
+    def moments(self) -> tuple[int, ...]:
+        """All numbers of frames after which an evaluation is due."""
+        every = self.evaluation.every
+        within = range(every, self.num_frames + 1, every) if every else ()
+        return tuple(frames for frames in sorted({0, *self.ends, *within}) if self.moment(frames) is not None)
+
+    @property
     def segments(self) -> tuple[tuple[Block, ...], ...]:
         """The blocks between two announced boundaries: each alone, or all of them where boundaries are hidden."""
         announced = self.protocol.boundaries == "announced"

@@ -1,0 +1,213 @@
+"""``method.yaml``: what the author of a method says about it, and what its runs say themselves."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctgraph_rl.checks import did_you_mean, is_int, is_real, is_shallow, require
+from ctgraph_rl.disk import read_regular
+from ctgraph_rl.tasks.protocol import Protocol
+
+TEMPLATE = """\
+# About a method, for ctgraph-rl submit RUNS --method method.yaml --to DIR. null: not known, or taken from the runs.
+name: My method             # the name that a board shows
+track: null                 # the track of the submission, such as small; --track names it, too
+authors: [First Author, Second Author]
+paper: null                 # the address of a paper, or null
+code:
+  repository: https://example.org/repository  # where the source of the learner is
+  commit: null              # the commit that was run, 7 to 40 hexadecimal digits
+  licence: MIT              # its licence, by SPDX identifier
+entry_point: null           # module:function that trains one seed, for learners that a Recorder measured; else null
+given:                      # the information that the learner is given; null: as the runs say
+  boundaries: null          # announced or hidden
+  task_id: null             # hidden, one_hot or at_boundaries
+  guide_frames: null        # frames of a block over which a policy that navigates acts in the learner's place
+bytes_per_task: 0           # bytes that the learner keeps for each further task; 0 for weights of a constant size alone
+tuning:
+  how: not tuned            # how settings were chosen, and over which values
+  seeds: []                 # the seeds of the runs by which they were chosen; none of them may be submitted
+compute:
+  hardware: null            # such as 1 core of an AMD EPYC 9654; null: as the runs say
+  hours: null               # of the submitted runs, on this hardware; null: as the runs say
+  tuning_hours: null        # of the runs by which settings were chosen
+failed: {}                  # seeds of runs without results, each with the reason, such as {3: out of memory}
+"""
+"""A ``method.yaml`` to fill in, with a comment on every line."""
+
+MOST_BYTES = 2**16
+"""Largest ``method.yaml`` that is read."""
+
+MAX_NESTING = 4
+
+EXAMPLE: Mapping[str, Any] = yaml.safe_load(TEMPLATE)
+
+ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+COMMIT = re.compile(r"[0-9a-f]{7,40}")
+HOURS_APART, SHARE_APART = 0.01, 0.05
+"""How far the hours of a ``method.yaml`` may be from those of the logs."""
+
+ADDRESS = re.compile(r"https?://\S+")
+
+
+def read_method(path: Path) -> dict[str, Any]:
+    """Read a ``method.yaml``.
+
+    Raises:
+        ValueError: for what is no YAML, a missing or unknown key, and values out of range; names all of them.
+        OSError: if it cannot be read.
+    """
+    try:
+        method = yaml.safe_load(read_regular(path, MOST_BYTES))
+    except (yaml.YAMLError, RecursionError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} must be YAML: {' '.join(str(error).split())}") from None
+    try:
+        check_method(method)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return dict(method)
+
+
+def check_method(method: Any) -> None:
+    """Refuse what does not describe a method.
+
+    Raises:
+        ValueError: for a missing or unknown key, and values out of range; names all of them.
+    """
+    plain = isinstance(method, Mapping) and is_shallow(method, MAX_NESTING)
+    fix = "ctgraph-rl submit --template prints one to fill in"
+    require((plain, f"it must hold name, authors and so on, got {method!r:.80}; {fix}"))
+    require(*_key_rules(method, EXAMPLE, ""))
+    require(*_rules(method))
+
+
+def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str) -> list[tuple[bool, str]]:
+    """Return the rules that an object has the keys of another one, and so have its parts."""
+    rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
+    rules += [(key in example, f"unknown key {prefix}{key}: {did_you_mean(str(key), example)}") for key in given]
+    for key, part in example.items():
+        if isinstance(part, Mapping) and part and key in given:
+            is_part = isinstance(given[key], Mapping)
+            rules.append((is_part, f"{key} must have {', '.join(part)}, got {given[key]!r:.80}"))
+            rules += _key_rules(given[key], part, f"{key}.") if is_part else []
+    return rules
+
+
+def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
+    """Return the rules for the values of an object with the right keys."""
+    code, tuning, compute = (method[key] for key in ("code", "tuning", "compute"))
+    authors, failed = method["authors"], method["failed"]
+    listed = isinstance(authors, list) and bool(authors) and all(map(_is_text, authors))
+    reasons = isinstance(failed, Mapping) and all(is_int(seed, 0) and _is_text(why) for seed, why in failed.items())
+    seeds = tuning["seeds"]
+    whole = isinstance(seeds, list) and all(is_int(seed, 0) for seed in seeds)
+    repository, commit, given = code["repository"], code["commit"], method["given"]
+    return [
+        *(_text_rule(name, value) for name, value in (("name", method["name"]), ("code.licence", code["licence"]))),
+        *(_text_rule(f"given.{key}", given[key], or_null=True) for key in ("boundaries", "task_id")),
+        *(_text_rule(key, method[key], or_null=True) for key in ("track", "paper")),
+        _text_rule("tuning.how", tuning["how"]),
+        _text_rule("compute.hardware", compute["hardware"], or_null=True),
+        (listed, f"authors must be a list of names, got {authors!r:.80}"),
+        (_matches(ADDRESS, repository), f"code.repository must be an address, got {repository!r:.80}"),
+        (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, got {commit!r:.80}"),
+        _entry_rule(method["entry_point"]),
+        _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
+        _count_rule("bytes_per_task", method["bytes_per_task"]),
+        (whole, f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),
+        *(_hours_rule(key, compute[key]) for key in ("hours", "tuning_hours")),
+        (reasons, f"failed must have a reason for each seed, such as {{3: out of memory}}, got {failed!r:.80}"),
+    ]
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _matches(pattern: re.Pattern[str], value: object) -> bool:
+    return isinstance(value, str) and pattern.fullmatch(value) is not None
+
+
+def _text_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, str]:
+    choice = "a text or null" if or_null else "a text"
+    return _is_text(value) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
+
+
+def _entry_rule(value: object) -> tuple[bool, str]:
+    fits = value is None or _matches(ENTRY_POINT, value)
+    return fits, f"entry_point must be module:function, such as my_learner:train, got {value!r:.80}"
+
+
+def _count_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, str]:
+    choice = "an integer >= 0 or null" if or_null else "an integer >= 0"
+    return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
+
+
+def _hours_rule(key: str, value: object) -> tuple[bool, str]:
+    return value is None or is_real(value, 0), f"compute.{key} must be a number >= 0 or null, got {value!r:.80}"
+
+
+def completed(method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a method with what is null in it as the runs say it.
+
+    Args:
+        method: what a ``method.yaml`` holds.
+        facts: what the runs say, as `facts_of` returns it.
+    """
+    filled = {
+        part: {key: known.get(key) if value is None else value for key, value in method[part].items()}
+        for part, known in facts.items()
+    }
+    return {**method, **filled}
+
+
+def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """Return what the runs of a submission say of the method themselves.
+
+    Args:
+        protocol: of what they learned.
+        runs: lines of ``runs.csv``.
+    """
+    given = {key: getattr(protocol, key) for key in EXAMPLE["given"]}
+    shared: dict[Any, float] = {}
+    for run in runs:
+        key = run.group or run.seed
+        shared[key] = max(shared.get(key, 0.0), run.seconds)
+    machines = dict.fromkeys(f"{run.cpu or run.machine}, threads: {run.num_threads}" for run in runs)
+    hours = round(math.fsum(shared.values()) / 3600, 4)
+    return {"given": given, "compute": {"hardware": "; ".join(machines), "hours": hours}}
+
+
+def fact_rules(
+    method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]], runs: Sequence[Any], num_tasks: int
+) -> list[tuple[bool, str]]:
+    """Return the rules that a method does not contradict its runs; what is null in it contradicts nothing.
+
+    Args:
+        method: what a ``method.yaml`` holds.
+        facts: what the runs say.
+        runs: lines of ``runs.csv``.
+        num_tasks: of the curriculum.
+    """
+    said, hours = method["given"], method["compute"]["hours"]
+    pairs = [(key, said[key], value) for key, value in facts["given"].items() if said[key] is not None]
+    logged = facts["compute"]["hours"]
+    near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
+    kept, largest = method["bytes_per_task"] * (num_tasks - 1), max((run.agent_bytes or 0 for run in runs), default=0)
+    fits = not largest or kept <= largest
+    all_kept, further = f"{kept:,} bytes for {num_tasks - 1} further tasks", method["bytes_per_task"]
+    less = f"bytes_per_task is {further}, {all_kept}, the agents of the runs have {largest:,} bytes in all: correct it"
+    return [
+        *(
+            (value == known, f"given.{key} is {value!r}, the runs were given {known!r}: write null, or that")
+            for key, value, known in pairs
+        ),
+        (near, f"compute.hours is {hours}, the logs of the runs have {logged}: write null, or that"),
+        (fits, less),
+    ]

@@ -1,0 +1,316 @@
+"""Level *rescored* of a verification: what a submission says is what its own logs give.
+
+All metrics and evaluations are computed again from the logs and compared, digit by digit on one kind of machine. It
+runs no code of the submission. What the logs say may still be made up: a rerun finds that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.board.method import fact_rules, facts_of
+from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, seed_rules
+from ctgraph_rl.board.submission import (
+    CONFIG,
+    EVALUATIONS,
+    METHOD,
+    METRIC_COLUMNS,
+    METRICS,
+    RUNS,
+    VERIFICATION,
+    VERSIONS,
+    Submission,
+    SubmittedRun,
+    log_sum,
+    read_submission,
+)
+from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.disk import read_regular, write_whole
+from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.log.escape import csv_text, terminal_text
+from ctgraph_rl.log.provenance import machine, versions
+from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
+from ctgraph_rl.metrics import Metric
+from ctgraph_rl.portable import cpu_model
+from ctgraph_rl.runs.settings import differences
+
+RESCORED, NONE = "rescored", "none"
+
+SCHEMA = 1
+"""Of ``verification.json``."""
+
+ROUNDING = 1e-9
+"""Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
+
+
+NO_ROW: Mapping[str, Any] = {}
+
+
+class Check(NamedTuple):
+    """One thing that was compared."""
+
+    what: str
+    expected: str
+    found: str
+    passed: bool | None  # None: it could not be decided
+    run: str = ""
+    note: str = ""
+    level: str = RESCORED
+
+    @property
+    def text(self) -> str:
+        """The check as a line."""
+        where = f"{self.run}: " if self.run else ""
+        note = f" ({self.note})" if self.note else ""
+        return f"{where}{self.what}: expected {self.expected}, found {self.found}{note}"
+
+
+def equal(what: str, expected: object, found: object, run: str = "", note: str = "") -> Check:
+    """Return the check that two values are equal."""
+    return Check(what, str(expected), str(found), expected == found, run=run, note=note)
+
+
+def rescore(submission: Submission) -> list[Check]:
+    """Check what a submission says by its own files.
+
+    Raises:
+        ModuleNotFoundError: without pyarrow; names the extra to install.
+        ValueError: for files that cannot be read.
+        OSError: if a file cannot be read.
+    """
+    require_parquet()
+    checks = [*_of_the_whole(submission)]
+    logs = {run: submission.log(run) for run in submission.runs}
+    for run, log in logs.items():
+        checks += _of_the_log(submission, run, log)
+    finished = {run: log for run, log in logs.items() if run.finished}
+    checks += _of_metrics(submission, finished)
+    return checks + _of_evaluations(submission, list(finished.values()))
+
+
+def _of_the_whole(submission: Submission) -> Iterator[Check]:
+    """Yield checks of curriculum, seeds and method."""
+    method, runs, of_track = submission.method, submission.runs, submission.track
+    named = None if of_track is None else of_track.name
+    yield equal("track", method["track"], named)
+    yield _rules("curriculum", [curriculum_rule(submission.curriculum, of_track)], submission.curriculum.fingerprint)
+    seeds = [run.seed for run in runs]
+    yield _rules("seeds", seed_rules(seeds, method["tuning"]["seeds"], of_track), ", ".join(map(str, seeds)))
+    yield _rules("entry point", [entry_rule(submission.config, method["entry_point"])], str(method["entry_point"]))
+    facts = facts_of(submission.curriculum.protocol, runs)
+    rules = fact_rules(method, facts, runs, len(submission.curriculum.tasks))
+    yield _rules(METHOD, rules, "what the runs say")
+    failed = [run.seed for run in runs if not run.finished]
+    yield equal(f"failed seeds of {METHOD}", sorted(method["failed"]), failed)
+
+
+def _rules(what: str, rules: Sequence[tuple[bool, str]], found: str) -> Check:
+    """Return a check of rules, with the messages of those that are broken."""
+    broken = "; ".join(message for holds, message in rules if not holds)
+    return Check(what, "as the rules say", found, not broken, note=broken)
+
+
+def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
+    """Yield checks of a log against what the other files say of its run."""
+    yield equal("sum of the log", run.log_sha256, log_sum(log), run.run)
+    about = (log.of_kind("run") or [{}])[0]
+    config = dict(about.get("config") or {})
+    yield equal("seed", run.seed, config.pop("seed", None), run.run)
+    changed = differences(config, submission.config)
+    yield Check(CONFIG, "equal settings", listed(changed) or "equal settings", not changed, run.run)
+    yield equal(VERSIONS, dict(submission.versions), about.get("versions"), run.run)
+    yield equal("curriculum of the log", submission.curriculum.fingerprint, about.get("fingerprint"), run.run)
+    yield equal(f"curriculum of {RUNS}", submission.curriculum.fingerprint, run.fingerprint, run.run)
+    yield equal("group", run.group, tuple(about.get("together") or ()), run.run)
+    stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
+    yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
+    if run.finished:
+        yield from _of_the_protocol(submission, run, log)
+
+
+def _of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
+    """Yield checks that a log has the evaluations of the protocol, and frames to the end of the curriculum."""
+    curriculum, how = submission.curriculum, submission.curriculum.evaluation
+    yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)
+    tasks_at = Evaluator(curriculum, run.seed, log).tasks_at
+    wanted = [(at, number, how.num_episodes) for at in curriculum.moments for number, _ in tasks_at(at).values()]
+    there = [(m["frames"], m["task"], m.get("episodes")) for m in log.of_kind("evaluation")]
+    missing, more = sorted({*wanted} - {*there}), sorted({*there} - {*wanted}, key=str)
+    sides: dict[str, list[Any]] = {"missing": missing, "more": more}
+    notes = [f"{what} (frames, task, episodes): {listed(some)}" for what, some in sides.items() if some]
+    same = wanted == there
+    yield Check("evaluations", str(len(wanted)), str(len(there)), same, run.run, note="; ".join(notes))
+
+
+def metrics_text(found: Mapping[SubmittedRun, Mapping[str, Metric]]) -> str:
+    """Return the content of ``metrics.csv``."""
+    rows = [cells for run, metrics in found.items() for cells in _metric_cells(run, metrics).values()]
+    return csv_text([list(METRIC_COLUMNS), *rows])
+
+
+def _metric_cells(run: SubmittedRun, metrics: Mapping[str, Metric]) -> dict[str, list[str]]:
+    """Return the cells of the lines of a run in ``metrics.csv``, by metric."""
+    return {
+        name: [
+            *(run.run, str(run.seed), name),
+            *("" if metric.value is None else repr(metric.value), metric.definition, metric.undefined or ""),
+        ]
+        for name, metric in metrics.items()
+    }
+
+
+def near(one: object, other: object) -> bool:
+    """Return whether two values are equal up to the rounding of another machine."""
+    if not (is_real(one) and is_real(other)):
+        return one == other
+    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=ROUNDING)  # type: ignore[arg-type]
+
+
+def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> list[Check]:
+    """Return the checks of ``metrics.csv``: one for each difference, or one for all."""
+    same_kind = submission.scored_on == machine()["machine"]
+    wrong, count = [], 0
+    runs = {run.run for run in logs}
+    more, rule = sorted(set(submission.metrics) - runs), "no finished run has this name"
+    if more:
+        wrong.append(Check(METRICS, "metrics of finished runs", listed(more), False, note=rule))
+    for run, log in logs.items():
+        cells = _metric_cells(run, scores(log, submission.curriculum, submission.experts(run)))
+        stated = {name: list(row.values()) for name, row in submission.metrics.get(run.run, {}).items()}
+        for name in {**cells, **stated}:
+            count += 1
+            check = _of_metric(run.run, name, cells.get(name), stated.get(name), same_kind)
+            wrong += [] if check is None else [check]
+    return wrong or [equal(METRICS, f"{count} values", f"{count} values")]
+
+
+def _of_metric(
+    run: str, name: str, cells: Sequence[str] | None, stated: Sequence[str] | None, same_kind: bool
+) -> Check | None:
+    """Return the check of a metric that is not what its log gives; None for one that is."""
+    if cells == stated:
+        return None
+    what = f"{name} in {METRICS}"
+    if cells is None or stated is None:
+        return Check(what, _value(cells), _value(stated), False, run)
+    rounded = not same_kind and cells[4:] == stated[4:] and near(_number(cells[3]), _number(stated[3]))
+    if rounded:
+        return None
+    pairs = [pair for pair in zip(cells, stated, strict=True) if pair[0] != pair[1]]
+    expected, found = (", ".join(cell or "nothing" for cell in side) for side in zip(*pairs, strict=True))
+    return Check(what, expected, found, False, run)
+
+
+def _value(cells: Sequence[str] | None) -> str:
+    return "no line" if cells is None else cells[3] or "undefined"
+
+
+def _number(cell: str) -> object:
+    """Return a cell as a number, or as it is."""
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Check]:
+    """Return the checks of ``evaluations.parquet``: one for each row that differs, or one for all."""
+    expected = _table(evaluations_parquet(logs))
+    try:
+        found = _table(read_regular(submission.path / EVALUATIONS, MOST_BYTES), len(expected))
+    except ValueError as error:
+        return [Check(EVALUATIONS, f"{len(expected)} rows", "a file that cannot be read", False, note=str(error))]
+    pairs = enumerate(zip_longest(expected, found, fillvalue=NO_ROW), 1)
+    differing = [(f"row {number} of {EVALUATIONS}", pair) for number, pair in pairs if pair[0] != pair[1]]
+    wrong = [Check(what, *_differing(*pair), False) for what, pair in differing]
+    return wrong or [equal(EVALUATIONS, f"{len(expected)} rows", f"{len(expected)} rows")]
+
+
+def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str]:
+    """Return in words what two rows have where they differ."""
+    if not one or not other:
+        return ("a row" if one else "no row"), ("a row" if other else "no row")
+    names = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    first, second = (listed(f"{name}={row.get(name)}" for name in names) for row in (one, other))
+    return first, second
+
+
+def _table(content: bytes, most: int | None = None) -> list[dict[str, Any]]:
+    """Return the rows of a Parquet file.
+
+    Raises:
+        ValueError: for what is none, and for more rows than it should have.
+    """
+    from pyarrow import ArrowException, BufferReader, parquet
+
+    try:
+        file = parquet.ParquetFile(BufferReader(content))
+        rows = file.metadata.num_rows
+        require((most is None or rows <= most, f"it has {rows:,} rows, the logs give {most}"))
+        return file.read().to_pylist()
+    except (ArrowException, OSError) as error:
+        raise ValueError(str(error)) from None
+
+
+def level_of(checks: Sequence[Check]) -> str:
+    """Return the level that checks have reached."""
+    return RESCORED if all(check.passed for check in checks) else NONE
+
+
+def write_verification(submission: Submission, checks: Sequence[Check]) -> Path:
+    """Write ``verification.json`` into the folder of a submission; an earlier one is replaced."""
+    content = {
+        "schema": SCHEMA,
+        "level": level_of(checks),
+        "digest": submission.digest,
+        "number": None,
+        "cells": [],
+        "checks": [check._asdict() for check in checks],
+        **machine(),
+        "cpu": cpu_model(),
+        "versions": versions(),
+    }
+    path = submission.path / VERIFICATION
+    write_whole(path, json.dumps(content, indent=2) + "\n")
+    return path
+
+
+def main() -> None:
+    """Verify a submission by its own files; the exit code is 1 if something differs."""
+    parser = argparse.ArgumentParser(prog="ctgraph-rl verify", description=__doc__)
+    parser.add_argument("submission", type=Path, metavar="DIR", help="the folder of a submission")
+    parser.add_argument(
+        "--level", choices=(RESCORED,), default=RESCORED, help="how far to verify (default: %(default)s)"
+    )
+    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
+    arguments = parser.parse_args()
+    with refused_by(parser):
+        submission = read_submission(arguments.submission, config_dir=arguments.config_dir)
+        checks = rescore(submission)
+        path = write_verification(submission, checks)
+    print(report(submission, checks))
+    print(f"verification: {terminal_text(path)}")
+    if level_of(checks) == NONE:
+        sys.exit(1)
+
+
+def report(submission: Submission, checks: Sequence[Check]) -> str:
+    """Return in words what a verification found."""
+    wrong = [check.text for check in checks if not check.passed]
+    about = f"{submission.method['name']}: {len(checks)} checks of {len(submission.runs)} runs"
+    verdict = f"{len(wrong)} failed" if wrong else "all passed: its numbers are what its logs give"
+    return "\n".join(map(terminal_text, [f"{about}, {verdict}", *(f"- {line}" for line in wrong)]))
+
+
+if __name__ == "__main__":
+    main()

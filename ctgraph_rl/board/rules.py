@@ -1,0 +1,153 @@
+"""What a submission must hold to: rules over its runs, its curriculum and what is said of the method.
+
+A rule is a pair of (holds, message), for `ctgraph_rl.checks.require`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ctgraph_rl.board.tracks import Track
+from ctgraph_rl.log.damage import damaged
+from ctgraph_rl.log.provenance import NUMBERS, code_changes
+from ctgraph_rl.log.sources import SCRIPTS, sources_of
+from ctgraph_rl.packages import is_published
+from ctgraph_rl.runs.read import MODIFIED, Run
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+Rule = tuple[bool, str]
+
+MOST_SHOWN = 3
+"""Of things that a message lists."""
+
+
+def listed(values: Iterable[Any]) -> str:
+    """Return the first of some values for a message, and how many more there are."""
+    texts = [str(value) for value in values]
+    more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
+    return ", ".join(texts[:MOST_SHOWN]) + more
+
+
+def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
+    """Return the rule that a curriculum is one of a track, or without a track the published one of its name."""
+    name, found = curriculum.name.removesuffix(MODIFIED), curriculum.fingerprint
+    if of_track is not None:
+        wanted = ", ".join(each.curriculum.fingerprint for each in of_track.variants)
+        is_there = of_track.variant_of(curriculum) is not None
+        return is_there, (
+            f"curriculum {name} has fingerprint {found}, track {of_track.id} has {wanted}: "
+            f"run ctgraph-rl -m track={of_track.name}, with no other curriculum, protocol or evaluation"
+        )
+    published = is_published(replace(curriculum, name=name))
+    if published is None:
+        return False, f"no published curriculum is named {name}: run a published one, or name a track that has it"
+    fix = "run it without changes, or name a track that has it"
+    return published, f"curriculum {name} (fingerprint {found}) is not the published one, it was modified: {fix}"
+
+
+def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | None) -> list[Rule]:
+    """Return the rules that the seeds are those of the track, and that none was used for tuning.
+
+    Args:
+        seeds: of the runs.
+        tuned: seeds that the method says it was tuned on.
+        of_track: the track; None: any seeds that were not used for tuning.
+    """
+    own = set(seeds)
+    used = own & set(tuned)
+    rules = [(not used, f"seeds {listed(sorted(used))} are among tuning.seeds: submit runs of other seeds")]
+    if of_track is None:
+        return rules
+    wanted, reserved = set(of_track.seeds), own & set(of_track.tuning_seeds)
+    missing, others = wanted - own, own - wanted - reserved
+    asked = f"track {of_track.id} has seeds {_ranges(wanted)}"
+    return [
+        *rules,
+        (not missing, f"seeds {listed(sorted(missing))} are missing: {asked}"),
+        (not reserved, f"seeds {listed(sorted(reserved))} are for tuning: {asked}"),
+        (not others, f"seeds {listed(sorted(others))} are of no submission: {asked}"),
+    ]
+
+
+def _ranges(seeds: Iterable[int]) -> str:
+    """Return seeds in words, such as ``0..9``."""
+    ordered = sorted(seeds)
+    whole = len(ordered) > 2 and ordered == list(range(ordered[0], ordered[-1] + 1))
+    return f"{ordered[0]}..{ordered[-1]}" if whole else ", ".join(map(str, ordered))
+
+
+def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
+    """Yield the rules that all runs are of one configuration, one curriculum and one code."""
+    nameless = [run.path for run in runs if run.agent is None]
+    fix = 'give Recorder(about={"learner": ...})'
+    yield not nameless, f"{listed(nameless)} do not name their learner: {fix}"
+    curricula = {f"{run.curriculum[0]} (fingerprint {run.curriculum[1]})" for run in runs}
+    yield len(curricula) == 1, f"runs are of several curricula, {listed(sorted(curricula))}: submit those of one"
+    settings = dict.fromkeys(key for run in runs for key in run.settings) if not nameless else ()
+    several = {key: _values(run.settings.get(key) for run in runs) for key in settings}
+    differing = [f"{key}={' and '.join(values)}" for key, values in several.items() if len(values) > 1]
+    yield not differing, f"runs are of several configurations, {listed(differing)}: submit those of one"
+    names = dict.fromkeys(name for run in runs for name in run.code)
+    mixed = [name for name in names if len(_values(run.code.get(name, "") for run in runs)) > 1]
+    yield not mixed, f"runs are of different code, {listed(mixed)} differs between them: run all with one"
+    versions = {name: _values((run.about.get("versions") or {}).get(name) for run in runs) for name in _packages(runs)}
+    other = [f"{name} {' and '.join(values)}" for name, values in versions.items() if len(values) > 1]
+    yield not other, f"runs are of different versions, {listed(other)}: run all with one"
+
+
+def _values(values: Iterable[Any]) -> list[str]:
+    """Return different values as texts, in order."""
+    return list(dict.fromkeys(json.dumps(value, sort_keys=True).strip('"') for value in values))
+
+
+def _packages(runs: Sequence[Run]) -> list[str]:
+    """Return the packages whose versions runs store."""
+    return list(dict.fromkeys(name for run in runs for name in run.about.get("versions") or {}))
+
+
+def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
+    """Yield the rules that the code of all runs is known, and that it has not changed since."""
+    unknown = [run.path for run in runs if any(value is None for value in run.code.values())]
+    unsaid = [run.path for run in runs if run.about.get("sources") is None and run.path not in unknown]
+    fix = "run again from files, and with Recorder(code=[MyLearner])"
+    yield not unknown + unsaid, f"{listed(unknown + unsaid)} do not say of which source they are: {fix}"
+    changed = dict.fromkeys(name for run in runs for name in code_changes(run.about, _code_now(run.about)))
+    yield not changed, f"the code has changed since the runs, {listed(changed)}: run again, or submit with that code"
+
+
+def _code_now(about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
+    stored = about.get("sources") or {}
+    found = sources_of(name for name in stored if name not in SCRIPTS)
+    sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None
+    return {"fingerprint": about["fingerprint"], "numbers": NUMBERS, "sources": sources}
+
+
+def failure_rules(runs: Sequence[Run], reasons: Mapping[int, str]) -> Iterator[Rule]:
+    """Yield the rules that every run is finished and whole, or accounted for.
+
+    Args:
+        runs: the runs.
+        reasons: why runs failed or were stopped, by seed.
+    """
+    for run in runs:
+        known, fix = run.seed in reasons, f"finish it, or account for it: failed: {{{run.seed}: why}} in method.yaml"
+        if run.reason is not None:
+            yield known, f"{run.path} has no results ({run.reason}): {fix}"
+            continue
+        yield not known, f"failed has seed {run.seed}, but {run.path} is finished: remove the seed from failed"
+        lost = damaged(run.path)
+        yield not lost, f"{run.path} has files that are not as they were written, {listed(lost)}: run it again"
+    without = sorted(set(reasons) - {run.seed for run in runs})
+    yield not without, f"failed has seeds {listed(without)}, of which there is no run: give their directories, too"
+
+
+def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
+    """Return the rule that there is a way to run a configuration again."""
+    agent = config.get("agent")
+    is_built = isinstance(agent, Mapping) and "_target_" in agent
+    fix = "set entry_point: module:function in method.yaml, a function (curriculum, seed, run_dir) that trains a run"
+    return is_built or entry_point is not None, f"no agent can be built from the configuration of the runs: {fix}"

@@ -1,0 +1,400 @@
+"""A submission: a folder of files by which anybody can check what a method reached.
+
+- ``method.yaml``: about the method, see `ctgraph_rl.board.method`.
+- ``config.yaml``: the configuration that all runs share, without the seed; ``versions.txt``: the versions that computed
+  them, and the kind of machine that computed the metrics; ``curriculum.json``: what they learned.
+- ``runs.csv``: a line for each seed, with the columns `COLUMNS`.
+- ``logs/RUN.jsonl.gz``: the log of each run; ``logs/RUN.expert_K.jsonl.gz``: of its single-task expert of task K.
+- ``evaluations.parquet`` and ``metrics.csv``: what the logs give.
+- ``verification.json``: what a verification found; not part of what was submitted.
+
+No code of the folder is ever run when it is read.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import hashlib
+import io
+import json
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctgraph_rl.board.method import read_method
+from ctgraph_rl.board.tracks import Track, track
+from ctgraph_rl.checks import is_int, is_shallow, require
+from ctgraph_rl.disk import read_regular
+from ctgraph_rl.log.escape import csv_text, from_csv
+from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.log.measurement import without_time
+from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
+from ctgraph_rl.runs.settings import as_before
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+METHOD, CONFIG, VERSIONS, RUNS, LOGS = "method.yaml", "config.yaml", "versions.txt", "runs.csv", "logs"
+EVALUATIONS, METRICS = "evaluations.parquet", "metrics.csv"
+
+FILES = (METHOD, CONFIG, VERSIONS, CURRICULUM, RUNS, EVALUATIONS, METRICS)
+"""Files of a submission beside its logs."""
+
+VERIFICATION = "verification.json"
+"""The file that a verification writes."""
+
+MOST_BYTES_OF_A_FILE = 2**28
+"""Largest file but the logs that is read: 256 MiB."""
+
+MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**20, 16
+
+MOST_RUNS = 10_000
+
+MACHINE = "machine"
+
+NO_PACKAGES = ("python", MACHINE)
+"""Names in ``versions.txt`` that pip does not know."""
+
+FINISHED, FAILED = "finished", "failed"
+
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
+"""Names of runs, which are names of files."""
+
+SUM = re.compile(r"[0-9a-f]{64}")
+
+NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source")
+"""Fields of a log's first line that its sum leaves out; the fingerprint stands for what the source describes."""
+
+COLUMNS = {
+    "run": "name of the run, and of its log in `logs/`",
+    "seed": "its seed",
+    "curriculum": "name of the curriculum",
+    "fingerprint": "what the curriculum is, in 16 digits",
+    "state": "`finished`, or `failed` for a run that failed or was stopped and that `method.yaml` accounts for",
+    "reason": "why it failed; empty for a finished run",
+    "group": "seeds that were trained together as one batch, separated by spaces; empty for a run that was alone",
+    "agent_sha256": "SHA-256 of the agent's state: names, types, shapes and bits; empty where a run left none",
+    "agent_bytes": "bytes of all tensors of that state",
+    "log_sha256": "SHA-256 of the log without times, versions and machine",
+    "machine": "kind of machine that it ran on",
+    "num_threads": "threads of torch",
+    "cpu": "model of the CPU; empty where the system does not say",
+    "seconds": "time of the run; runs of one group share it",
+}
+"""Columns of ``runs.csv`` with their meaning."""
+
+METRIC_COLUMNS = {
+    "run": "name of the run",
+    "seed": "its seed",
+    "metric": "name of the metric",
+    "value": "its value, with all digits; empty where it is undefined",
+    "definition": "id of the definition",
+    "undefined": "why it has no value",
+}
+"""Columns of ``metrics.csv`` with their meaning."""
+
+
+@dataclass(frozen=True)
+class SubmittedRun:
+    """A line of ``runs.csv``; see `COLUMNS`."""
+
+    run: str
+    seed: int
+    curriculum: str
+    fingerprint: str
+    state: str
+    reason: str
+    group: tuple[int, ...]
+    agent_sha256: str
+    agent_bytes: int | None
+    log_sha256: str
+    machine: str
+    num_threads: int
+    cpu: str
+    seconds: float
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has results."""
+        return self.state == FINISHED
+
+    @property
+    def cells(self) -> list[Any]:
+        """The cells of its line."""
+        values = [getattr(self, field.name) for field in fields(self)]
+        return [" ".join(map(str, value)) if isinstance(value, tuple) else value for value in values]
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A submission as data.
+
+    Args:
+        path: its folder.
+        method: what ``method.yaml`` says.
+        config: the configuration of all runs, without the seed.
+        versions: of what computed them, by the names of packages.
+        scored_on: the kind of machine that computed ``metrics.csv``.
+        curriculum: what they learned.
+        runs: a line for each seed, sorted by it.
+        track: the track that it is for; None: it is for none.
+    """
+
+    path: Path
+    method: Mapping[str, Any]
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    scored_on: str
+    curriculum: Curriculum
+    runs: tuple[SubmittedRun, ...]
+    track: Track | None
+
+    @property
+    def finished(self) -> tuple[SubmittedRun, ...]:
+        """The runs that have results."""
+        return tuple(run for run in self.runs if run.finished)
+
+    def log(self, run: SubmittedRun) -> RunLog:
+        """Return the log of a run.
+
+        Raises:
+            ValueError: if it is no log, or larger than a log may be.
+            OSError: if it cannot be read.
+        """
+        return read_log(self.path / log_name(run.run))
+
+    def experts(self, run: SubmittedRun) -> list[RunLog] | None:
+        """Return the logs of the single-task experts of a run; None if it was trained without.
+
+        Raises:
+            ValueError: see `log`.
+            OSError: if one of them cannot be read.
+        """
+        numbers = [each["task"] for each in experts_of(self.log(run))]
+        return [read_log(self.path / log_name(run.run, number)) for number in numbers] or None
+
+    @cached_property
+    def metrics(self) -> dict[str, dict[str, dict[str, str]]]:
+        """Cells of ``metrics.csv`` by run and metric; see `METRIC_COLUMNS`."""
+        found: dict[str, dict[str, dict[str, str]]] = {}
+        for row in _rows(self.path / METRICS, METRIC_COLUMNS):
+            found.setdefault(row["run"], {})[row["metric"]] = row
+        return found
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over the sums of all files but verifications and hidden ones, in the order of their names."""
+        lines = (
+            f"{name} {hashlib.sha256((self.path / name).read_bytes()).hexdigest()}\n" for name in _names(self.path)
+        )
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def read_submission(path: Path | str, of_track: Track | None = None, config_dir: Path | None = None) -> Submission:
+    """Read a submission and check its form; `ctgraph_rl.board.rescore` checks what it says.
+
+    Args:
+        path: its folder.
+        of_track: the track, in place of the one that ``method.yaml`` names.
+        config_dir: where a track of the user's own is, as ``track/NAME.yaml``.
+
+    Raises:
+        ValueError: for what is no submission; names what is missing or wrong.
+        OSError: if a file cannot be read.
+    """
+    path = Path(path)
+    require((path.is_dir(), f"{path} must be the folder of a submission"))
+    links = [str(each.relative_to(path)) for each in path.rglob("*") if each.is_symlink()]
+    missing = [name for name in (*FILES, LOGS) if not (path / name).exists()]
+    require(
+        (not links, f"{path} has links, {', '.join(links[:3])}: put the files in their place"),
+        (not missing, f"{path} lacks {', '.join(missing)}: ctgraph-rl submit RUNS --to DIR writes all of them"),
+    )
+    method, runs = read_method(path / METHOD), read_runs(path / RUNS)
+    absent = [log_name(run.run) for run in runs if not (path / log_name(run.run)).is_file()]
+    require((not absent, f"{path} lacks {', '.join(absent[:3])}, which {RUNS} names"))
+    if of_track is None and method["track"] is not None:
+        of_track = track(method["track"], config_dir)
+    versions = _versions(path / VERSIONS)
+    return Submission(
+        path=path,
+        method=method,
+        config=_config(path / CONFIG),
+        scored_on=versions.pop(MACHINE),
+        versions=versions,
+        curriculum=Curriculum.from_json(path / CURRICULUM),
+        runs=runs,
+        track=of_track,
+    )
+
+
+def read_runs(path: Path) -> tuple[SubmittedRun, ...]:
+    """Read ``runs.csv``.
+
+    Raises:
+        ValueError: for other columns, cells out of range, and a run or seed that is there twice.
+        OSError: if it cannot be read.
+    """
+    rows = _rows(path, COLUMNS)
+    require((0 < len(rows) <= MOST_RUNS, f"{path} must have 1..{MOST_RUNS:,} runs, got {len(rows):,}"))
+    runs = [_run(row, f"{path}: line {number}") for number, row in enumerate(rows, 2)]
+    names, seeds = [run.run.lower() for run in runs], [run.seed for run in runs]
+    require(
+        (len(set(names)) == len(names), f"{path} names a run twice: {_twice(names)}"),
+        (len(set(seeds)) == len(seeds), f"{path} has a seed twice: {_twice(seeds)}"),
+    )
+    return tuple(sorted(runs, key=lambda run: run.seed))
+
+
+def _twice(values: Sequence[Any]) -> str:
+    return ", ".join(sorted({str(value) for value in values if values.count(value) > 1})[:3])
+
+
+def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
+    """Return a line of ``runs.csv``."""
+    numbers = {key: row[key] for key in ("seed", "num_threads")}
+    group = row["group"].split(" ") if row["group"] else []
+    whole = {**numbers, **{f"group {number}": number for number in group}}
+    whole |= {"agent_bytes": row["agent_bytes"]} if row["agent_bytes"] else {}
+    sums = {"log_sha256": row["log_sha256"]} | ({"agent_sha256": row["agent_sha256"]} if row["agent_sha256"] else {})
+    is_time = re.fullmatch(r"\d+(\.\d+)?", row["seconds"]) is not None
+    require(
+        (NAME.fullmatch(row["run"]) is not None, f"{place}: run must be a name of a file, got {row['run']!r:.80}"),
+        (
+            row["state"] in (FINISHED, FAILED),
+            f"{place}: state must be {FINISHED} or {FAILED}, got {row['state']!r:.80}",
+        ),
+        *(
+            (re.fullmatch(r"\d{1,19}", value) is not None, f"{place}: {key} must be an integer >= 0, got {value!r:.80}")
+            for key, value in whole.items()
+        ),
+        *(
+            (SUM.fullmatch(value) is not None, f"{place}: {key} must be 64 hexadecimal digits, got {value!r:.80}")
+            for key, value in sums.items()
+        ),
+        (is_time, f"{place}: seconds must be a number >= 0, got {row['seconds']!r:.80}"),
+    )
+    values: dict[str, Any] = {**row, **{key: int(value) for key, value in numbers.items()}}
+    values |= {"group": tuple(map(int, group)), "seconds": float(row["seconds"])}
+    return SubmittedRun(**values | {"agent_bytes": int(row["agent_bytes"]) if row["agent_bytes"] else None})
+
+
+def _rows(path: Path, columns: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with exactly these columns."""
+    text = read_regular(path, MOST_BYTES_OF_A_FILE).decode("utf-8", "replace")
+    try:
+        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
+    except csv.Error as error:
+        raise ValueError(f"{path} must be CSV: {error}") from None
+    header = rows[0] if rows else []
+    require(
+        (header == list(columns), f"{path} must have the columns {', '.join(columns)}, got {', '.join(header):.200}")
+    )
+    widths = {len(row) for row in rows}
+    require((widths == {len(columns)}, f"{path} must have {len(columns)} cells in every line"))
+    return [dict(zip(columns, map(from_csv, row), strict=True)) for row in rows[1:]]
+
+
+def _config(path: Path) -> dict[str, Any]:
+    """Return the configuration of all runs."""
+    try:
+        config = yaml.safe_load(read_regular(path, MOST_BYTES_OF_A_CONFIGURATION))
+    except (yaml.YAMLError, RecursionError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} must be YAML: {' '.join(str(error).split())}") from None
+    plain = isinstance(config, dict) and is_shallow(config, MAX_NESTING)
+    require((plain, f"{path} must hold settings by name, got {config!r:.80}"))
+    require(("seed" not in config, f"{path} must leave out the seed, which {RUNS} lists"))
+    return config
+
+
+def _versions(path: Path) -> dict[str, str]:
+    """Return what ``versions.txt`` says, by names."""
+    lines = read_regular(path, MOST_BYTES_OF_A_CONFIGURATION).decode("utf-8", "replace").splitlines()
+    pairs = {name: version for name, _, version in (line.removeprefix("# ").partition("==") for line in lines)}
+    wrong = [name for name, version in pairs.items() if not version]
+    require(
+        (not wrong, f"{path} must have lines such as torch==2.9.0, got {wrong[:1]!r:.80}"),
+        (MACHINE in pairs, f"{path} must have a line # {MACHINE}==KIND, of the machine that computed {METRICS}"),
+    )
+    return pairs
+
+
+def versions_text(versions: Mapping[str, str], machine: str) -> str:
+    """Return the content of ``versions.txt``, which pip reads as constraints; what is no package is a comment."""
+    lines = {**versions, MACHINE: machine}
+    return "".join(f"{'# ' * (name in NO_PACKAGES)}{name}=={value}\n" for name, value in sorted(lines.items()))
+
+
+def runs_text(runs: Sequence[SubmittedRun]) -> str:
+    """Return the content of ``runs.csv``."""
+    return csv_text([list(COLUMNS), *(run.cells for run in runs)])
+
+
+def log_name(run: str, expert: int | None = None) -> str:
+    """Return where the log of a run is in a submission, or that of its expert of a task from 1."""
+    return f"{LOGS}/{run}{'' if expert is None else f'.expert_{expert}'}.jsonl.gz"
+
+
+def experts_of(log: RunLog) -> list[dict[str, Any]]:
+    """Return what a log says of single-task experts, in the order of tasks; empty without any."""
+    said = [each for line in log.of_kind("experts") for each in line.get("experts", ())]
+    numbered = all(isinstance(each, dict) and is_int(each.get("task"), 1) for each in said)
+    require((numbered, "the log names experts without the numbers of their tasks: restore it"))
+    return said
+
+
+def packed(content: bytes) -> bytes:
+    """Return the content of a log as it is in a submission: equal bytes for equal logs."""
+    return gzip.compress(content, mtime=0)
+
+
+def read_log(path: Path) -> RunLog:
+    """Read a log of a submission; no more of it is unpacked than a log may have.
+
+    Raises:
+        ValueError: if it is no log, or larger than a log may be.
+        OSError: if it cannot be read.
+    """
+    unpack = zlib.decompressobj(31)  # the format of gzip
+    try:
+        content = unpack.decompress(read_regular(path, MOST_BYTES), MOST_BYTES + 1)
+    except zlib.error as error:
+        raise ValueError(f"{path} is no file of gzip: {error}; restore it") from None
+    require(
+        (len(content) <= MOST_BYTES, f"{path} holds more than {MOST_BYTES:,} bytes, which a log may have"),
+        (unpack.eof or len(content) > MOST_BYTES, f"{path} ends too early: restore it"),
+    )
+    return RunLog.of_content(content, path)
+
+
+def log_sum(log: RunLog) -> str:
+    """Return the SHA-256 of a log without times, versions and machine: equal for equal runs, bit for bit.
+
+    It is over a line of JSON for each measurement, with sorted keys. Settings that were added after the run, with their
+    value for "as before", do not count.
+    """
+    found = hashlib.sha256()
+    for measurement in log.measurements:
+        found.update(json.dumps(_counted(measurement), sort_keys=True).encode() + b"\n")
+    return found.hexdigest()
+
+
+def _counted(measurement: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a measurement counts in the sum of a log."""
+    kept = without_time(measurement)
+    if kept["kind"] != "run":
+        return kept
+    kept = {key: value for key, value in kept.items() if key not in NOT_COUNTED}
+    return {**kept, "config": as_before(kept.get("config") or {})}
+
+
+def _names(path: Path) -> Iterator[str]:
+    """Yield the names of all files of a submission but verifications and hidden ones, sorted."""
+    files = (each.relative_to(path) for each in path.rglob("*") if each.is_file())
+    shown = (each for each in files if not any(part.startswith(".") for part in each.parts))
+    yield from sorted(each.as_posix() for each in shown if each.as_posix() != VERIFICATION)

@@ -1,0 +1,242 @@
+"""``ctgraph-rl submit RUNS --to DIR`` makes a submission of finished runs: a folder of files that anybody can check.
+
+``ctgraph-rl submit --template > method.yaml`` prints what an author says about a method, to fill in once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctgraph_rl.board import submission as files
+from ctgraph_rl.board.method import TEMPLATE, completed, fact_rules, facts_of, read_method
+from ctgraph_rl.board.rescore import metrics_text, near, rescore
+from ctgraph_rl.board.rules import (
+    code_rules,
+    curriculum_rule,
+    entry_rule,
+    failure_rules,
+    listed,
+    same_rules,
+    seed_rules,
+)
+from ctgraph_rl.board.submission import (
+    FAILED,
+    FINISHED,
+    Submission,
+    SubmittedRun,
+    experts_of,
+    log_name,
+    log_sum,
+    packed,
+    read_submission,
+    runs_text,
+    versions_text,
+)
+from ctgraph_rl.board.tracks import Track, track
+from ctgraph_rl.checks import require
+from ctgraph_rl.disk import made_folder, new_folder, write_whole
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
+from ctgraph_rl.log.provenance import machine
+from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
+from ctgraph_rl.runs.read import Run, find_runs
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum_json import file_text
+
+
+def submit(paths: Sequence[Path], to: Path, method: Mapping[str, Any], of_track: Track | None = None) -> Submission:
+    """Make a submission of runs.
+
+    Args:
+        paths: run directories, or folders that hold them.
+        to: the folder to make; must not exist.
+        method: what ``method.yaml`` holds; see `ctgraph_rl.board.method.read_method`.
+        of_track: the track that it is for; None: it is for none.
+
+    Returns:
+        The submission, as it is read from its folder.
+
+    Raises:
+        ValueError: for runs that cannot be submitted; names every broken rule, before anything is written.
+        FileExistsError: if the folder exists.
+        ModuleNotFoundError: without pyarrow; names the extra to install.
+    """
+    require_parquet()
+    runs, curriculum = _checked(paths, method, of_track)
+    names = _names(runs)
+    lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
+    facts = facts_of(curriculum.protocol, lines)
+    require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
+    about = {**completed(method, facts), "track": None if of_track is None else of_track.name}
+    with new_folder(to) as folder:
+        _write(folder, runs, lines, about, curriculum=curriculum)
+        made = read_submission(folder, of_track)
+        wrong = [check.text for check in rescore(made) if not check.passed]
+        require((not wrong, f"the submission would not pass its own check: {listed(wrong)}"))
+    return read_submission(to, of_track)
+
+
+def _checked(paths: Sequence[Path], method: Mapping[str, Any], of_track: Track | None) -> tuple[list[Run], Curriculum]:
+    """Return the runs by seed, and what they learned; refuse what cannot be submitted."""
+    found, problems = find_runs(paths)
+    left_out = [(False, problem.reason) for problem in problems]
+    require(*left_out, *([] if found or problems else [(False, "there is no run")]))
+    runs = sorted(found, key=lambda run: run.seed)
+    seeds = [run.seed for run in runs]
+    rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
+    rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
+    rules.append(entry_rule(runs[0].about["config"], method["entry_point"]))
+    curricula = [(run, run.path / CURRICULUM) for run in runs]
+    unwritten = [path for _, path in curricula if not path.exists()]
+    message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a curriculum of ours"
+    rules.append((not unwritten, message))
+    first = None if unwritten else Curriculum.from_json(curricula[0][1])
+    rules += [] if first is None else [curriculum_rule(first, of_track), *_fingerprint_rules(runs, first)]
+    rules += [rule for run in runs if run.reason is None for rule in _expert_rules(run)]
+    require(*rules)
+    assert first is not None
+    return runs, first
+
+
+def _fingerprint_rules(runs: Sequence[Run], curriculum: Curriculum) -> list[tuple[bool, str]]:
+    """Return the rules that logs are of the curriculum that is beside the first of them."""
+    other = [run.path for run in runs if run.curriculum[1] != curriculum.fingerprint]
+    return [(not other, f"the logs of {listed(other)} are of another curriculum than {runs[0].path / CURRICULUM}")]
+
+
+def _expert_rules(run: Run) -> list[tuple[bool, str]]:
+    """Return the rules that the logs of a run's single-task experts are there."""
+    missing = [str(path) for path in _experts(run).values() if not path.is_file()]
+    fix = "submit from the directory that the run was started in"
+    return [(not missing, f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}")]
+
+
+def _experts(run: Run) -> dict[int, Path]:
+    """Return where the logs of a run's single-task experts are, by the numbers of their tasks."""
+    return {each["task"]: Path(str(each.get("run"))) / LOG for each in experts_of(RunLog.read(run.path / LOG))}
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """Return a name for each run: that of its directory, or its seed where these are no different names of files."""
+    names = [run.path.resolve().name for run in runs]
+    usable = all(files.NAME.fullmatch(name) for name in names) and len({name.lower() for name in names}) == len(names)
+    return names if usable else [f"seed{run.seed}" for run in runs]
+
+
+def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
+    """Return the line of a run in ``runs.csv``."""
+    log, weights = RunLog.read(run.path / LOG), run.path / AGENT
+    finished = run.reason is None
+    state = read_plain(content_of(weights)) if finished and weights.exists() else None
+    return SubmittedRun(
+        run=name,
+        seed=run.seed,
+        curriculum=run.group[0],
+        fingerprint=run.curriculum[1],
+        state=FINISHED if finished else FAILED,
+        reason="" if finished else " ".join(reasons[run.seed].split()),
+        group=tuple(run.about.get("together") or ()),
+        agent_sha256="" if state is None else sum_of_state(state),
+        agent_bytes=None if state is None else num_bytes_of(state),
+        log_sha256=log_sum(log),
+        machine=str(run.about.get("machine", "")),
+        num_threads=int(run.about.get("num_threads", 1)),
+        cpu=str(run.about.get("cpu") or ""),
+        seconds=float(log.measurements[-1].get("seconds", 0.0)),
+    )
+
+
+def _write(
+    folder: Path,
+    runs: Sequence[Run],
+    lines: Sequence[SubmittedRun],
+    method: Mapping[str, Any],
+    *,
+    curriculum: Curriculum,
+) -> None:
+    """Write all files of a submission."""
+    made_folder(folder / files.LOGS)
+    for run, line in zip(runs, lines, strict=True):
+        write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
+        for number, path in _experts(run).items() if line.finished else ():
+            write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
+    write_whole(folder / files.METHOD, _yaml(method))
+    write_whole(folder / files.CONFIG, _yaml({k: v for k, v in runs[0].about["config"].items() if k != "seed"}))
+    write_whole(folder / files.VERSIONS, versions_text(runs[0].about["versions"], machine()["machine"]))
+    write_whole(folder / CURRICULUM, file_text(curriculum.to_json()))
+    write_whole(folder / files.RUNS, runs_text(lines))
+    finished = [(run, line) for run, line in zip(runs, lines, strict=True) if line.finished]
+    logs = [RunLog.read(run.path / LOG) for run, _ in finished]
+    write_whole(folder / files.EVALUATIONS, evaluations_parquet(logs))
+    found = {}
+    for (run, line), log in zip(finished, logs, strict=True):
+        experts = [RunLog.read(path) for path in _experts(run).values()] or None
+        found[line] = scores(log, curriculum, experts)
+        require(_metrics_rule(run, {name: metric.value for name, metric in found[line].items()}))
+    write_whole(folder / files.METRICS, metrics_text(found))
+
+
+def _yaml(content: Mapping[str, Any]) -> str:
+    """Return plain values as YAML."""
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
+
+
+def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> tuple[bool, str]:
+    """Return the rule that the metrics of a run are what its log gives, up to the rounding of another machine."""
+    stored = {name: metric["value"] for name, metric in run.metrics.items() if name in found}
+    other = [f"{name} {value} for {found[name]}" for name, value in stored.items() if not near(value, found[name])]
+    return not other, f"{run.path} has metrics that its log does not give, {listed(other)}: run it again"
+
+
+def main() -> None:
+    """Make a submission, or print a ``method.yaml`` to fill in."""
+    parser = argparse.ArgumentParser(prog="ctgraph-rl submit", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="*", help="run directories, or folders that hold them")
+    parser.add_argument("--to", type=Path, metavar="DIR", help="the folder to make")
+    about = "what you say about the method (default: %(default)s)"
+    parser.add_argument("--method", type=Path, default=Path("method.yaml"), metavar="FILE", help=about)
+    parser.add_argument("--track", metavar="NAME", help="the track; default: as the file says")
+    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
+    parser.add_argument("--template", action="store_true", help="print a method.yaml to fill in, and do nothing else")
+    arguments = parser.parse_args()
+    if arguments.template:
+        print(TEMPLATE, end="")
+        return
+    if not arguments.runs or arguments.to is None:
+        parser.error("give run directories and --to DIR, or --template")
+    sys.path.append(os.getcwd())  # where a user's own modules may be, as in a run
+    with refused_by(parser):
+        method = read_method(arguments.method)
+        name = method["track"] if arguments.track is None else arguments.track
+        of_track = None if name is None else track(name, arguments.config_dir)
+        made = submit(arguments.runs, arguments.to, method, of_track)
+    print(summary(made))
+
+
+def summary(made: Submission) -> str:
+    """Return in words what a submission holds, and what to do next."""
+    count, finished = len(made.runs), len(made.finished)
+    failed = f", {count - finished} of them failed" if finished < count else ""
+    where = "for no track" if made.track is None else f"for track {made.track.id}"
+    lines = [
+        f"submission of {made.method['name']} {where}, on {made.curriculum.name}",
+        f"runs: {count}{failed}",
+        f"digest: {made.digest}",
+        f"files: {made.path}; ctgraph-rl verify {made.path} checks them",
+    ]
+    return "\n".join(map(terminal_text, lines))
+
+
+if __name__ == "__main__":
+    main()
