@@ -131,6 +131,12 @@ class RecurrentModule(TensorDictModuleBase):
         return [own_input(key, data[key], self.cell.num_actions) * ~data["is_init"] for key in self.own_keys]
 
 
+def trunk_of(policy: object) -> Any:
+    """Return the part of a policy before its output layers, which has ``over_time`` and ``in_keys``; None without."""
+    parts = policy.modules() if isinstance(policy, nn.Module) else ()
+    return next((part for part in parts if hasattr(part, "over_time")), None)
+
+
 def joined(features: Tensor, *others: Tensor) -> Tensor:
     """Concatenate features with further inputs, [..., n] each."""
     return torch.cat([features, *others], dim=-1) if others else features

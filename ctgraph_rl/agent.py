@@ -85,6 +85,14 @@ class Agent(Protocol):
         ...
 
 
+class Detector(Protocol):
+    """A detector of task changes, which gives tasks labels. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
+
+    def labelling(self, method: Method) -> Method:
+        """Return a method whose task ids and boundaries are this detector's."""
+        ...
+
+
 class Method(Protocol):
     """A lifelong-learning method: it changes how an agent learns. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 

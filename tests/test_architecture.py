@@ -75,7 +75,7 @@ DOORS = {
 }
 """Modules that import by name, and why."""
 
-CATALOGUES = ("baselines", "baselines.exchanges", "baselines.methods", "curricula")
+CATALOGUES = ("baselines", "baselines.detectors", "baselines.exchanges", "baselines.methods", "curricula")
 """Folders of one file for each of many things of a kind."""
 
 LONG_FILES: dict[str, str] = {}

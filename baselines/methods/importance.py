@@ -57,6 +57,7 @@ class Importance(Method):
         ids = curriculum.protocol.task_id != "hidden" and not multi_task_blocks(curriculum)
         if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
+            self.heads.max_labels = self.max_labels
             self.heads.setup(agent, weights, curriculum)
         self.register_buffer("held", torch.ones(len(weights)) if self.heads is None else 1.0 - weights.in_heads.float())
 

@@ -65,6 +65,7 @@ class MaskAMSC(SelectedMasks):
         )
         self.distance, self.z_score, self.temperature = distance, z_score, temperature
         self.episodes, self.shuffled = competence, shuffled
+        self.reads_tasks = "evaluations of the task that ends" if competence == "evaluation" else ""
         self.competence: dict[int, float] = {}
         """Of the tasks that have ended, by slot."""
 

@@ -44,6 +44,7 @@ class MaskSC(SelectedMasks):
         require(*one_of(SELECTIONS, selection=selection), *at_least_one(top_k=top_k), (is_real(threshold, -1, 1), rule))
         self.selection, self.threshold, self.top_k = selection, threshold, top_k
         self.compares = selection == "similarity"
+        self.reads_tasks = "the tasks' goals and images" if selection in ORACLES else ""
 
     def start_task(self, task: int | None) -> None:
         """Start with what an oracle selects, or nothing."""

@@ -172,7 +172,7 @@ class CombinedMasks(Masks):
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        self.betas = nn.Parameter(torch.zeros(len(weights.parameters), len(curriculum.tasks)))
+        self.betas = nn.Parameter(torch.zeros(len(weights.parameters), self.num_ids(curriculum)))
         super().setup(agent, weights, curriculum)
 
     @property

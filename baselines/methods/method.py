@@ -36,6 +36,12 @@ class Method(Hooks):
     needs_boundaries: ClassVar[bool] = True
     """Whether task changes must be announced."""
 
+    reads_tasks: str = ""
+    """What it reads of the curriculum's tasks beside their ids, for the message that refuses a detector's labels."""
+
+    max_labels: int | None = None
+    """The largest number of ids, where they are the labels of a detector; None: those of the curriculum's tasks."""
+
     agent_members: tuple[str, ...] = ("method", "weights")
     """The members of `Learner` that it uses beside those of `ctgraph_rl.agent.Agent`."""
 
@@ -52,15 +58,16 @@ class Method(Hooks):
             ValueError: if the curriculum's protocol hides what the method needs.
         """
         protocol, name, several = curriculum.protocol, type(self).__name__, multi_task_blocks(curriculum)
+        or_detector = "" if self.reads_tasks else ", or name a detector of task changes, detector=NAME"
         require(
             (
                 not self.needs_task_id or protocol.task_id != "hidden",
                 f"{name} needs task ids, which are hidden: "
-                f"set protocol.task_id=one_hot or at_boundaries{self.hidden_ids_hint}",
+                f"set protocol.task_id=one_hot or at_boundaries{self.hidden_ids_hint}{or_detector}",
             ),
             (
                 not self.needs_boundaries or protocol.boundaries == "announced",
-                f"{name} needs announced task changes: set protocol.boundaries=announced",
+                f"{name} needs announced task changes: set protocol.boundaries=announced{or_detector}",
             ),
             (
                 not (self.needs_task_id and several),
@@ -110,6 +117,10 @@ class Method(Hooks):
         """Return the weights to act with in a task, float32 [P]; None for the present ones."""
         return None
 
+    def num_ids(self, curriculum: Curriculum) -> int:
+        """Return the largest number of different ids that tasks start with."""
+        return len(curriculum.tasks) if self.max_labels is None else self.max_labels
+
 
 def multi_task_blocks(curriculum: Curriculum) -> list[int]:
     """Return the numbers of the blocks with several tasks, from 1."""
@@ -136,7 +147,7 @@ class TaskMethod(Method):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        self.num_tasks = len(curriculum.tasks)
+        self.num_tasks = self.num_ids(curriculum)
 
     def start_task(self, task: int | None) -> None:
         """Select the task's slot."""

@@ -17,6 +17,8 @@ class Multitask(Finetune):
     different can all be solved.
     """
 
+    reads_tasks = "all tasks at once"
+
     def prepare(self, curriculum: Curriculum) -> Curriculum:
         """Return the curriculum of one block.
 

@@ -38,6 +38,7 @@ class PackNet(TaskMethod):
     """
 
     agent_members = Heads.agent_members
+    reads_tasks = "the frames of each block"
 
     owner: Tensor  # int16 [P]: the slot of the task that keeps a weight, or FREE
     packed: Tensor  # float32 [P]: kept weights

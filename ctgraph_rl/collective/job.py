@@ -48,14 +48,15 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
     """Run a collective in an existing directory, unless its results are there.
 
     Raises:
-        ValueError: before any work, for a value out of range, and members that cannot exchange messages.
+        ValueError: before any work, for a value out of range, a detector, and members that cannot exchange messages.
         FileExistsError: if a member's directory holds results that ``overwrite`` does not allow to replace.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     batch = (
         "together=true trains seeds as one batch, members of a collective learn in turn: leave out together or exchange"
     )
-    require((cfg.together is False, batch))
+    labels = "labels that learners give themselves do not name the same tasks for all: leave out detector or exchange"
+    require((cfg.together is False, batch), ("detector" not in cfg, labels))
     exchange = config.target(cfg, "exchange")()
     runs = [(config.of_member(cfg, number), member_folder(run_dir, number)) for number in range(exchange.num_members)]
     with locked(run_dir):

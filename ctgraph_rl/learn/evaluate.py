@@ -20,6 +20,7 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_of_episodes
+from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation
@@ -225,7 +226,7 @@ class Evaluator:
         """Evaluate an agent if the curriculum says so after ``frames`` frames of the run."""
         moment = self.curriculum.moment(frames)
         if moment is not None:
-            policy = self._policy(agent, self.tasks_at(frames))
+            policy = self._policy(agent, self.tasks_at(frames), frames)
             self.evaluate(_of_data(policy), frames, moment, agent.initial_state)
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
@@ -260,13 +261,19 @@ class Evaluator:
         seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
         return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
 
-    def _policy(self, agent: Agent, tasks: Iterable[Task]) -> Policy:
-        """Return the agent's policy; where task ids are given, the one for each task."""
+    def _policy(self, agent: Agent, tasks: Iterable[Task], frames: int) -> Policy:
+        """Return the agent's policy; where task ids are given, or the agent has labels, the one for each task."""
+        if hasattr(agent, "policy_for_label"):
+            return _of_each(agent, policies_by_label(agent, self.curriculum, self.log, tasks, frames))
         if self.curriculum.protocol.task_id == "hidden":
             return agent.policy
         ids = self.curriculum.task_ids
-        policies = [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks]
-        return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
+        return _of_each(agent, [agent.policy_for(ids[task]) if task in ids else agent.policy for task in tasks])
+
+
+def _of_each(agent: Agent, policies: Sequence[Policy]) -> Policy:
+    """Return the agent's policy where it is that of each task, or else one that acts with each in its slice of rows."""
+    return agent.policy if all(policy is agent.policy for policy in policies) else by_slices(policies)
 
 
 def _of_data(policy: Policy) -> Policy:

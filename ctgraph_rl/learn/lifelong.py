@@ -23,6 +23,9 @@ from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Block, Curriculum
 
+AT_THE_END = {"alarm", "rolled_back"}
+"""Measurements of the end of a batch, which are 0 in its other parts."""
+
 OfferCheckpoint = Callable[[Callable[[], dict[str, Any]], bool], object]
 """Takes a function that makes the run's state, and whether a block ends here; saves the state if it is time."""
 
@@ -266,11 +269,13 @@ def log_training(
     log: RunLog, curriculum: Curriculum, batch: TensorDictBase, start: int, measurements: Mapping[str, float]
 ) -> float:
     """Append a line for each block that a batch has frames of; return the mean return of the last line."""
-    frames = start
+    frames, end = start, start + batch.numel()
     for part in _of_one_block(batch, start, curriculum.ends):
         frames += part.numel()
         episodes = episode_means(part["next"][part["next", "done"].squeeze(-1)])
-        log.append("training", block=curriculum.block_at(frames), frames=frames, **episodes, **measurements)
+        events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
+        given = {**episodes, **measurements, **events}
+        log.append("training", block=curriculum.block_at(frames), frames=frames, **given)
     return episodes["return_mean"]
 
 

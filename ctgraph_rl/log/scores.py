@@ -14,6 +14,7 @@ from ctgraph_rl import metrics
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
+from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy
 from ctgraph_rl.tasks.task import Task
@@ -74,6 +75,7 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         "success_rates": log.last("success_rate", count),
         "episodes": log.training("episodes"),
         "returns": log.training("return_mean"),
+        "labelling": _labelling(log, curriculum),
         "interval_best": _interval_best(log, curriculum, best),
         "random_frames": [random_frames_to_goal(task) for task in curriculum.tasks],
         "search_episodes": [task.graph.expected_search_episodes for task in curriculum.tasks],
@@ -161,6 +163,23 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor) -> Tensor:
     values = [{of_task[task] for task in block} for block in curriculum.trained]
     alone = torch.tensor([each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64)
     return alone[log.training("block").long() - 1]
+
+
+def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
+    """Return the labels that the learner gave to tasks itself; undefined where it gave none."""
+    acted, ends, blocks = (log.training(name) for name in ("acted_label", "frames", "block"))
+    if not len(acted) or acted.isnan().any():
+        return Undefined("the learner gives tasks no labels of its own: it has no detector")
+    trained = [block[0] if len(block) == 1 else SEVERAL for block in curriculum.trained]
+    return Labelling(
+        acted.long() - 1,
+        torch.tensor(trained)[blocks.long() - 1],
+        ends.diff(prepend=ends.new_zeros(1)).long(),
+        learned=log.training("learned") > 0,
+        alarm=log.training("alarm") > 0,
+        rolled_back=log.training("rolled_back").nan_to_num().long(),
+        announced=curriculum.protocol.boundaries == "announced",
+    )
 
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:

@@ -18,6 +18,7 @@ INPUTS = {
     "success_rates": "share of them that reached the goal, float64 [tasks]",
     "episodes": "finished episodes of each training interval, float64 [intervals]",
     "returns": "their mean return, float64 [intervals]; NaN without episodes",
+    "labelling": "the labels that the learner gave to tasks itself, `Labelling`",
     "interval_best": "optimal mean return of each interval's task, float64 [intervals]; NaN where tasks differ in it",
     "first_frames": "for each task, frames since the start of its first block at the end of each of its intervals",
     "first_episodes": "for each task, finished episodes of these intervals",

@@ -74,13 +74,13 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Name a run's directory: curriculum, agent, cell, method and exchange if chosen, seed and a hash of all."""
+    """Name a run's directory: curriculum, agent; cell, method, detector and exchange if chosen; seed, a hash of all."""
     return name_of(_root_, _root_.hydra.runtime.choices)
 
 
 def name_of(cfg: DictConfig, choices: Any) -> str:
     """Return the name of a configuration's run, given the chosen file of each group."""
-    parts = {"cell": (None, "lstm"), "method": ("finetune",), "exchange": (None, "null")}
+    parts = {"cell": (None, "lstm"), "method": ("finetune",), "detector": (None,), "exchange": (None, "null")}
     chosen = [choices.get(group) for group, usual in parts.items() if choices.get(group) not in usual]
     learner = "-".join([choices.agent, *chosen])
     seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere

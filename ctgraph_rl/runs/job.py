@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,7 +71,7 @@ class Job:
         """
         device = checked_device(cfg.device)
         prepare_torch(cfg)
-        make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
+        make_method, make_alone = method_of(cfg), config.target(cfg, "agent")
         curriculum = curriculum_of(cfg, make_method())
         if cfg.experts:
             _check_experts(curriculum, make_alone, cfg.seed)
@@ -159,6 +159,7 @@ def make_agent(
     *,
     method: str | None = None,
     method_settings: Mapping[str, Any] | None = None,
+    detector: str | None = None,
     device: torch.device | str | None = None,
     config_dir: Path | str | None = None,
     **settings: Any,
@@ -175,6 +176,7 @@ def make_agent(
         seed: decides the weights and torch's global generator, in [0, 2**63); None: as on the command line.
         method: name of a file in ``conf/method``, such as ``"ewc"``; None: as on the command line.
         method_settings: values that replace those of the method's file, such as ``{"coeff": 50.0}``.
+        detector: name of a file in ``conf/detector``, such as ``"swoks"``; None: without.
         device: where the agent lives; None: as on the command line.
         config_dir: a directory with files of the user, ``agent/NAME.yaml`` and ``method/NAME.yaml``.
         settings: values that replace those of the agent's file, such as ``learning_rate=0.001``.
@@ -190,19 +192,29 @@ def make_agent(
         256
     """
     require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
-    cfg = config.with_names({"agent": name, "method": method}, None if config_dir is None else Path(config_dir))
+    names = {"agent": name, "method": method, "detector": detector}
+    cfg = config.with_names(names, None if config_dir is None else Path(config_dir))
     cfg.seed, cfg.device = cfg.seed if seed is None else seed, cfg.device if device is None else str(device)
     for group, values in (("agent", settings), ("method", method_settings or {})):
         cfg[group] = {**cfg[group], **values}
     config.check_values(cfg)
     prepare_torch(cfg)
-    make_method, make_alone = config.target(cfg, "method"), config.target(cfg, "agent")
+    make_method, make_alone = method_of(cfg), config.target(cfg, "agent")
     kind = type(make_method()).__name__
     other = (
         f"{kind} learns another curriculum: replace yours by {kind}(...).prepare(curriculum), here and where it is used"
     )
     require((make_method().prepare(curriculum) == curriculum, other))
     return new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, checked_device(cfg.device))
+
+
+def method_of(cfg: DictConfig) -> Callable[[], Method]:
+    """Return what builds the method of a configuration, labelled by its detector if it has one."""
+    make_method = config.target(cfg, "method")
+    if "detector" not in cfg:
+        return make_method
+    make_detector = config.target(cfg, "detector")
+    return lambda: make_detector().labelling(make_method())
 
 
 def prepare_torch(cfg: DictConfig) -> None:
@@ -308,12 +320,12 @@ def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]
 def code_of(cfg: DictConfig, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return what a run of a configuration would store of its code; see `ctgraph_rl.log.provenance.code`."""
     settings = config.plain(cfg)
-    deciding = {key: settings.get(key) for key in ("curriculum", "method", *config.PARTS)}
+    deciding = {key: settings.get(key) for key in ("curriculum", "method", "detector", *config.PARTS)}
     key = json.dumps([deciding, learners(settings, None)], sort_keys=True)
     if key not in known:
         with suppress(Exception):  # of the code of a user; once imported it may find more modules
             config.target(cfg, "agent")
-        known[key] = _code(curriculum_of(cfg, config.target(cfg, "method")()), settings)
+        known[key] = _code(curriculum_of(cfg, method_of(cfg)()), settings)
     return known[key]
 
 

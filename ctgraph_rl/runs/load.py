@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, read_plain, require_records
@@ -31,8 +32,9 @@ OURS = {
     "agent": re.compile(r"(baselines\.\w+)\.(\w+)"),
     "method": re.compile(r"(baselines\.methods\.\w+)\.(\w+)"),
     "cell": re.compile(r"(baselines\.cells\.\w+)\.(\w+)"),
+    "detector": re.compile(r"(baselines\.detectors\.\w+)\.(\w+)"),
 }
-"""Names of agents, methods and cells that a directory may name; the caller of `load` gives any other."""
+"""Names of agents, methods, cells and detectors that a directory may name; the caller of `load` gives any other."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,12 @@ class Trained:
     log: RunLog
 
     def policy_for(self, task: Task) -> TensorDictModuleBase:
-        """Return the policy for a task: the one for its id, where the curriculum has one and shows it."""
+        """Return the policy for a task: the one for its id, where the curriculum has one and shows it.
+
+        For an agent that labels tasks itself, it is that of the task's most frequent label.
+        """
+        if hasattr(self.agent, "policy_for_label"):
+            return policies_by_label(self.agent, self.curriculum, self.log, [task])[0]
         number = None if self.curriculum.protocol.task_id == "hidden" else self.curriculum.task_ids.get(task)
         return self.agent.policy if number is None else self.agent.policy_for(number)
 
@@ -73,7 +80,8 @@ def load(
         curriculum: what was learned; needed where it has parts of classes that are not this package's.
         device: where the agent shall live.
         make_method: builds the agent's method; needed where its class is not one of the baselines': the class or a
-            function, in the same way.
+            function, in the same way. Where the detector's class is none of the baselines, it builds both, such as
+            ``lambda: MyDetector(...).labelling(MaskRI())``.
 
     Raises:
         FileNotFoundError: if there is no run, or none that has been saved.
@@ -123,10 +131,21 @@ def _builder(
     named = make_agent is None
     alone = _ours(run_dir, "agent", stored["agent"]) if named else _with(run_dir, make_agent, stored["agent"])
     if make_method is not None:
-        return with_method(alone, _with(run_dir, make_method, stored["method"]), curriculum)
-    if stored["method"] is None:
+        make_method = _with(run_dir, make_method, stored["method"])
+    elif stored["method"] is not None:
+        make_method = _ours(run_dir, "method", stored["method"])
+    else:
         return alone
-    return with_method(alone, _ours(run_dir, "method", stored["method"]), curriculum)
+    return with_method(alone, partial(_labelled, run_dir, make_method, stored["detector"]), curriculum)
+
+
+def _labelled(run_dir: Path, make_method: Callable[[], Method], detector: Any) -> Method:
+    """Return a new method, labelled by the detector that a run stored, if there is one and it is not labelled yet."""
+    method = make_method()
+    if detector is None or hasattr(method, "detector"):
+        return method
+    labelled: Method = _ours(run_dir, "detector", detector)().labelling(method)
+    return labelled
 
 
 def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
@@ -140,14 +159,14 @@ def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
 
 
 def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
-    """Return what builds the agent, cell or method that a configuration names, if its class is one of ``baselines``."""
+    """Return what builds a part that a configuration names, such as its agent, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours, maker = OURS[part].fullmatch(name), "make_method" if part == "method" else "make_agent"
+    ours, maker = OURS[part].fullmatch(name), "make_method" if part in ("method", "detector") else "make_agent"
     if ours is None:
         raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., {maker}=), in Python")
     kind: Any = class_named(ours[1], ours[2])
-    defined = kind is not None and issubclass(kind, torch.nn.Module)
+    defined = kind is not None and (issubclass(kind, torch.nn.Module) or hasattr(kind, "labelling"))
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., {maker}=)"))
     return partial(kind, **_settings(run_dir, with_added(settings)))
 

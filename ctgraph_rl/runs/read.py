@@ -213,14 +213,12 @@ def _about(file: Path) -> dict[str, Any]:
 
 
 def _agent(config: Mapping[str, Any]) -> str | None:
-    """Return the agent, its cell and its method, each by its class or by the name that the recorder of the run gave.
-
-    The cell is named if it is not the usual one.
-    """
+    """Return agent, cell if not the usual one, method and detector, by their classes or the recorder's names."""
     learner = config.get("agent")
     agent = _called(learner) or _called(config.get("learner"))
     cell = _called(learner.get("cell")) if isinstance(learner, Mapping) else None
-    return " + ".join(filter(None, (agent, cell, _called(config.get("method"))))) if agent else agent
+    parts = (agent, cell, *(_called(config.get(part)) for part in ("method", "detector")))
+    return " + ".join(filter(None, parts)) if agent else agent
 
 
 def _called(part: Any) -> str | None:

@@ -117,6 +117,7 @@ def test_a_stopped_collective_is_resumed_bit_by_bit_and_a_finished_one_is_left(m
         (("method=ewc",), "L2D2C needs masks, and member 0 has EWC: take method=mask_ri"),
         (("method=mask_ri",), "member 1 has another than member 0: set method.backbone_seed"),
         (("method.backbone_seed=-1",), "method.backbone_seed must be an integer in [0, 2**63) or null, got -1"),
+        (("detector=oracle",), "do not name the same tasks for all: leave out detector or exchange"),
         (("together=true",), "together=true trains seeds as one batch, members of a collective learn in turn: leave"),
     ],
 )

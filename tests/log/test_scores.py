@@ -231,7 +231,11 @@ def test_a_log_that_stops_early_or_has_no_evaluation_has_scores():
 
     assert found["frames_to_first_reward"].terms[1] is None
     assert found["frames_to_first_reward"].terms[0] > 0
-    assert {name for name, metric in found.items() if metric.value is not None} == {"regret", *OF_THE_TASKS}
+    assert {name for name, metric in found.items() if metric.value is not None} == {
+        "regret",
+        "online_return",
+        *OF_THE_TASKS,
+    }
 
 
 def test_frames_count_from_where_the_curriculum_says_that_a_block_starts(log):
@@ -280,7 +284,8 @@ def test_a_run_that_was_hardly_evaluated_has_undefined_scores_and_does_not_fail(
     found = scores(log, CURRICULUM)
 
     defined = {name for name, metric in found.items() if metric.value is not None}
-    assert defined == {"regret", "frames_to_first_reward", "search_efficiency", *OF_THE_TASKS}
+    of_training = {"regret", "online_return", "frames_to_first_reward", "search_efficiency"}
+    assert defined == {*of_training, *OF_THE_TASKS}
     assert found["performance_recovery"].undefined == "lifelong metrics need an evaluation of every task"
     assert found["average_performance"].n_undefined == found["normalised_performance"].n_undefined == 2
 

@@ -1,0 +1,93 @@
+"""The base class of detectors of task changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from baselines.detectors.seen import Seen, Verdict
+from baselines.methods.self_labelled import SelfLabelled
+from ctgraph_rl.checks import at_least_one, is_int, require
+
+if TYPE_CHECKING:
+    from ctgraph_rl.agent import Method
+    from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+class Detector:
+    """Judges from what the learner sees whether the task is still that of the present label.
+
+    Labels are 0, 1, 2, ... in the order in which they are opened. `baselines.methods.self_labelled.SelfLabelled` calls
+    `observe` once with each batch, before the batch is learned from, and tells by `start_label` with which label it
+    acts next. Detectors draw nothing from torch's global generator.
+
+    Args:
+        max_labels: most labels; None, where a detector allows it: one for each task of the curriculum.
+        patience: frames for which a known label is tried before the next one.
+        snapshot_every: batches between two snapshots of what is learned; a suspicion restores the older of two. None:
+            there are none, and a suspicion restores nothing.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    """What it reads of `Seen` beside the fields that are always there: ``features``, ``observation_id``."""
+
+    is_oracle: ClassVar[bool] = False
+    """Whether it is given the curriculum."""
+
+    def __init__(self, max_labels: int | None, patience: int, snapshot_every: int | None) -> None:
+        labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)
+        require(
+            (labels, f"max_labels must be an integer >= 1, got {max_labels!r}"),
+            *at_least_one(patience=patience),
+            *(() if snapshot_every is None else at_least_one(snapshot_every=snapshot_every)),
+        )
+        self.max_labels, self.patience, self.snapshot_every = max_labels, patience, snapshot_every
+
+    def labelling(self, method: Method) -> SelfLabelled:
+        """Return a method that labels tasks by this detector; see `ctgraph_rl.agent.Detector`."""
+        return SelfLabelled(method, self)
+
+    def tell(self, curriculum: Curriculum) -> None:
+        """Called once with what will be learned, if it is an oracle."""
+
+    def setup(self, num_rows: int, num_steps: int, num_actions: int, num_observations: int | None) -> None:
+        """Called once before the first batch.
+
+        Args:
+            num_rows: rows of a batch.
+            num_steps: steps of a batch, unless the end of a block has shortened it.
+            num_actions: number of different actions.
+            num_observations: number of different observations where they are one-hot; None for images.
+
+        Raises:
+            ValueError: if it cannot work with them.
+        """
+
+    def present_label(self) -> int:
+        """Return the label to begin with; an oracle is asked at each announced boundary."""
+        return 0
+
+    def observe(self, seen: Seen) -> Verdict:
+        """Return what a batch says of the present label.
+
+        Returns:
+            None: nothing; the label stays. `SUSPICION`: what is learned is rolled back, learning pauses, and the known
+            labels are tried. A label: this one from the next batch on, without a rollback; while labels are tried it is
+            accepted. The number of labels so far stands for a new one.
+        """
+        raise NotImplementedError
+
+    def start_label(self, label: int, trial: bool) -> None:
+        """Called when the next batch will be the first one that is acted with a label.
+
+        Args:
+            label: the label.
+            trial: whether it is tried after a suspicion; False where learning begins, or resumes, with it.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that verdicts depend on, as tensors and plain values."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""

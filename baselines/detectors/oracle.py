@@ -1,0 +1,50 @@
+"""The oracle: labels are the true tasks, the upper reference of all detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from baselines.detectors.detector import Detector
+from baselines.detectors.seen import Seen, Verdict
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+class Oracle(Detector):
+    """Knows the curriculum and counts frames: a label is the position of the task in ``curriculum.tasks``.
+
+    Where boundaries are announced, a label starts with its block: this is ``protocol.task_id=at_boundaries``, bit for
+    bit. Where they are hidden, it starts with the first batch that begins in the block; each row ends its episode of
+    the task before first, as always there.
+
+    Args:
+        max_labels: most labels; None: one for each task.
+    """
+
+    is_oracle = True
+
+    def __init__(self, max_labels: int | None = None) -> None:
+        super().__init__(max_labels, patience=1, snapshot_every=None)
+        self.frames = 0
+
+    def tell(self, curriculum: Curriculum) -> None:
+        """See `Detector`."""
+        self.curriculum = curriculum
+
+    def present_label(self) -> int:
+        """Return the label of the task of the next frame; after the last one, that of the last task."""
+        block = min(self.curriculum.block_at(self.frames + 1), len(self.curriculum.blocks))
+        return self.curriculum.trained[block - 1][0]
+
+    def observe(self, seen: Seen) -> Verdict:
+        """Return the label of the task in which the next batch begins; nothing where boundaries are announced."""
+        self.frames += seen.action.numel()
+        return self.present_label() if self.curriculum.protocol.boundaries == "hidden" else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of frames."""
+        return {"frames": self.frames}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.frames = state["frames"]

@@ -1,0 +1,316 @@
+"""SelfLabelled: a detector tells tasks apart, so that a method needs neither their ids nor their boundaries.
+
+Pausing, rolling back and trying known labels after a suspicion follow Dick et al. 2024 (CoLLAs, arXiv 2405.19047).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from baselines.detectors.seen import SUSPICION, Seen, Verdict
+from baselines.networks import sequences_of, trunk_of
+from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.checks import require
+from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
+
+if TYPE_CHECKING:
+    from baselines.detectors.detector import Detector
+
+
+class SelfLabelled:
+    """A method whose task ids and boundaries come from a detector.
+
+    The method starts and ends tasks as if the labels were ids of tasks that are given at announced boundaries. With the
+    oracle and announced boundaries that is ``protocol.task_id=at_boundaries``, bit for bit.
+
+    Args:
+        method: any lifelong-learning method that learns the curriculum as it is.
+        detector: what gives the labels.
+    """
+
+    def __init__(self, method: Method, detector: Detector) -> None:
+        self.method, self.detector = method, detector
+
+    def prepare(self, curriculum: Curriculum) -> Curriculum:
+        """Return the curriculum, whose ids are hidden.
+
+        Raises:
+            ValueError: if there is nothing to detect, or the method needs more than labels.
+        """
+        how, detector, method = curriculum.protocol, type(self.detector).__name__, type(self.method).__name__
+        hidden = how.boundaries == "hidden" or self.detector.is_oracle
+        several = [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
+        reads = getattr(self.method, "reads_tasks", "")
+        room = self.num_labels(curriculum)
+        wants = len(curriculum.tasks) if self.detector.is_oracle else 0
+        require(
+            (
+                how.task_id == "hidden",
+                f"{detector} gives tasks labels of its own: set protocol.task_id=hidden, got {how.task_id}",
+            ),
+            (
+                hidden,
+                f"{detector} detects task changes that are not announced: set protocol.boundaries=hidden, "
+                "or leave the detector out",
+            ),
+            (
+                not (self.detector.is_oracle and several),
+                f"{detector} needs blocks of one task each, and blocks {several} have several: take another detector",
+            ),
+            (not reads, f"{method} needs {reads}, which no detector gives: take another method, or leave it out"),
+            (wants <= room, f"max_labels={room} is too few for {wants} tasks: set detector.max_labels=null"),
+        )
+        labelled = as_labelled(curriculum)
+        same = self.method.prepare(labelled) == labelled
+        require((same, f"{method} learns another curriculum in place of this one, without changes to detect"))
+        return curriculum
+
+    def num_labels(self, curriculum: Curriculum) -> int:
+        """Return the largest number of labels."""
+        most = self.detector.max_labels
+        return len(curriculum.tasks) if most is None else most
+
+    def attach(self, agent: Agent, curriculum: Curriculum) -> SelfLabelledAgent:
+        """Return the agent with the method attached, whose tasks the detector labels.
+
+        Args:
+            agent: a new agent.
+            curriculum: what `prepare` returned.
+
+        Raises:
+            ValueError: if agent, method and detector do not fit together.
+        """
+        detector, name = self.detector, type(self.detector).__name__
+        shape = curriculum.tasks[0].images.shape
+        missing = "features" in detector.needs and trunk_of(agent.policy) is None
+        fix = "its policy has no trunk with `over_time`, as those of baselines have"
+        require(
+            (
+                not missing,
+                f"{name} needs features of {type(agent).__name__}: {fix}; take another agent or detector",
+            ),
+            (
+                "observation_id" not in detector.needs or len(shape) == 1,
+                f"{name} needs one-hot observations, got images {list(shape)}: take another detector",
+            ),
+        )
+        self.method.max_labels = self.num_labels(curriculum)  # type: ignore[attr-defined]
+        if detector.is_oracle:
+            detector.tell(curriculum)
+        tasks = curriculum.tasks
+        num_actions = max(task.graph.branching_factor for task in tasks) + 1
+        one_hot = max(task.images.shape[0] for task in tasks) if len(shape) == 1 else None
+        detector.setup(agent.num_envs, agent.num_steps, num_actions, one_hot)
+        policy = agent.policy
+        learner = self.method.attach(agent, as_labelled(curriculum))
+        return SelfLabelledAgent(learner, detector, policy, self.num_labels(curriculum))
+
+
+def as_labelled(curriculum: Curriculum) -> Curriculum:
+    """Return the curriculum as a method with labels sees it: each task in a block, announced with its id."""
+    blocks = tuple(Block((task,), curriculum.num_frames) for task in curriculum.tasks)
+    return replace(curriculum, blocks=blocks, protocol=Protocol("at_boundaries", "announced"))
+
+
+class SelfLabelledAgent(nn.Module):
+    """An agent with a method, whose tasks a detector labels.
+
+    At a suspicion the older of two snapshots of agent, optimiser and method is restored, and the task ends there. Then
+    the known labels start one after the other, in the order in which they were opened, for `Detector.patience` frames
+    each; nothing is learned meanwhile. If the detector accepts none, a new label starts; where there are `max_labels`
+    already, that of before the suspicion resumes. If the label of before is accepted, there was no boundary: what is
+    learned is as the snapshot was.
+
+    Args:
+        learner: the agent with its method.
+        detector: what gives the labels.
+        policy: of the agent, which computes features.
+        max_labels: most labels.
+    """
+
+    def __init__(self, learner: Agent, detector: Detector, policy: nn.Module, max_labels: int) -> None:
+        super().__init__()
+        self.learner: Any = learner
+        self.detector, self.max_labels = detector, max_labels
+        self.num_envs, self.num_steps = learner.num_envs, learner.num_steps
+        object.__setattr__(self, "_trunk", trunk_of(policy))  # a part of the agent, which holds it
+        self.label = 0
+        """The label that acts, and unless labels are tried learns."""
+
+        self.num_labels = 0
+        self.home: int | None = None
+        """The label before the suspicion, while labels are tried."""
+
+        self.waiting: list[int] = []
+        """The labels that are still to be tried."""
+
+        self.num_tried = 0
+        """Frames that the present label has been tried."""
+
+        self.num_batches = 0
+        """Batches learned from since the label started."""
+
+        self.snapshots: list[dict[str, Any]] = []
+        """The older one first; each with ``state`` and the frames learned from since the one before, ``frames``."""
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The agent's policy, with the weights of the label that acts."""
+        return self.learner.policy
+
+    def policy_for(self, task: int) -> TensorDictModuleBase:
+        """Return the policy for a label."""
+        return self.learner.policy_for(task)
+
+    def policy_for_label(self, label: int | None) -> TensorDictModuleBase:
+        """Return the policy for a label; for None that for a label that has not been opened."""
+        return self.policy_for(self.num_labels if label is None else label)
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return the agent's recurrent state."""
+        return self.learner.initial_state(num_envs)
+
+    def start_task(self, task: int | None = None) -> None:
+        """Start the label that the detector begins with; the oracle says another at each announced boundary."""
+        self._start(self.detector.present_label())
+
+    def end_task(self) -> None:
+        """End the task of the present label."""
+        if self.home is None:
+            self.learner.end_task()
+
+    def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor] | TensorDictBase:
+        """Compute the agent's losses and the method's penalties."""
+        return self.learner.loss(batch)
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Ask the detector, and learn from a batch unless it suspects a change or labels are tried.
+
+        Returns:
+            What the agent measured, if it learned; ``acted_label``, from 1, that acted in the batch; ``learned``, 1 or
+            0; ``alarm``, 1 where the detector left the label that was learned, or 0; ``rolled_back``, the number of
+            earlier frames whose learning was undone.
+        """
+        verdict = self.detector.observe(self._seen(batch))
+        measured: dict[str, float] = {"acted_label": self.label + 1, "learned": 0, "alarm": 0, "rolled_back": 0}
+        if self.home is not None:
+            self._try(verdict, batch.numel())
+        elif verdict is SUSPICION:
+            measured |= {"alarm": 1, "rolled_back": self._suspect()}
+        else:
+            measured |= self.learner.learn(batch) | {"learned": 1}
+            self._learned(batch.numel())
+            if verdict is not None and verdict != self.label:
+                measured["alarm"] = 1
+                self.learner.end_task()
+                self._start(verdict)
+        return measured
+
+    @torch.no_grad()
+    def _seen(self, batch: TensorDictBase) -> Seen:
+        """Return what the detector sees of a batch."""
+        after, needs = batch["next"], self.detector.needs
+        given = {
+            "action": batch["action"],
+            "is_init": batch["is_init"].squeeze(-1),
+            **{key: after[key].squeeze(-1) for key in ("reward", "done")},
+            "episode_return": after["episode_reward"].squeeze(-1),
+        }
+        if "features" in needs:
+            trunk: Any = self._trunk
+            given["features"] = trunk.over_time(sequences_of(batch, trunk.in_keys))
+        if "observation_id" in needs:
+            given["observation_id"] = batch["observation"].argmax(-1)
+            given["next_observation_id"] = after["observation"].argmax(-1)
+        return Seen(**{key: value.detach().cpu() for key, value in given.items()})
+
+    def _start(self, label: int) -> None:
+        """Start to learn a label."""
+        self.learner.start_task(label)
+        self._resume(label)
+
+    def _resume(self, label: int) -> None:
+        """Learn the label that has started."""
+        self.label, self.num_labels = label, max(self.num_labels, label + 1)
+        self.home, self.waiting, self.num_batches = None, [], 0
+        self.detector.start_label(label, trial=False)
+        self.snapshots = []
+        if self.detector.snapshot_every is not None:
+            self._take_snapshot()
+
+    def _take_snapshot(self) -> None:
+        """Keep what is learned now, and the newer of the snapshots so far."""
+        self.snapshots = [*self.snapshots[-1:], {"state": deepcopy(self.learner.state_dict()), "frames": 0}]
+
+    def _learned(self, num_frames: int) -> None:
+        """Count a batch that was learned from, and take a snapshot where it is time."""
+        self.num_batches += 1
+        if self.snapshots:
+            self.snapshots[-1]["frames"] += num_frames
+            if self.num_batches % cast(int, self.detector.snapshot_every) == 0:
+                self._take_snapshot()
+
+    def _suspect(self) -> int:
+        """Roll back, end the task and try the first label; return the frames whose learning was undone."""
+        undone = sum(each["frames"] for each in self.snapshots)
+        self.snapshots = self.snapshots[:1]
+        self._restore()
+        self.learner.end_task()
+        self.home, self.waiting = self.label, list(range(self.num_labels))
+        self._try_next()
+        return undone
+
+    def _restore(self) -> None:
+        """Restore what was learned at the older snapshot, if there is one."""
+        for snapshot in self.snapshots[:1]:
+            self.learner.load_state_dict(deepcopy(snapshot["state"]))
+
+    def _try(self, verdict: Verdict, num_frames: int) -> None:
+        """Accept a label, or try the next one after so many frames."""
+        self.num_tried += num_frames
+        if isinstance(verdict, int):
+            self._accept(verdict)
+        elif self.num_tried >= self.detector.patience:
+            self._try_next()
+
+    def _try_next(self) -> None:
+        """Try the next label; after the last one open a new one, if there is room."""
+        if self.waiting:
+            self.label, self.num_tried = self.waiting.pop(0), 0
+            self.learner.start_task(self.label)
+            self.detector.start_label(self.label, trial=True)
+        else:
+            self._accept(self.num_labels if self.num_labels < self.max_labels else cast(int, self.home))
+
+    def _accept(self, label: int) -> None:
+        """Learn a label after a suspicion."""
+        if label == self.home and self.snapshots:
+            self._restore()
+        elif label != self.label:
+            self.learner.start_task(label)
+        self._resume(label)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the labels, the snapshots and the detector's state."""
+        own = {name: getattr(self, name) for name in STATE}
+        snapshots = [{**each, "state": dict(each["state"])} for each in self.snapshots]
+        return {**own, "waiting": list(self.waiting), "snapshots": snapshots, "detector": self.detector.state_dict()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        for name in STATE:
+            setattr(self, name, state[name])
+        self.waiting, self.snapshots = list(state["waiting"]), deepcopy(state["snapshots"])
+        self.detector.load_state_dict(state["detector"])
+
+
+STATE = ("label", "num_labels", "home", "num_tried", "num_batches")
+"""Numbers of a `SelfLabelledAgent` that are saved."""

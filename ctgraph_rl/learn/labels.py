@@ -1,0 +1,51 @@
+"""Labels that a learner gives to tasks itself: which one stands for a task where that is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.metrics.labels import most_frequent
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+
+def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
+    """Return the label that acted in most frames of each task so far, by the task's position.
+
+    Each task of a block with several counts with an equal share of its frames. The learner knows nothing of this: it
+    is an oracle's in evaluation alone.
+    """
+    acted, blocks, ends = (log.training(name).tolist() for name in ("acted_label", "block", "frames"))
+    starts = [0.0, *ends]
+    parts = [
+        (task, int(label) - 1, (end - start) / len(curriculum.trained[int(block) - 1]))
+        for label, block, end, start in zip(acted, blocks, ends, starts, strict=False)
+        if label == label  # unless it is NaN
+        for task in curriculum.trained[int(block) - 1]
+    ]
+    return most_frequent(*zip(*parts, strict=True)) if parts else {}
+
+
+def policies_by_label(
+    agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[Task], frames: int | None = None
+) -> list[TensorDictModuleBase]:
+    """Return an agent's policy for each task by its most frequent label.
+
+    Args:
+        agent: labels tasks itself.
+        curriculum: what it learns.
+        log: of the run so far.
+        tasks: what is played. One that is held out has no label, and is played with the label that acts.
+        frames: of the run so far, while it lasts: the present task may have started after the log's last interval, and
+            then has the label that acts.
+    """
+    labels = task_labels(log, curriculum)
+    if frames:
+        for task in curriculum.trained[curriculum.block_at(frames) - 1]:
+            labels.setdefault(task, agent.label)
+    position = {task: number for number, task in enumerate(curriculum.tasks)}
+    return [agent.policy_for_label(labels.get(position[task])) if task in position else agent.policy for task in tasks]
