@@ -69,18 +69,26 @@ def bounds_of(runs: Iterable[Run]) -> BoundsOfRuns:
     for run in runs:
         curriculum = curriculum_of(run)
         if curriculum is not None and run.history is not None:
-            returns = {
-                label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
-            }
-            lows, highs = zip(*returns.values(), strict=True)
-            failure = all(task.fail_reward == task.return_bounds[0] for task in curriculum.tasks)
             curves = run.history.evaluations.values()
             evaluations = max((sum(frames > 0 for frames, _ in curve) for curve in curves), default=1)
-            known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
-            noisy = any(task.reward_std > 0 for task in curriculum.tasks)
-            alike = curriculum.evaluation.greedy and all(task.is_deterministic for task in curriculum.tasks)
-            return BoundsOfRuns(returns, known, noisy=noisy, one_episode=alike)
+            return bounds_of_curriculum(curriculum, evaluations)
     return NO_BOUNDS
+
+
+def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> BoundsOfRuns:
+    """Return the bounds of what runs of a curriculum measure.
+
+    Args:
+        curriculum: what they learn.
+        evaluations: of each task, after those before training; those of sums over time need it alone.
+    """
+    returns = {label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)}
+    lows, highs = zip(*returns.values(), strict=True)
+    failure = all(task.fail_reward == task.return_bounds[0] for task in curriculum.tasks)
+    known = Known(min(lows), max(highs), len(returns), evaluations=evaluations, failure_is_lowest=failure)
+    noisy = any(task.reward_std > 0 for task in curriculum.tasks)
+    alike = curriculum.evaluation.greedy and all(task.is_deterministic for task in curriculum.tasks)
+    return BoundsOfRuns(returns, known, noisy=noisy, one_episode=alike)
 
 
 def curriculum_of(run: Run) -> Curriculum | None:

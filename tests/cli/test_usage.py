@@ -102,7 +102,7 @@ def test_an_unknown_word_is_refused_with_what_may_have_been_meant(call, runs, wo
     assert (code, out, runs) == (2, "", [])
     first, second = err.splitlines()
     assert first == f"error: unknown command {word!r}; did you mean ctgraph-rl {meant}?"
-    assert second.startswith("Commands: run, agents, collectives, compare, curricula, ")
+    assert second.startswith("Commands: run, agents, board, collectives, compare, curricula, ")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,102 @@
+"""What the tasks of a curriculum allow in the mean, computed and not measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.values import is_needle, memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
+
+
+class Ceilings(NamedTuple):
+    """Means over the tasks of a curriculum, undiscounted; None where there is no closed form."""
+
+    optimal: float | None  # of a policy that knows the goal
+    one_policy: float | None  # of the best policy that does not distinguish tasks that look the same; at most
+    search: float | None  # of the best search, where goals change and an evaluation plays every goal's episodes
+    memoryless: float | None  # of a policy that remembers nothing within an episode
+    open_loop: float | None  # of a sequence of actions that ignores all observations
+    random: float | None  # of the uniformly random policy
+    random_frames: float  # frames that it needs for its first reward on the hardest task
+
+
+def ceilings_of(curriculum: Curriculum) -> Ceilings:
+    """Return what the tasks of a curriculum allow."""
+    tasks = curriculum.tasks
+    changes = any(task.goal_change is not None for task in tasks)
+    return Ceilings(
+        optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),
+        one_policy=_one_policy(curriculum),
+        search=_search(curriculum),
+        memoryless=None if changes else _mean(tasks, memoryless_ceiling),
+        open_loop=None if changes else _mean(tasks, open_loop_ceiling),
+        random=_mean(tasks, _random) if all(map(_is_plain, tasks)) else None,
+        random_frames=max(map(random_frames_to_goal, tasks)),
+    )
+
+
+def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
+    """Return names and values of ceilings for readers; what has no closed form is left out."""
+    names = {
+        "optimal": "optimum",
+        "one_policy": "one policy for all tasks that look the same, at most",
+        "search": "best search for a goal that is not known",
+        "memoryless": "best policy without memory",
+        "open_loop": "best sequence of actions without observations",
+        "random": "random policy",
+    }
+    shown = [(name, getattr(ceilings, key)) for key, name in names.items()]
+    frames = f"{ceilings.random_frames:,.0f}" if ceilings.random_frames < 1e7 else f"{ceilings.random_frames:.1e}"
+    values = [(name, f"{value:.3g}") for name, value in shown if value is not None]
+    return [*values, ("frames to its first reward, on the hardest task", frames)]
+
+
+def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None:
+    """Return the mean of a value over tasks; None if one has none."""
+    try:
+        return sum(map(value, tasks)) / len(tasks)
+    except ValueError:
+        return None
+
+
+def _is_plain(task: Task) -> bool:
+    """Whether a task pays at its goal alone."""
+    return is_needle(task) and task.goal_reward > 0 and task.fail_reward == task.step_reward == 0
+
+
+def _random(task: Task) -> float:
+    return task.graph.reward_prob_random * task.goal_reward
+
+
+def _one_policy(curriculum: Curriculum) -> float | None:
+    """Return the most that one policy without ids gets; None where ids are given or tasks do not pay alike.
+
+    Tasks with the same images and the same rules of what is shown are distinguished by nothing. A policy that reaches
+    the goal of the deepest one surely reaches those goals that are beginnings of it, and no mixture gets more.
+    """
+    tasks = curriculum.tasks
+    alike = len({task.goal_reward for task in tasks}) == 1 and all(map(_is_plain, tasks))
+    if len(tasks) < 2 or curriculum.protocol.task_id != "hidden" or not alike or tasks[0].goal_change is not None:
+        return None
+    groups: dict[object, list[tuple[int, ...]]] = {}
+    for task in tasks:
+        shown = (task.images, task.observations, task.graph.branching_factor, task.graph.wait_prob)
+        groups.setdefault(shown, []).append(task.goal_decisions)
+    return sum(map(_most_reached, groups.values())) / len(tasks) * tasks[0].goal_reward
+
+
+def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
+    """Return how many goals one sequence of decisions reaches at most."""
+    counts = Counter(goals)
+    return max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
+
+
+def _search(curriculum: Curriculum) -> float | None:
+    """Return the mean return of a search without repetition, over all episodes of a goal; None where goals stay."""
+    tasks, episodes = curriculum.tasks, curriculum.evaluation.episodes_per_row
+    ends = {task.graph.num_end_states for task in tasks}
+    whole = all(task.goal_change == (episodes, episodes) for task in tasks) and ends == {episodes}
+    return (episodes + 1) / (2 * episodes) if whole and all(map(_is_plain, tasks)) else None

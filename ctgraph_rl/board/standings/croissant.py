@@ -1,0 +1,113 @@
+"""Metadata of the board's data in Croissant 1.0 (https://docs.mlcommons.org/croissant/docs/croissant-spec.html)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from datetime import date
+from typing import Any
+
+from ctgraph_rl import __version__
+
+CONTEXT = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+"""The names that the specification fixes."""
+
+LICENCE = "https://spdx.org/licenses/Apache-2.0.html"
+URL = "https://arxiv.org/abs/2302.10887"
+CREATOR = "The ctgraph_rl developers, and the authors of the submissions"
+
+Columns = Mapping[str, tuple[str, str]]
+"""Types and meanings by the names of columns."""
+
+
+def croissant(files: Mapping[str, tuple[str, Columns]], key: str, published: date) -> dict[str, Any]:
+    """Return the metadata of CSV files that stand beside it.
+
+    Args:
+        files: content and columns of each file, by its name; the first one has a line for each value of ``key``.
+        key: a column of all files; those of the others refer to the first one's.
+        published: the day of publication.
+    """
+    first = next(iter(files))
+    return {
+        "@context": CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": "ctgraph_rl_board",
+        "description": "Submissions to the tracks of the CT-graph benchmark, with the scores of each seed.",
+        "license": LICENCE,
+        "url": URL,
+        "creator": {"@type": "Organization", "name": CREATOR},
+        "datePublished": published.isoformat(),
+        "version": __version__,
+        "distribution": [_file(name, content) for name, (content, _) in files.items()],
+        "recordSet": [_records(name, columns, key, first) for name, (_, columns) in files.items()],
+    }
+
+
+def _file(name: str, content: str) -> dict[str, Any]:
+    """Return a file with its sum."""
+    data = content.encode()
+    return {
+        "@type": "cr:FileObject",
+        "@id": name,
+        "name": name,
+        "contentUrl": name,
+        "contentSize": f"{len(data)} B",
+        "encodingFormat": "text/csv",
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+
+
+def _records(name: str, columns: Columns, key: str, first: str) -> dict[str, Any]:
+    """Return the records of a file, with a field for each column."""
+    records, home = name.partition(".")[0], first.partition(".")[0]
+    fields = []
+    for column, (kind, meaning) in columns.items():
+        own: dict[str, Any] = {
+            "@type": "cr:Field",
+            "@id": f"{records}/{column}",
+            "name": column,
+            "description": meaning,
+        }
+        own |= {"dataType": kind, "source": {"fileObject": {"@id": name}, "extract": {"column": column}}}
+        if column == key and name != first:
+            own["references"] = {"field": {"@id": f"{home}/{key}"}}
+        fields.append(own)
+    unique = {"key": {"@id": f"{records}/{key}"}} if name == first else {}
+    return {"@type": "cr:RecordSet", "@id": records, "name": records, **unique, "field": fields}

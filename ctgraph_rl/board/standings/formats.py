@@ -1,0 +1,286 @@
+"""Tables of the board for readers and programs: Markdown, LaTeX, CSV, JSON, and the results file of model hubs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import yaml
+
+from ctgraph_rl import __version__
+from ctgraph_rl.board.standings.ceilings import in_words
+from ctgraph_rl.board.standings.entries import LEVELS, shown_level
+from ctgraph_rl.board.standings.tables import Standing, Table, is_significant
+from ctgraph_rl.log.escape import csv_text, markdown_text
+from ctgraph_rl.metrics import METRICS
+from ctgraph_rl.report.formats import MEANS, measure_name
+from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, latex
+from ctgraph_rl.report.latex import Table as LatexTable
+from ctgraph_rl.report.statistics import Estimate
+
+SCHEMA = 1
+"""Of ``board.json``."""
+
+TASK = {"type": "reinforcement-learning", "name": "Lifelong reinforcement learning"}
+"""What a model hub calls the task."""
+
+LEGEND = (
+    f"{MEANS}; rank: those that comparisons of all pairs leave open, seed by seed, with Holm's correction at 5 %; "
+    "n: seeds with a score; bytes per task: kept for each further task, as the authors say; hours: of all seeds"
+)
+
+
+NOT_IN_LATEX = ("method", "bytes of the agent", "steps")
+"""Columns that stand elsewhere in LaTeX, or are left out for want of room."""
+
+
+class Column(NamedTuple):
+    """A cell of a line for a page: what is shown, and what the column is sorted by."""
+
+    head: str
+    shown: str
+    value: float | str | None
+    interval: str = ""
+
+
+def columns(line: Standing) -> list[Column]:
+    """Return the cells of a line."""
+    entry, compute = line.entry, line.entry.method["compute"]
+    per_task = entry.method["bytes_per_task"]
+    numbers = [_measure(name, estimate) for name, estimate in line.estimates.items()]
+    n = str(line.score).rpartition(" n = ")[2]
+    return [
+        Column("rank", line.rank, line.best_rank),
+        Column("method", line.name, line.name.lower()),
+        *numbers,
+        Column("n", n, line.score.n),
+        Column("bytes per task", f"{per_task:,}", per_task),
+        Column("bytes of the agent", _count(entry.agent_bytes), entry.agent_bytes),
+        Column("steps", f"{entry.frames:,}", entry.frames),
+        Column("hours", _hours(compute["hours"]), compute["hours"]),
+        Column("level", shown_level(entry.level), LEVELS.index(entry.level)),
+    ]
+
+
+def _measure(name: str, estimate: Estimate) -> Column:
+    value, _, interval = str(estimate).partition(" n = ")[0].partition(" ")
+    return Column(measure_name(name), value, estimate.value, interval)
+
+
+def _count(value: int | None) -> str:
+    return "-" if value is None else f"{value:,}"
+
+
+def _hours(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}" if value < 10 else f"{value:,.0f}"
+
+
+def notes(table: Table) -> list[str]:
+    """Return what lines of a table need said: why they have no rank, and which seeds failed."""
+    found = []
+    for line in table.standings:
+        why = line.entry.why_not_ranked
+        found += [f"{line.name} has no rank: {why}."] if why else []
+        found += [f"{line.name}, seed {seed} failed: {reason}" for seed, reason in line.entry.failed.items()]
+    return found
+
+
+def facts(table: Table) -> list[tuple[str, str]]:
+    """Return what a table's tasks allow, with the budget and the seeds."""
+    curriculum, seeds = table.variant.curriculum, table.track.seeds
+    whole = seeds == tuple(range(seeds[0], seeds[-1] + 1))
+    about = [
+        ("curriculum", f"{curriculum.name}, fingerprint {curriculum.fingerprint}"),
+        ("steps", f"{curriculum.num_frames:,}"),
+        ("seeds", f"{seeds[0]} to {seeds[-1]}" if whole else ", ".join(map(str, seeds))),
+    ]
+    return [*about, *in_words(table.ceilings)]
+
+
+def verdicts(table: Table) -> list[tuple[str, str, str]]:
+    """Return each comparison of a table: the pair, the difference of the scores, and the corrected p-value."""
+    return [
+        (f"{one} - {other}", str(found.difference).partition(" n = ")[0], _p_value(found.holm, is_significant(found)))
+        for (one, other), found in table.pairs.items()
+    ]
+
+
+def _p_value(holm: float | None, significant: bool) -> str:
+    return "-" if holm is None else f"{holm:.2g}" + ("" if significant else ", not distinguishable")
+
+
+def markdown(tables: Sequence[Table]) -> str:
+    """Return all tables in Markdown."""
+    parts = [part for table in tables for part in _markdown(table)]
+    return "\n\n".join(["# Board", f"{LEGEND}.", *parts]) + "\n"
+
+
+def _markdown(table: Table) -> Iterator[str]:
+    yield f"## {markdown_text(table.title)}"
+    yield f"{markdown_text(table.track.measures)} Breakthrough: {markdown_text(table.track.breakthrough)}"
+    yield "; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + "."
+    lines = [columns(line) for line in table.standings]
+    head = [f"| {' | '.join(cell.head for cell in lines[0])} |", f"|{'---|' * len(lines[0])}"]
+    rows = [[markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells] for cells in lines]
+    yield "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows)])
+    if notes(table):
+        yield "\n".join(f"- {markdown_text(note)}" for note in notes(table))
+
+
+def tables_tex(tables: Sequence[Table]) -> str:
+    """Return all tables in LaTeX."""
+    labels = Labels()
+    return "\n\n".join([PREAMBLE, *(_latex(table, labels) for table in tables)]) + "\n"
+
+
+def _latex(table: Table, labels: Labels) -> str:
+    lines = [[cell for cell in columns(line) if cell.head not in NOT_IN_LATEX] for line in table.standings]
+    rows = [
+        (line.name, [Cell(cell.shown, cell.interval) for cell in cells])
+        for line, cells in zip(table.standings, lines, strict=True)
+    ]
+    label = labels.new("board", table.track.id, table.variant.rung, table.variant.given)
+    caption = f"{table.title}: {LEGEND}."
+    return latex(LatexTable(caption, label, "method", [cell.head for cell in lines[0]], rows))
+
+
+ENTRY_COLUMNS = {
+    "submission": ("sc:Text", "first digits of the submission's digest"),
+    "method": ("sc:Text", "name of the method"),
+    "track": ("sc:Text", "track with its version"),
+    "rung": ("sc:Text", "rung of a ladder; empty for a track of one curriculum"),
+    "given": ("sc:Text", "what the learner was given to know of tasks"),
+    "fingerprint": ("sc:Text", "what the curriculum is, in 16 digits"),
+    "steps": ("sc:Integer", "frames that each seed learned from"),
+    "best_rank": ("sc:Integer", "best rank that the comparisons leave open; empty without a rank"),
+    "worst_rank": ("sc:Integer", "worst rank that the comparisons leave open"),
+    "score": ("sc:Text", "name of the metric that orders the table"),
+    "value": ("sc:Float", "its mean over seeds"),
+    "low": ("sc:Float", "lower end of the 95 % interval"),
+    "high": ("sc:Float", "upper end of the 95 % interval"),
+    "seeds": ("sc:Integer", "seeds with a value"),
+    "seeds_without": ("sc:Integer", "seeds without a value"),
+    "bytes_per_task": ("sc:Integer", "bytes kept for each further task, as the authors say"),
+    "agent_bytes": ("sc:Integer", "bytes of the largest agent"),
+    "hours": ("sc:Float", "hours of computing of all its runs"),
+    "level": ("sc:Text", f"how far it was verified: {', '.join(map(shown_level, LEVELS))}"),
+}
+"""Columns of ``entries.csv`` with their types in Croissant and their meaning."""
+
+SCORE_COLUMNS = {
+    "submission": ("sc:Text", "first digits of the submission's digest"),
+    "seed": ("sc:Integer", "seed of the run"),
+    "metric": ("sc:Text", "name of the metric"),
+    "value": ("sc:Float", "its value; empty where it is undefined or the run failed"),
+}
+"""Columns of ``scores.csv`` in the same way."""
+
+
+def entries_csv(tables: Sequence[Table]) -> str:
+    """Return a line for each entry."""
+    rows = [list(_entry_cells(table, line)) for table in tables for line in table.standings]
+    return csv_text([list(ENTRY_COLUMNS), *rows])
+
+
+def _entry_cells(table: Table, line: Standing) -> Iterator[Any]:
+    entry, score = line.entry, line.score
+    yield from (entry.id, entry.name, table.track.id, table.variant.rung, table.variant.given)
+    yield from (table.variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
+    yield from (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
+    yield from (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, shown_level(entry.level))
+
+
+def scores_csv(tables: Sequence[Table]) -> str:
+    """Return a line for each metric of each seed of each entry."""
+    rows = [
+        [line.entry.id, seed, metric, value]
+        for table in tables
+        for line in table.standings
+        for metric, values in line.entry.values.items()
+        for seed, value in zip(line.entry.seeds, values, strict=True)
+    ]
+    return csv_text([list(SCORE_COLUMNS), *rows])
+
+
+def as_json(tables: Sequence[Table]) -> dict[str, Any]:
+    """Return all tables as plain values."""
+    return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": [_json(table) for table in tables]}
+
+
+def _json(table: Table) -> dict[str, Any]:
+    track, variant = table.track, table.variant
+    return {
+        "track": {"name": track.name, "version": track.version, "measures": track.measures},
+        "breakthrough": track.breakthrough,
+        "rung": variant.rung,
+        "given": variant.given,
+        "curriculum": {"name": variant.curriculum.name, "fingerprint": variant.curriculum.fingerprint},
+        "steps": variant.curriculum.num_frames,
+        "seeds": list(track.seeds),
+        "score": {"name": track.score, "definition": METRICS[track.score].meaning.id},
+        "ceilings": table.ceilings._asdict(),
+        "entries": [_json_line(line) for line in table.standings],
+        "comparisons": [
+            {
+                "first": one,
+                "second": other,
+                "difference": _numbers(found.difference),
+                "p_value": found.p_value,
+                "holm": found.holm,
+            }
+            for (one, other), found in table.pairs.items()
+        ],
+    }
+
+
+def _json_line(line: Standing) -> dict[str, Any]:
+    entry = line.entry
+    ranks = {"best_rank": line.best_rank, "worst_rank": line.worst_rank, "why_not_ranked": entry.why_not_ranked}
+    estimates = {name: _numbers(estimate) for name, estimate in line.estimates.items()}
+    values = {name: list(values) for name, values in entry.values.items()}
+    about = {"name": line.name, "digest": entry.digest, "method": dict(entry.method), "level": entry.level}
+    failed = {str(seed): reason for seed, reason in entry.failed.items()}
+    return {
+        **about,
+        **ranks,
+        "measures": estimates,
+        "values": values,
+        "agent_bytes": entry.agent_bytes,
+        "failed": failed,
+    }
+
+
+def _numbers(estimate: Estimate) -> dict[str, Any]:
+    names = ("value", "low", "high", "n", "n_undefined", "method")
+    return {name: getattr(estimate, name) for name in names}
+
+
+def model_index(tables: Sequence[Table]) -> str:
+    """Return the results file that model hubs read, as YAML: ``model-index`` of the Hugging Face Hub."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for table in tables:
+        for line in table.standings:
+            found.setdefault(line.entry.name, []).append(_result(table, line))
+    models = [{"name": name, "results": results} for name, results in found.items()]
+    return yaml.safe_dump({"model-index": models}, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _result(table: Table, line: Standing) -> dict[str, Any]:
+    """Return the result of an entry: task, data set, metrics and source."""
+    variant, method = table.variant, line.entry.method
+    named = {name: estimate for name, estimate in line.estimates.items() if estimate.value is not None}
+    return {
+        "task": dict(TASK),
+        "dataset": {
+            "type": f"ctgraph_rl/{table.track.id}",
+            "name": f"ctgraph_rl {table.title}",
+            "config": variant.curriculum.name,
+            "revision": variant.curriculum.fingerprint,
+        },
+        "metrics": [
+            {"type": name, "value": estimate.value, "name": f"{measure_name(name)}, {estimate.method}, {estimate}"}
+            for name, estimate in named.items()
+        ],
+        "source": {"name": f"submission {line.entry.id}, {shown_level(line.entry.level)}"}
+        | {"url": method["code"]["repository"]},
+    }

@@ -1,0 +1,153 @@
+"""``ctgraph-rl board DIR... --out FOLDER`` writes a page with tables of submissions, and the same for programs.
+
+``board.html`` needs nothing else and no network; ``board.md`` and ``tables.tex`` are the same tables; ``board.json``,
+``entries.csv`` and ``scores.csv`` hold their numbers, ``croissant.json`` describes the CSV files, and
+``model-index.yaml`` is the results file that model hubs read. The exit code is 1 if something was left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl import __version__
+from ctgraph_rl.board.standings import formats
+from ctgraph_rl.board.standings.croissant import croissant
+from ctgraph_rl.board.standings.entries import LEVELS, Entry, read_entries, shown_level
+from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.checks import require
+from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.report.intervals import scipy
+from ctgraph_rl.runs.read import Problem
+
+PAGE = "board.html"
+
+ADDRESS = re.compile(r"https?://\S+")
+
+
+class Board(NamedTuple):
+    """The page that was written, its tables, and what was left out."""
+
+    page: Path
+    tables: list[Table]
+    problems: list[Problem]
+
+
+def write_board(
+    paths: Sequence[Path | str],
+    folder: Path | str,
+    config_dir: Path | None = None,
+    published: date | None = None,
+) -> Board:
+    """Write the page and the other files of a board.
+
+    Args:
+        paths: folders of submissions, or folders that hold them.
+        folder: where the files go.
+        config_dir: where tracks of the user are, as ``track/NAME.yaml``.
+        published: the day that the metadata names; None: today.
+
+    Raises:
+        ModuleNotFoundError: before any work, without what the extra ``report`` installs.
+        ValueError: if there is no submission that can be read.
+    """
+    _require_packages()
+    entries, problems = read_entries(paths, config_dir)
+    require((bool(entries), "; ".join(problem.reason for problem in problems)))
+    made, folder = tables(entries), made_folder(Path(folder))
+    data = {
+        "entries.csv": (formats.entries_csv(made), formats.ENTRY_COLUMNS),
+        "scores.csv": (formats.scores_csv(made), formats.SCORE_COLUMNS),
+    }
+    about = croissant(data, "submission", published or date.today())
+    files = {
+        PAGE: html(made, problems),
+        "board.md": formats.markdown(made),
+        "tables.tex": formats.tables_tex(made),
+        "board.json": json.dumps(formats.as_json(made), indent=1) + "\n",
+        **{name: content for name, (content, _) in data.items()},
+        "croissant.json": json.dumps(about, indent=2) + "\n",
+        "model-index.yaml": formats.model_index(made),
+    }
+    for name, content in files.items():
+        write_whole(folder / name, content)
+    return Board(folder / PAGE, made, problems)
+
+
+def html(made: Sequence[Table], problems: Sequence[Problem] = ()) -> str:
+    """Return the page: without JavaScript plain tables, with it tables that are sorted and filtered."""
+    from jinja2 import FileSystemLoader, StrictUndefined
+    from jinja2.sandbox import SandboxedEnvironment
+
+    here = Path(__file__).parent
+    style: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined}
+    environment = SandboxedEnvironment(loader=FileSystemLoader(here), autoescape=True, **style)
+    environment.finalize = lambda value: terminal_text(value) if type(value) is str else value
+    script = (here / "board.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return environment.get_template(f"{PAGE}.j2").render(
+        tables=made,
+        problems=problems,
+        formats=formats,
+        levels=[(place, shown_level(level)) for place, level in enumerate(LEVELS)],
+        level_of=lambda entry: LEVELS.index(entry.level),
+        given=list(dict.fromkeys(table.variant.given for table in made)),
+        link_of=link_of,
+        version=__version__,
+        script_text=script,
+        script_digest=digest,
+    )
+
+
+def link_of(entry: Entry) -> str | None:
+    """Return the address of the paper of an entry, else of its code; None if neither is one."""
+    addresses = (str(entry.method["paper"]), str(entry.method["code"]["repository"]))
+    return next(filter(ADDRESS.fullmatch, addresses), None)
+
+
+def _require_packages() -> None:
+    """Refuse before any work.
+
+    Raises:
+        ModuleNotFoundError: without jinja2 or scipy; names the extra to install.
+    """
+    try:
+        import jinja2  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("the board needs jinja2: pip install 'ctgraph_rl[report]'") from error
+    scipy("stats")
+
+
+def main() -> None:
+    """Write the board, and say what is in it."""
+    parser = argparse.ArgumentParser(prog="ctgraph-rl board", description=__doc__)
+    parser.add_argument(
+        "submissions", type=Path, nargs="+", metavar="DIR", help="submissions, or folders that hold them"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the files go")
+    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where tracks of your own are, track/NAME.yaml")
+    parser.add_argument("--date", type=date.fromisoformat, help="the day that the metadata names (default: today)")
+    arguments = parser.parse_args()
+    with refused_by(parser):
+        board = write_board(arguments.submissions, arguments.out, arguments.config_dir, arguments.date)
+    for problem in board.problems:
+        print(f"left out: {terminal_text(problem.reason)}", file=sys.stderr)
+    count = sum(len(table.standings) for table in board.tables)
+    submissions = f"{count} submission{'s' * (count != 1)}"
+    print(f"board of {submissions} in {len(board.tables)} table{'s' * (len(board.tables) != 1)}: {board.page}")
+    if board.problems:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""Tables of the board: entries that learned the same and were given the same, with ranks as far as seeds decide them.
+
+Entries of other tracks, versions, rungs or protocols are in other tables. Within one, every two entries are compared
+seed by seed, and p-values are corrected by Holm's procedure for all pairs. An entry is at best behind all that are
+significantly better, and at worst before all that are significantly worse: its rank is that range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+from ctgraph_rl.board.standings.ceilings import Ceilings, ceilings_of
+from ctgraph_rl.board.standings.entries import Entry, names_of
+from ctgraph_rl.board.tracks import Track, Variant
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.bounds import bounds_of_curriculum
+from ctgraph_rl.report.statistics import LEVEL, Comparison, Estimate
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A line of a table.
+
+    Args:
+        entry: what stands there.
+        name: of the method, which no other line of the table has.
+        estimates: of the score and the other measures, over seeds.
+        best_rank: the best rank that the comparisons leave open; None for an entry without rank.
+        worst_rank: the worst one.
+    """
+
+    entry: Entry
+    name: str
+    estimates: Mapping[str, Estimate]
+    best_rank: int | None = None
+    worst_rank: int | None = None
+
+    @property
+    def score(self) -> Estimate:
+        """The estimate of the metric that orders the table."""
+        return self.estimates[self.entry.track.score]
+
+    @property
+    def rank(self) -> str:
+        """The rank as text, such as ``2 to 4``."""
+        if self.best_rank is None:
+            return "-"
+        return str(self.best_rank) if self.best_rank == self.worst_rank else f"{self.best_rank} to {self.worst_rank}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Entries that are comparable, the best score first.
+
+    Args:
+        track: of all entries.
+        variant: what all learned.
+        standings: the lines.
+        pairs: comparisons of the scores of every two entries with a rank, by their names.
+    """
+
+    track: Track
+    variant: Variant
+    standings: Sequence[Standing]
+    pairs: Mapping[tuple[str, str], Comparison]
+
+    @property
+    def title(self) -> str:
+        """Track, rung and what is given."""
+        return ", ".join(part for part in (self.track.id, self.variant.rung, f"given: {self.variant.given}") if part)
+
+    @cached_property
+    def ceilings(self) -> Ceilings:
+        """What its tasks allow."""
+        return ceilings_of(self.variant.curriculum)
+
+    @property
+    def num_seeds(self) -> int:
+        """Seeds of each entry."""
+        return len(self.track.seeds)
+
+
+def tables(entries: Iterable[Entry]) -> list[Table]:
+    """Return a table for all entries that are comparable, in the order of tracks, rungs and what is given."""
+    found: dict[tuple[str, str], list[Entry]] = {}
+    for entry in entries:
+        found.setdefault((entry.track.id, entry.variant.curriculum.fingerprint), []).append(entry)
+    made = [_table(some) for some in found.values()]
+    return sorted(made, key=lambda table: (table.track.name != "small", table.track.id, _place(table)))
+
+
+def _place(table: Table) -> int:
+    """Return the place of a table's variant in its track."""
+    given = [each.curriculum.fingerprint for each in table.track.variants]
+    return given.index(table.variant.curriculum.fingerprint)
+
+
+def _table(entries: Sequence[Entry]) -> Table:
+    """Return the table of comparable entries."""
+    lines = [Standing(entry, name, _estimates(entry)) for entry, name in zip(entries, names_of(entries), strict=True)]
+    lines.sort(key=lambda line: (line.score.value is None, -(line.score.value or 0.0), line.name))
+    pairs = _pairs([line for line in lines if line.entry.why_not_ranked is None])
+    ranked = [_ranked(line, pairs) if line.entry.why_not_ranked is None else line for line in lines]
+    return Table(entries[0].track, entries[0].variant, ranked, pairs)
+
+
+def _estimates(entry: Entry) -> dict[str, Estimate]:
+    """Return each measure of an entry over seeds, with the interval that the package's rules give it."""
+    bounds = bounds_of_curriculum(entry.variant.curriculum)
+    return {name: statistics.mean(values, bounds=bounds.of_metric(name)) for name, values in entry.values.items()}
+
+
+def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
+    """Return the comparison of the scores of every two lines, p-values corrected for their number."""
+    found = {}
+    for one, other in combinations(lines, 2):
+        bounds = bounds_of_curriculum(one.entry.variant.curriculum).of_metric(one.entry.track.score)
+        found[one.name, other.name] = statistics.compare(one.entry.scores, other.entry.scores, bounds=bounds)
+    corrected = statistics.holm([each.p_value for each in found.values()])
+    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), corrected, strict=True)}
+
+
+def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison]) -> Standing:
+    """Return a line with its rank."""
+    better = sum(other == line.name and is_significant(each) for (_, other), each in pairs.items())
+    worse = sum(one == line.name and is_significant(each) for (one, _), each in pairs.items())
+    count = len({name for pair in pairs for name in pair} | {line.name})
+    return replace(line, best_rank=1 + better, worst_rank=count - worse)
+
+
+def is_significant(found: Comparison) -> bool:
+    """Return whether a difference is one after the correction for all pairs."""
+    return found.holm is not None and found.holm <= 1 - LEVEL

@@ -1,0 +1,221 @@
+"""Tables of the board, from made-up submissions: who is ranked beside whom, and what each format says of it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import curricula
+from ctgraph_rl import Protocol
+from ctgraph_rl.board.method import TEMPLATE
+from ctgraph_rl.board.standings import formats
+from ctgraph_rl.board.standings.ceilings import ceilings_of
+from ctgraph_rl.board.standings.entries import Entry
+from ctgraph_rl.board.standings.page import html
+from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.board.tracks import Track, track
+from ctgraph_rl.report import statistics
+
+pytest.importorskip("scipy")
+pytest.importorskip("jinja2")
+
+SMALL, FORGETTING = track("small"), track("forgetting")
+
+
+def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant: int = 0, **more: Any) -> Entry:
+    """A submission with these scores, one for each seed."""
+    method = yaml.safe_load(TEMPLATE) | {"name": name, "bytes_per_task": more.pop("bytes_per_task", 0)}
+    method["compute"]["hours"] = 0.25
+    about = {"level": "submitted", "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
+    values = dict.fromkeys(("normalised_performance", "average_performance", "forgetting"), tuple(scores))
+    digest = hashlib.sha256(name.encode()).hexdigest()
+    return Entry(digest, method, of, of.variants[variant], seeds=of.seeds, values=values, **about)
+
+
+def some(low: float, high: float, count: int = 20) -> list[float]:
+    """Scores of which every other one is the higher one."""
+    return [high if seed % 2 else low for seed in range(count)]
+
+
+def ranks(table: Table) -> dict[str, str]:
+    return {line.name: line.rank for line in table.standings}
+
+
+def test_a_rank_is_the_range_that_corrected_comparisons_of_all_pairs_leave_open():
+    one, other = some(0.75, 1.0), some(1.0, 0.75)
+    (table,) = tables([entry("low", [0.25] * 20), entry("one", one), entry("other", other), entry("best", [1.0] * 20)])
+
+    assert ranks(table) == {"best": "1", "one": "2 to 3", "other": "2 to 3", "low": "4"}
+    assert [line.score.value for line in table.standings] == [1.0, 0.875, 0.875, 0.25]
+    assert table.pairs["one", "other"].p_value == 1.0
+    assert all(found.p_value == 0.0001 for pair, found in table.pairs.items() if "low" in pair)
+    assert table.pairs["best", "low"].holm == pytest.approx(6e-4)
+
+
+def test_five_seeds_rank_no_one():
+    few = replace(SMALL, seeds=(0, 1, 2, 3, 4))
+    (table,) = tables([entry("worse", [0.0] * 5, few), entry("better", [1.0] * 5, few)])
+
+    assert ranks(table) == {"better": "1 to 2", "worse": "1 to 2"}
+    assert table.pairs["better", "worse"].p_value == 2 / 2**5
+
+
+def test_what_is_of_another_track_version_rung_or_protocol_is_in_another_table():
+    newer, depths = replace(SMALL, version=2), track("exploration")
+    found = tables(
+        [
+            entry("ids", [1.0] * 20),
+            entry("nothing", [0.25] * 20, variant=3),
+            entry("newer", [0.5] * 20, newer),
+            entry("eight tasks", [0.5] * 10, FORGETTING),
+            entry("depth 3", [1.0] * 10, depths, variant=1),
+            entry("depth 2", [1.0] * 10, depths),
+        ]
+    )
+
+    assert [(table.title, ranks(table)) for table in found] == [
+        ("small-v1, given: task ids, boundaries", {"ids": "1"}),
+        ("small-v1, given: nothing", {"nothing": "1"}),
+        ("small-v2, given: task ids, boundaries", {"newer": "1"}),
+        ("exploration-v1, depth 2, given: nothing", {"depth 2": "1"}),
+        ("exploration-v1, depth 3, given: nothing", {"depth 3": "1"}),
+        ("forgetting-v1, given: task ids, boundaries", {"eight tasks": "1"}),
+    ]
+    assert all(not table.pairs for table in found)
+
+
+def test_without_all_scores_or_with_a_failed_verification_there_is_no_rank():
+    missing = entry("missing", [1.0] * 19 + [None], failed={19: "out of memory"})
+    wrong = entry("wrong", [1.0] * 20, level="failed")
+    (table,) = tables([missing, wrong, entry("whole", [0.5] * 20)])
+
+    assert ranks(table) == {"missing": "-", "wrong": "-", "whole": "1"}
+    assert formats.notes(table) == [
+        "missing has no rank: no score of seed 19.",
+        "missing, seed 19 failed: out of memory",
+        "wrong has no rank: its verification found differences.",
+    ]
+
+
+def test_an_interval_is_that_of_the_rules_of_the_package():
+    (table,) = tables([entry("half", some(0.5, 1.0))])
+
+    assert table.standings[0].score == statistics.mean(some(0.5, 1.0), bounds=(0.0, 1.0))
+    assert table.standings[0].score.method == "mean, Gaffke 95%"
+
+
+def test_two_methods_of_one_name_are_named_apart():
+    found = [entry("same", [1.0] * 20), replace(entry("same", [0.5] * 20), digest="f" * 64)]
+
+    (table,) = tables(found)
+
+    assert list(ranks(table)) == [f"same ({found[0].id})", "same (ffffffffffff)"]
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "expected"),
+    [
+        (SMALL.variants[0].curriculum, {"optimal": 1.0, "one_policy": None, "random": 1 / 243, "random_frames": 651.0}),
+        (SMALL.variants[3].curriculum, {"one_policy": 1 / 4, "memoryless": 1.0}),
+        (replace(curricula.load("ct8_md"), protocol=Protocol("hidden")), {"one_policy": 4 / 8}),  # 11, 111, 1111, 11111
+        (replace(curricula.load("ct28"), protocol=Protocol("hidden")), {"one_policy": 1.0}),  # images say which family
+        (curricula.load("su_b1_changing_goals"), {"search": 5 / 8, "memoryless": None, "one_policy": None}),
+        (curricula.load("su_b1_changing_goals", depth=3), {"search": 9 / 16, "optimal": 1.0}),
+        (curricula.load("co_hard"), {"memoryless": 1 / 4, "open_loop": pytest.approx(0.1**2), "search": None}),
+    ],
+)
+def test_ceilings_are_those_by_hand(curriculum, expected):
+    found = ceilings_of(curriculum)._asdict()
+
+    assert {key: found[key] for key in expected} == {
+        key: value if value is None else pytest.approx(value) for key, value in expected.items()
+    }
+
+
+@pytest.fixture
+def made() -> list[Table]:
+    """Two tables, with a name that means something in every format."""
+    best = entry("<b>A_1</b> & *co* | $x$", [1.0] * 20, level="rerun", bytes_per_task=4096)
+    return tables([best, entry("PPO", some(0.0, 1.0)), entry("other", [0.5] * 20, variant=1)])
+
+
+def test_markdown_has_a_line_for_each_submission(made):
+    lines = formats.markdown(made).splitlines()
+
+    assert [line for line in lines if line.startswith("## ")] == [
+        "## small-v1, given: task ids, boundaries",
+        "## small-v1, given: task ids at boundaries",
+    ]
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
+    assert rows[0][:3] == ["rank", "method", "normalised performance"] and rows[0][-1] == "level"
+    assert rows[2] == [
+        *("2", "PPO", *["0.50 [0.27, 0.73]"] * 2, "0.50 [0.18, 0.73]"),
+        *("20", "0", "1,234", "409,600", "0.25", "submitted"),
+    ]
+    assert rows[1][0] == "1" and rows[1][-1] == "rerun" and "<b>" not in rows[1][1] and len(rows[1]) == 11
+
+
+def test_latex_has_a_table_for_each_and_names_are_text(made):
+    paper = formats.tables_tex(made)
+
+    assert paper.count(r"\begin{table}") == paper.count(r"\end{table}") == 2
+    assert re.findall(r"\\label\{(.*?)\}", paper) == [
+        "tab:board-small-v1-task-ids-boundaries",
+        "tab:board-small-v1-task-ids-at-boundaries",
+    ]
+    assert r"\textless{}b\textgreater{}A\_1\textless{}/b\textgreater{} \& {*}co{*} \textbar{} \$x\$ & 1 & 1.00" in paper
+    for body in re.findall(r"\\begin\{tabular\}\{@\{\}lr+@\{\}\}(.*?)\n\\end\{tabular\}%", paper, re.DOTALL):
+        plain = re.sub(r"\\begin\{tabular\}\[b\].*?\\end\{tabular\}", "head", body)
+        assert len({line.count(" & ") for line in plain.splitlines() if line.endswith(r"\\")}) == 1
+
+
+def test_json_and_csv_hold_the_numbers_of_each_seed(made):
+    table = formats.as_json(made)["tables"][0]
+    first, second = table["entries"]
+
+    assert (table["track"]["name"], table["track"]["version"], table["given"]) == ("small", 1, "task ids, boundaries")
+    assert table["ceilings"]["optimal"] == 1.0 and table["seeds"] == list(range(20))
+    assert (first["best_rank"], second["worst_rank"], first["level"]) == (1, 2, "rerun")
+    assert second["values"]["normalised_performance"] == some(0.0, 1.0)
+    (pair,) = table["comparisons"]
+    assert (pair["second"], pair["difference"]["value"]) == ("PPO", 0.5) and pair["holm"] == pair["p_value"] <= 0.05
+
+    entries, scores = formats.entries_csv(made).splitlines(), formats.scores_csv(made).splitlines()
+    assert entries[0].split(",") == list(formats.ENTRY_COLUMNS) and len(entries) == 4
+    assert len(scores) == 1 + 3 * 3 * 20 and scores[0] == "submission,seed,metric,value"
+
+
+def test_a_model_hub_finds_task_data_set_and_metrics(made):
+    models = yaml.safe_load(formats.model_index(made))["model-index"]
+
+    assert [model["name"] for model in models] == ["<b>A_1</b> & *co* | $x$", "PPO", "other"]
+    (result,) = models[1]["results"]
+    assert result["task"]["type"] == "reinforcement-learning"
+    assert result["dataset"] == {
+        "type": "ctgraph_rl/small-v1",
+        "name": "ctgraph_rl small-v1, given: task ids, boundaries",
+        "config": "fo_b1_4tasks",
+        "revision": "84e7ff519e265d9b",
+    }
+    assert result["metrics"][0]["type"] == "normalised_performance" and result["metrics"][0]["value"] == 0.5
+    assert "&id" not in formats.model_index(made)
+
+
+def test_the_page_needs_no_network_and_shows_names_as_text(made):
+    page = html(made)
+
+    digest = re.search(r"script-src 'sha256-([\w+/=]+)'", page)[1]
+    script = re.search(r"<script>(.*)</script>", page, re.DOTALL)[1]
+    assert digest == base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert "default-src 'none'" in page and "&lt;b&gt;A_1&lt;/b&gt;" in page and "<b>A_1" not in page
+    assert re.findall(r'(?:src|href)="(?!#)([^"]*)"', page) == ["https://example.org/repository"] * 3
+    assert page.count('<tr data-level="') == 3 and '<tr data-level="3" data-bytes="4096" data-steps="409600">' in page
+    assert 'data-given="task ids at boundaries"' in page
