@@ -19,7 +19,7 @@ from ctgraph_rl.checks import nearest
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-_MODULES = ("adaptation", "masks", "memory", "nested", "paper", "sharing")
+_MODULES = ("adaptation", "masks", "memory", "nested", "paper", "sharing", "task_free")
 """Each has a table ``NAMED`` of its curricula by name."""
 
 _HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "order"}

@@ -24,7 +24,7 @@ class Detector:
     Args:
         max_labels: most labels; None, where a detector allows it: one for each task of the curriculum.
         patience: frames for which a known label is tried before the next one.
-        snapshot_every: batches between two snapshots of what is learned; a suspicion restores the older of two. None:
+        snapshot_every: frames between two snapshots of what is learned; a suspicion restores the older of two. None:
             there are none, and a suspicion restores nothing.
     """
 

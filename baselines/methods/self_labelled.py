@@ -155,11 +155,8 @@ class SelfLabelledAgent(nn.Module):
         self.num_tried = 0
         """Frames that the present label has been tried."""
 
-        self.num_batches = 0
-        """Batches learned from since the label started."""
-
         self.snapshots: list[dict[str, Any]] = []
-        """The older one first; each with ``state`` and the frames learned from since the one before, ``frames``."""
+        """The older one first; each with ``state`` and ``frames``, those learned from until the next one."""
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -240,7 +237,7 @@ class SelfLabelledAgent(nn.Module):
     def _resume(self, label: int) -> None:
         """Learn the label that has started."""
         self.label, self.num_labels = label, max(self.num_labels, label + 1)
-        self.home, self.waiting, self.num_batches = None, [], 0
+        self.home, self.waiting = None, []
         self.detector.start_label(label, trial=False)
         self.snapshots = []
         if self.detector.snapshot_every is not None:
@@ -251,11 +248,10 @@ class SelfLabelledAgent(nn.Module):
         self.snapshots = [*self.snapshots[-1:], {"state": deepcopy(self.learner.state_dict()), "frames": 0}]
 
     def _learned(self, num_frames: int) -> None:
-        """Count a batch that was learned from, and take a snapshot where it is time."""
-        self.num_batches += 1
+        """Count frames that were learned from, and take a snapshot where it is time."""
         if self.snapshots:
             self.snapshots[-1]["frames"] += num_frames
-            if self.num_batches % cast(int, self.detector.snapshot_every) == 0:
+            if self.snapshots[-1]["frames"] >= cast(int, self.detector.snapshot_every):
                 self._take_snapshot()
 
     def _suspect(self) -> int:
@@ -312,5 +308,5 @@ class SelfLabelledAgent(nn.Module):
         self.detector.load_state_dict(state["detector"])
 
 
-STATE = ("label", "num_labels", "home", "num_tried", "num_batches")
+STATE = ("label", "num_labels", "home", "num_tried")
 """Numbers of a `SelfLabelledAgent` that are saved."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from helpers.paths import CHECKOUT
 
@@ -9,6 +11,7 @@ import curricula
 from ctgraph_rl import CTGraph, Observations, Task
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
+from ctgraph_rl.tasks.switch import Drift
 from curricula.published import MISSING, full_mdp, labelled, one_wait_image, pool_ids, words
 
 EVERY_5120 = Evaluation(num_episodes=10, greedy=True, every=5120)
@@ -343,3 +346,25 @@ def test_an_inconsistent_fourth_family_is_said_in_name_and_summary(name):
     skips = name.endswith("_skips_d5")
     assert depths == [2, 3, 4, 5, 6, 7, 8, 9][: 8 if skips else 7]
     assert ("skips depth 5" in curricula.summary(name)) == skips
+
+
+def test_the_task_free_protocol_has_the_same_tasks_changed_abruptly_gradually_and_again():
+    abrupt, gradual, recurring = (curricula.load(f"task_free_{name}") for name in ("abrupt", "gradual", "recurring"))
+
+    assert abrupt.tasks == gradual.tasks == recurring.tasks == curricula.load("fo_b1_4tasks").tasks
+    assert {each.protocol for each in (abrupt, gradual, recurring)} == {Protocol(boundaries="hidden")}
+    assert abrupt.trained == ((0,), (1,), (2,), (3,))
+    assert gradual.trained == ((0,), (0, 1), (1,), (1, 2), (2,), (2, 3), (3,))
+    assert [block.switch for block in gradual.blocks] == [None, Drift(57)] * 3 + [None]  # 102,400 / (256 x 7)
+    order = [task for block in recurring.trained for task in block]
+    assert sorted(order) == sorted([0, 1, 2, 3] * 3) and all(a != b for a, b in pairwise(order))
+
+
+def test_tasks_of_the_task_free_protocol_differ_in_goals_in_inputs_or_in_both():
+    labels = {how: curricula.load("task_free_abrupt", differ=how).labels for how in ("goals", "inputs", "both")}
+
+    assert labels["goals"] == ("goal1.1", "goal1.2", "goal2.1", "goal2.2")
+    assert labels["inputs"] == tuple(f"goal1.1-img{seed}" for seed in (1, 2, 3, 4))
+    assert labels["both"] == ("goal1.1-img1", "goal1.2-img2", "goal2.1-img3", "goal2.2-img4")
+    with pytest.raises(ValueError, match="differ must be one of goals, inputs, both, got 'images'"):
+        curricula.load("task_free_abrupt", differ="images")

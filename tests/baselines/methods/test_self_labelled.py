@@ -52,7 +52,7 @@ class Script(Detector):
     needs: tuple[str, ...] = ()  # type: ignore[misc]
     max_labels: int | None = 3
     patience: int = 64
-    snapshot_every: int | None = 1
+    snapshot_every: int | None = 32
 
     def __post_init__(self) -> None:
         self.number, self.started, self.seen = 0, list[tuple[int, bool]](), list[Seen]()
@@ -146,7 +146,7 @@ def own(measured: list[dict[str, float]]) -> list[tuple[float, ...]]:
     return [tuple(each[name] for name in OWN) for each in measured]
 
 
-@pytest.mark.parametrize(("every", "kept"), [(1, 4), (2, 2), (3, 0)])
+@pytest.mark.parametrize(("every", "kept"), [(32, 4), (33, 2), (64, 2), (96, 0)])
 def test_a_suspicion_restores_the_older_snapshot_and_a_label_that_is_found_again_learns_on_from_it(
     labelled, every, kept
 ):

@@ -1,0 +1,98 @@
+"""A task-free protocol: what can change without notice, in three curricula of the same four tasks.
+
+Task-free continual learning (Zeno et al. 2018, arXiv 1803.10123; Aljundi et al. 2019, arXiv 1812.03596) gives a learner
+neither ids nor boundaries. Change points are known here to those who measure, so that delays and false alarms of a
+detector can be counted; the learner observes none. The graph is that of CT-FO-B1, so that no task needs memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+from ctgraph_rl.checks import at_least_one, one_of, require
+from ctgraph_rl.tasks.configurations import ct_fo_b1
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block, Protocol
+from ctgraph_rl.tasks.switch import Drift
+from ctgraph_rl.tasks.task import Task
+from curricula.axes import all_goals, image_seeds
+from curricula.order import sequence
+
+TASK_FREE = "ctgraph_rl, after Zeno et al. 2018, arXiv 1803.10123, and Aljundi et al. 2019, arXiv 1812.03596"
+
+HIDDEN = Protocol(boundaries="hidden")
+
+DIFFER = ("goals", "inputs", "both")
+"""What changes from task to task."""
+
+ROUNDS = ((0, 1, 2, 3), (1, 3, 0, 2), (3, 1, 2, 0))
+"""Each task once in a round, and none twice in a row."""
+
+LONGEST_EPISODE = 7
+"""Steps of an optimal episode of CT-FO-B1."""
+
+
+def task_free_abrupt(num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1) -> Curriculum:
+    """Four tasks, one after the other, without notice: changes are abrupt, at known frames.
+
+    Args:
+        num_frames: frames per task.
+        differ: ``goals``, the four of the graph behind the same images; ``inputs``, four image sets and one goal;
+            ``both``, an image set for each goal.
+        image_seed: seed of the first image set; further ones have the next seeds.
+    """
+    return _curriculum("task_free_abrupt", _tasks(differ, image_seed), num_frames)
+
+
+def task_free_gradual(
+    num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1, num_rows: int = 256
+) -> Curriculum:
+    """Four tasks, with a gradual change from each to the next, as long as a stay: there is no point of change.
+
+    Within a change each environment plays, from episode to episode, the next task with a probability that rises from 0
+    to 1 by the time that the longest episodes take.
+
+    Args:
+        num_frames: frames of each stay, and of each change.
+        differ: see `task_free_abrupt`.
+        image_seed: see `task_free_abrupt`.
+        num_rows: environments of the agent, for the number of episodes of a change.
+    """
+    require(*at_least_one(num_frames=num_frames, num_rows=num_rows))
+    tasks, drift = _tasks(differ, image_seed), Drift(max(num_frames // (num_rows * LONGEST_EPISODE), 1))
+    blocks = [Block((tasks[0],), num_frames)]
+    for pair in pairwise(tasks):
+        blocks += [Block(pair, num_frames, drift), Block(pair[1:], num_frames)]
+    return Curriculum("task_free_gradual", 1, TASK_FREE, tuple(blocks), protocol=HIDDEN)
+
+
+def task_free_recurring(num_frames: int = 102_400, differ: str = "goals", image_seed: int = 1) -> Curriculum:
+    """Four tasks, three times each in different orders, without notice: is a task that returns recognised?
+
+    Args:
+        num_frames: frames per stay.
+        differ: see `task_free_abrupt`.
+        image_seed: see `task_free_abrupt`.
+    """
+    tasks = _tasks(differ, image_seed)
+    return _curriculum("task_free_recurring", [tasks[place] for order in ROUNDS for place in order], num_frames)
+
+
+def _curriculum(name: str, tasks: list[Task], num_frames: int) -> Curriculum:
+    return sequence(name, tasks, num_frames, version=1, source=TASK_FREE, protocol=HIDDEN)
+
+
+def _tasks(differ: str, image_seed: int) -> list[Task]:
+    """Return the four tasks."""
+    require(*one_of(DIFFER, differ=differ))
+    task, seeds = ct_fo_b1(image_seed=image_seed), [image_seed + number for number in range(4)]
+    goals = list(all_goals(task))
+    if differ == "goals":
+        return goals
+    shown = list(image_seeds(task, seeds))
+    return shown if differ == "inputs" else [replace(s, goal=g.goal) for s, g in zip(shown, goals, strict=True)]
+
+
+NAMED = {f.__name__: f for f in (task_free_abrupt, task_free_gradual, task_free_recurring)}
+"""The curricula of this module by name."""
