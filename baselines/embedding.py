@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
@@ -88,3 +89,29 @@ def sliced_wasserstein(points: Tensor, directions: Tensor, num_quantiles: int) -
     levels = torch.linspace(0, 1, num_quantiles, dtype=points.dtype, device=points.device)
     quantiles = (points @ directions.T).quantile(levels, dim=0)
     return normalize(quantiles.T.flatten() / math.sqrt(quantiles.numel()), dim=0)
+
+
+def sliced_distances(samples: Tensor, other: Tensor, directions: Tensor) -> Tensor:
+    """Compute sliced 2-Wasserstein distances of several samples from one, all of N points.
+
+    Its square is the mean over the directions of the squared 2-Wasserstein distance of the projections, which is the
+    mean squared difference of the sorted projections. A sample that is moved by c has the distance sqrt(mean((D c)^2)).
+
+    Args:
+        samples: float [..., N, n].
+        other: float [N, n].
+        directions: D, float [L, n], of norm 1.
+
+    Returns:
+        float [...].
+    """
+    moved = _sorted_projections(samples, directions) - _sorted_projections(other, directions)
+    return moved.square().mean(dim=(-2, -1)).sqrt()
+
+
+def _sorted_projections(samples: Tensor, directions: Tensor) -> Tensor:
+    """Return the projections of points [..., N, n] on directions [L, n] in rising order, [..., L, N].
+
+    NumPy sorts them, which takes a twentieth of PyTorch's time.
+    """
+    return torch.from_numpy(np.sort((directions @ samples.mT).cpu().numpy())).to(samples.device)

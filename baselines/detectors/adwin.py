@@ -1,0 +1,151 @@
+"""ADWIN on the return: a window of episodes is cut where the mean returns of its two parts differ.
+
+Bifet and Gavalda 2007 (SDM), "Learning from time-changing data with adaptive windowing"; the detector is that of the
+library River. What is a suspicion, and when a label is accepted, are our choices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import fmean, pvariance
+from typing import Any, NamedTuple
+
+import torch
+
+from baselines.detectors.detector import Detector
+from baselines.detectors.seen import SUSPICION, Seen, Verdict
+from ctgraph_rl.checks import at_least_one, is_int, is_real, require
+
+
+class Returns(NamedTuple):
+    """Returns of episodes: their number, their mean and their variance."""
+
+    number: int
+    mean: float
+    variance: float
+
+
+class ADWIN(Detector):
+    """Suspects a change where ADWIN cuts its window of episode returns, and their mean has fallen.
+
+    A mean that has risen is that of learning. The label keeps number, mean and variance of the returns that were cut
+    off. A label on trial is accepted once at least ``num_trial_episodes`` returns have been seen, and their mean
+    differs from the kept one by at most ADWIN's own bound at the significance ``delta``. So a label without success is
+    accepted in any task without success. Every label starts with an empty window.
+
+    Args:
+        delta: significance of a cut.
+        clock: episodes between two looks for a cut.
+        max_buckets: of each size, in which the window is kept.
+        min_window_length: episodes of a part.
+        grace_period: episodes before the first look.
+        num_trial_episodes: before a label is accepted.
+        max_labels: as the following, of `Detector`.
+
+    Raises:
+        ModuleNotFoundError: without River; names the extra to install.
+    """
+
+    def __init__(
+        self,
+        delta: float,
+        clock: int,
+        max_buckets: int,
+        min_window_length: int,
+        grace_period: int,
+        num_trial_episodes: int,
+        max_labels: int,
+        patience: int,
+        snapshot_every: int,
+    ) -> None:
+        super().__init__(max_labels, patience, snapshot_every)
+        require(
+            (is_real(delta, 0, 1) and 0 < delta < 1, f"delta must be in (0, 1), got {delta!r}"),
+            *at_least_one(clock=clock, max_buckets=max_buckets, min_window_length=min_window_length),
+            *at_least_one(num_trial_episodes=num_trial_episodes),
+            (is_int(grace_period, 0), f"grace_period must be an integer >= 0, got {grace_period!r}"),
+        )
+        self.delta, self.num_trial_episodes = delta, num_trial_episodes
+        make = _river_adwin()
+        self._new_window = lambda: make(delta, clock, max_buckets, min_window_length, grace_period)
+        self.kept: dict[int, Returns] = {}
+        """Of labels that were left."""
+
+        self.start_label(0, trial=False)
+
+    def observe(self, seen: Seen) -> Verdict:
+        """Give ADWIN the returns of the episodes that ended, or on trial compare them with the kept ones."""
+        ended = seen.episode_return.flatten()[seen.done.flatten()].tolist()
+        if self.is_trial:
+            self.returns.extend(ended)
+            return self._accepted()
+        return SUSPICION if any(self._falls(each) for each in ended) else None
+
+    def start_label(self, label: int, trial: bool) -> None:
+        """Start with an empty window."""
+        self.label, self.is_trial = label, trial
+        self.window = self._new_window()
+        self.returns: list[float] = []
+        """In the window, or of the trial."""
+
+    def _falls(self, episode_return: float) -> bool:
+        """Add a return to the window; return whether it was cut and its mean has fallen, and then keep the rest."""
+        self.window.update(episode_return)
+        self.returns.append(episode_return)
+        if not self.window.drift_detected:
+            return False
+        newest = int(self.window.width)
+        before, after = returns_of(self.returns[:-newest]), returns_of(self.returns[-newest:])
+        self.returns = []  # River starts an empty window at the next return
+        if after.mean < before.mean:
+            self.kept[self.label] = before
+        return after.mean < before.mean
+
+    def _accepted(self) -> Verdict:
+        """Return the label on trial if its returns are those that were kept."""
+        kept, seen = self.kept.get(self.label), returns_of(self.returns)
+        if kept is None or seen.number < self.num_trial_episodes:
+            return None
+        return self.label if abs(seen.mean - kept.mean) <= bound(kept, seen, self.delta) else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what verdicts depend on; 8 bytes for each return in the window."""
+        kept = {label: tuple(each) for label, each in self.kept.items()}
+        returns = torch.tensor(self.returns, dtype=torch.float64)
+        return {"label": self.label, "is_trial": self.is_trial, "returns": returns, "kept": kept}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned; the window is made again of its returns."""
+        self.start_label(state["label"], state["is_trial"])
+        self.kept = {label: Returns(*each) for label, each in state["kept"].items()}
+        self.returns = state["returns"].tolist()
+        for each in () if self.is_trial else self.returns:
+            self.window.update(each)
+
+
+def returns_of(values: Sequence[float]) -> Returns:
+    """Return number, mean and variance of some returns; zeros if there are none."""
+    return Returns(len(values), fmean(values), pvariance(values)) if values else Returns(0, 0.0, 0.0)
+
+
+def bound(first: Returns, second: Returns, delta: float) -> float:
+    """Compute ADWIN's bound of the difference of two means, Bifet and Gavalda 2007, Section 3.3.
+
+    epsilon = sqrt(2 v L / m) + 2 L / (3 m), with L = ln(2 ln(n) / delta), n episodes in all, 1 / m = 1 / n0 + 1 / n1,
+    and v the variance of all returns.
+    """
+    total = first.number + second.number
+    mean = (first.number * first.mean + second.number * second.mean) / total
+    variance = sum(each.number * (each.variance + (each.mean - mean) ** 2) for each in (first, second)) / total
+    inverse, log = 1 / first.number + 1 / second.number, math.log(2 * math.log(total) / delta)
+    return math.sqrt(2 * variance * log * inverse) + 2 / 3 * log * inverse
+
+
+def _river_adwin() -> Any:
+    """Return River's detector."""
+    try:
+        from river.drift import ADWIN as RiverADWIN
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("detector=adwin needs river: pip install 'ctgraph_rl[detectors]'") from error
+    return RiverADWIN

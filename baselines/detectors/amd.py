@@ -1,0 +1,279 @@
+"""AMD: a predictive model for each label, and a chi-squared test of what it predicts.
+
+Dick et al. 2020, Frontiers in Neurorobotics 14, 578675, here after the equations, without their code. The model is a
+table of frequencies in place of their predictive state representation or network; windows do not overlap, two
+batches decide, a new model is not tested during its first steps, and steps without a cluster are one: our choices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from baselines.detectors.detector import Detector
+from baselines.detectors.seen import Seen, Verdict
+from ctgraph_rl.checks import at_least_one, fraction, is_int, one_of, positive, require, true_or_false
+
+DEGREES = ("published", "corrected")
+
+IMPOSSIBLE, PENALTY = 1e-8, 10.0
+"""Where less than the first is expected, PENALTY * O^2 is added in place of (O - E)^2 / E."""
+
+
+class AMD(Detector):
+    """Compares what is observed after each action with what the model of each label expects.
+
+    The model of a label gives P(o | a), the probability of each observation after each action, from the last ``order``
+    actions and observations of the episode: relative frequencies of the steps that were acted with the label, with
+    ``smoothing`` added to each count. The tables P of ``window`` steps are clustered by DBSCAN. With O the number of
+    steps in which o followed a in a cluster, and E the sum over the cluster's steps with a of its mean P(o | a),
+
+        X = sum (O - E)^2 / E,   p = P(chi^2 with k degrees of freedom > X)
+
+    with k = n |o| (``published``), which accepts too often, or n (|o| - 1) (``corrected``), where n is the number of
+    pairs of a cluster and an action in it. The p-value of a batch is the smallest one of its W windows, times W. A
+    label fits if that is at least ``threshold``. Where the present label does not fit, the next batch decides, as the
+    steps of this one may be of two tasks: the label of the largest p-value is next, or a new one if none fits.
+
+    Args:
+        window: steps of a test.
+        order: steps of the episode on which a prediction depends.
+        smoothing: added to each count.
+        radius: two tables with at most this Euclidean distance are neighbours.
+        min_neighbours: of a table and itself that make it the core of a cluster.
+        threshold: a label with a smaller p-value does not fit.
+        degrees: of freedom: published or corrected.
+        keeps_fitting: the present label stays as long as it fits; False: the label with the largest p-value is next.
+        num_untested: steps of a new label before it is tested.
+        max_labels: most labels.
+    """
+
+    needs = ("observation_id",)
+
+    def __init__(
+        self,
+        window: int,
+        order: int,
+        smoothing: float,
+        radius: float,
+        min_neighbours: int,
+        threshold: float,
+        degrees: str,
+        keeps_fitting: bool,
+        num_untested: int,
+        max_labels: int,
+    ) -> None:
+        super().__init__(max_labels, patience=1, snapshot_every=None)
+        require(
+            *at_least_one(window=window, order=order, min_neighbours=min_neighbours),
+            *positive(smoothing=smoothing, radius=radius),
+            *fraction(threshold=threshold),
+            *one_of(DEGREES, degrees=degrees),
+            *true_or_false(keeps_fitting=keeps_fitting),
+            (is_int(num_untested, 0), f"num_untested must be an integer >= 0, got {num_untested!r}"),
+        )
+        self.window, self.order, self.smoothing = window, order, smoothing
+        self.radius, self.min_neighbours = radius, min_neighbours
+        self.threshold, self.degrees, self.keeps_fitting = threshold, degrees, keeps_fitting
+        self.num_untested = num_untested
+        self.label = 0
+        self.is_doubted = False
+        """Whether the label did not fit the last batch."""
+
+    def setup(self, num_rows: int, num_steps: int, num_actions: int, num_observations: int | None) -> None:
+        """See `Detector`.
+
+        Raises:
+            ValueError: for images, and for histories that are too long to be numbered.
+        """
+        message = "AMD needs one-hot observations, and these are images: take one-hot tasks, or another detector"
+        require((num_observations is not None, message))
+        self.num_actions, self.num_observations = num_actions, num_observations or 0
+        self.num_outcomes = num_actions * self.num_observations
+        longest = int(63 / math.log2(self.num_outcomes + 1)) - 1
+        rule = f"order must be at most {longest} with {num_actions} actions and {num_observations} observations"
+        require((self.order <= longest, f"{rule}, got {self.order}"))
+        self.models: dict[int, Counts] = {0: Counts()}
+        """Of each label."""
+
+        self.recent = torch.zeros(num_rows, self.order - 1, dtype=torch.int64)
+        """The last pairs of action and next observation of each row's episode, from 1; 0 stands for none."""
+
+        self.last_action = torch.zeros(num_rows, dtype=torch.int64)
+        """Of each row."""
+
+        self.pending = torch.zeros(0, 3, dtype=torch.int64)
+        """History, action and next observation of the steps behind the last window."""
+
+    def observe(self, seen: Seen) -> Verdict:
+        """Test every full window; learn from the batch if the label stays."""
+        new = self.triples(seen)
+        steps = torch.cat([self.pending, new])
+        full = len(steps) // self.window * self.window
+        self.pending = steps[full:].clone()
+        label = self._label_of(steps[:full].view(-1, self.window, 3)) if full else self.label
+        if label == self.label:
+            self.is_doubted = False
+            self._learn(new)
+        elif self.is_doubted:
+            return label
+        else:
+            self.is_doubted, self.pending = True, self.pending[:0]
+        return None
+
+    def start_label(self, label: int, trial: bool) -> None:
+        """Begin a model where the label is new, and forget the steps that are in no window yet."""
+        self.label, self.is_doubted, self.pending = label, False, self.pending[:0]
+        self.models.setdefault(label, Counts())
+
+    def triples(self, seen: Seen) -> Tensor:
+        """Return number of the history, action and next observation of each step, row after row, int64 [N, 3]."""
+        ids, action, following = _needed(seen)
+        before = torch.cat([self.last_action.unsqueeze(1), action[:, :-1]], dim=1)
+        pairs = torch.where(seen.is_init, 0, before) * self.num_observations + ids + 1
+        begins = torch.cat([torch.zeros_like(self.recent, dtype=torch.bool), seen.is_init], dim=1)
+        lags = [torch.cat([self.recent, pairs], dim=1)]
+        for _ in range(1, self.order):
+            earlier = torch.cat([torch.zeros_like(lags[-1][:, :1]), lags[-1][:, :-1]], dim=1)
+            lags.append(torch.where(begins, 0, earlier))
+        history = sum(each * (self.num_outcomes + 1) ** lag for lag, each in enumerate(lags))[:, self.order - 1 :]
+        self.last_action = action[:, -1].clone()
+        self.recent = torch.stack([each[:, -1] for each in reversed(lags)], dim=1)[:, 1:]
+        return torch.stack([history, action, following], dim=-1).flatten(0, 1)
+
+    def _learn(self, steps: Tensor) -> None:
+        """Count steps, int64 [N, 3], for the present label."""
+        history, action, following = steps.unbind(1)
+        self.models[self.label].add(history * self.num_outcomes + action * self.num_observations + following)
+
+    def _predicted(self, label: int, history: Tensor) -> Tensor:
+        """Return P(o | a) after histories by the model of a label, float64 [..., actions, observations]."""
+        outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes)
+        counts = self.models[label].of(outcomes).double() + self.smoothing
+        counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
+        return counts / counts.sum(dim=-1, keepdim=True)
+
+    def _label_of(self, windows: Tensor) -> int:
+        """Return the label that fits windows of steps, int64 [W, window, 3], by its smallest p-value times W."""
+        if self.models[self.label].total < self.num_untested:
+            return self.label
+        smallest = [float(self.p_values(label, windows).min()) for label in range(len(self.models))]
+        return self._label_for([min(1.0, len(windows) * p_value) for p_value in smallest])
+
+    def _label_for(self, p_values: list[float]) -> int:
+        """Return the label that fits, by the p-values of all."""
+        present, best = p_values[self.label], max(p_values)
+        if present == best or (self.keeps_fitting and present >= self.threshold):
+            return self.label if present >= self.threshold or self._is_full else len(p_values)
+        return p_values.index(best) if best >= self.threshold or self._is_full else len(p_values)
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self.models) == self.max_labels
+
+    def p_values(self, label: int, windows: Tensor) -> Tensor:
+        """Return the p-value of a label in each window of steps, int64 [W, window, 3]: float64 [W]."""
+        history, action, following = windows.unbind(-1)
+        predicted = self._predicted(label, history)
+        found = clusters(predicted.flatten(2), self.radius, self.min_neighbours)
+        groups = one_hot(found + 1, self.window + 1).double()
+        means = torch.einsum("wtc,wtao->wcao", groups, predicted) / groups.sum(1).clamp(min=1)[..., None, None]
+        taken = torch.einsum("wtc,wta->wtca", groups, one_hot(action, self.num_actions).double())
+        expected = means * taken.sum(dim=1).unsqueeze(-1)
+        observed = torch.einsum("wtca,wto->wcao", taken, one_hot(following, self.num_observations).double())
+        pairs = (taken.sum(dim=1) > 0).sum(dim=(1, 2))
+        degrees = pairs * (self.num_observations - (self.degrees == "corrected"))
+        return chi_squared_tail(statistic(observed, expected), degrees)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the models, and what verdicts depend on beside them."""
+        models = {label: (model.keys, model.counts) for label, model in self.models.items()}
+        last = {"recent": self.recent, "last_action": self.last_action, "pending": self.pending}
+        return {"label": self.label, "is_doubted": self.is_doubted, "models": models, **last}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.label, self.is_doubted, self.pending = state["label"], state["is_doubted"], state["pending"]
+        self.recent, self.last_action = state["recent"], state["last_action"]
+        self.models = {label: Counts(*model) for label, model in state["models"].items()}
+
+
+class Counts:
+    """How often each of many numbers occurred; those that never did take no memory.
+
+    Args:
+        keys: the numbers in rising order, int64 [n]; None: none.
+        counts: of each, int64 [n].
+    """
+
+    def __init__(self, keys: Tensor | None = None, counts: Tensor | None = None) -> None:
+        empty = torch.zeros(0, dtype=torch.int64)
+        self.keys, self.counts = empty if keys is None else keys, empty if counts is None else counts
+
+    @property
+    def total(self) -> int:
+        """Of all counts."""
+        return int(self.counts.sum())
+
+    def add(self, numbers: Tensor) -> None:
+        """Count numbers, int64 [N]."""
+        weights = torch.cat([self.counts, torch.ones_like(numbers)])
+        self.keys, places = torch.cat([self.keys, numbers]).unique(return_inverse=True)
+        self.counts = torch.zeros_like(self.keys).index_add(0, places, weights)
+
+    def of(self, numbers: Tensor) -> Tensor:
+        """Return the counts of numbers, int64 [...]."""
+        if not len(self.keys):
+            return torch.zeros_like(numbers)
+        places = torch.searchsorted(self.keys, numbers).clamp(max=len(self.keys) - 1)
+        return torch.where(self.keys[places] == numbers, self.counts[places], 0)
+
+
+def _needed(seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the observation of each step, its action and the next observation."""
+    return cast(Tensor, seen.observation_id), seen.action, cast(Tensor, seen.next_observation_id)
+
+
+def statistic(observed: Tensor, expected: Tensor) -> Tensor:
+    """Compute the sum of (O - E)^2 / E over all but the first dimension; 10 O^2 where E is below 1e-8."""
+    terms = torch.where(expected < IMPOSSIBLE, PENALTY * observed**2, (observed - expected) ** 2 / expected)
+    return terms.flatten(1).sum(dim=1)
+
+
+def chi_squared_tail(statistics: Tensor, degrees: Tensor) -> Tensor:
+    """Return the probability that a chi-squared variable is larger, float64 [...]."""
+    return torch.special.gammaincc(degrees.double() / 2, statistics.double() / 2)
+
+
+def clusters(points: Tensor, radius: float, min_neighbours: int) -> Tensor:
+    """Cluster points by DBSCAN: cores within the radius of each other, and those within the radius of a core.
+
+    A core has at least ``min_neighbours`` points within the radius, itself among them. A point near cores of several
+    clusters is in the one whose first core comes first.
+
+    Args:
+        points: float [..., N, n].
+        radius: largest Euclidean distance of neighbours.
+        min_neighbours: of a core.
+
+    Returns:
+        int64 [..., N]: the place of the first core of a point's cluster, -1 without a cluster.
+    """
+    number = points.shape[-2]
+    near = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist") <= radius
+    core = near.sum(dim=-1) >= min_neighbours
+    firsts = torch.where(core, torch.arange(number), number)
+    joined = near & core.unsqueeze(-2)
+    for _ in range(number):
+        spread = torch.where(joined, firsts.unsqueeze(-2), number).amin(dim=-1)
+        following = torch.where(core, torch.minimum(firsts, spread), number)
+        if torch.equal(following, firsts):
+            break
+        firsts = following
+    found = torch.where(joined, firsts.unsqueeze(-2), number).amin(dim=-1)
+    return torch.where(found < number, found, -1)

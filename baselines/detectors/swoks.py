@@ -1,0 +1,190 @@
+"""SWOKS: sliced Wasserstein distances from the past, and a test whether they have grown.
+
+Dick et al. 2024 (CoLLAs), arXiv 2405.19047, here after the equations, without their code. What samples of a trial do,
+what is kept of a label to which the learner returns, and how often a sample has to be new are our choices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from baselines.detectors.detector import Detector
+from baselines.detectors.seen import SUSPICION, Seen, Verdict
+from baselines.detectors.two_sample import MOST_VALUES, ks_greater
+from baselines.embedding import sliced_distances, unit_directions
+from ctgraph_rl.checks import at_least_one, fraction, is_int, positive, require
+
+WINDOWS_BEFORE = 3
+"""Windows of a label before the first distance is measured."""
+
+
+class SWOKS(Detector):
+    """Suspects a change where the newest steps are further from the label's earlier ones than they were.
+
+    A step is the point u = (action, sqrt(F) reward, features [F]). After every ``window`` points the sliced
+    2-Wasserstein distance of these from a reference is measured for each label: for the present one the reference is
+    the oldest of its last ``num_windows`` + 1 windows, for the others the one that they had when they were left. Once
+    more than ``stable_phase`` points have passed since the label was started, the last ``num_tested`` distances are
+    compared with the earlier ones, times ``adjustment``: a one-sided Kolmogorov-Smirnov test. A p-value below ``alpha``
+    is a suspicion. The label then keeps its reference, and its distances but the last ``num_left_out``.
+
+    A label on trial is accepted as soon as the same test of its distances has a p-value above ``accept``. Points of a
+    trial are in no reference. The label that is accepted starts with an empty history.
+
+    Args:
+        window: points between two tests (L_D).
+        num_windows: windows of the history after the oldest one (L_W).
+        num_directions: of the sliced distance.
+        num_tested: newest distances that are tested.
+        num_kept: distances that are kept, with those.
+        num_left_out: newest distances that are not part of what a label keeps when it is left.
+        alpha: a p-value below is a suspicion.
+        accept: a p-value above accepts a label on trial.
+        adjustment: by which earlier distances are multiplied.
+        stable_phase: points after the start of a label without a test.
+        num_fresh: distances that are measured in a trial before its first test; with fewer than ``num_tested``, a label
+            may be accepted for steps that were taken before its trial.
+        max_labels: as the following, of `Detector`.
+    """
+
+    needs = ("features",)
+
+    def __init__(
+        self,
+        window: int,
+        num_windows: int,
+        num_directions: int,
+        num_tested: int,
+        num_kept: int,
+        num_left_out: int,
+        alpha: float,
+        accept: float,
+        adjustment: float,
+        stable_phase: int,
+        num_fresh: int,
+        max_labels: int,
+        patience: int,
+        snapshot_every: int,
+    ) -> None:
+        super().__init__(max_labels, patience, snapshot_every)
+        counts = {"window": window, "num_windows": num_windows, "num_directions": num_directions}
+        require(*at_least_one(**counts, num_tested=num_tested, num_kept=num_kept, num_left_out=num_left_out))
+        require(
+            (num_left_out >= num_tested, f"num_left_out must be at least num_tested={num_tested}, got {num_left_out}"),
+            (
+                num_left_out < num_kept <= MOST_VALUES,
+                f"num_kept must be above num_left_out={num_left_out} and at most {MOST_VALUES}, got {num_kept}",
+            ),
+            (is_int(stable_phase, 0), f"stable_phase must be an integer >= 0, got {stable_phase!r}"),
+            (
+                is_int(num_fresh, 0) and num_fresh * window <= patience,
+                f"num_fresh must be an integer in 0..{patience // window}, the windows in patience={patience} points, "
+                f"got {num_fresh!r}",
+            ),
+            *fraction(alpha=alpha, accept=accept),
+            *positive(adjustment=adjustment),
+        )
+        self.window, self.num_windows, self.num_directions = window, num_windows, num_directions
+        self.num_tested, self.num_kept, self.num_left_out = num_tested, num_kept, num_left_out
+        self.alpha, self.accept, self.adjustment = alpha, accept, adjustment
+        self.stable_phase, self.num_fresh = stable_phase, num_fresh
+        self.label, self.is_trial = 0, False
+        self.num_points = 0
+        """In windows since the label was started."""
+
+        self.pending = torch.zeros(0)
+        """The points behind the last window."""
+
+        self.history: list[Tensor] = []
+        """The last windows of the present label, oldest first, float32 [window, n] each; none in a trial."""
+
+        self.references: dict[int, Tensor] = {}
+        """Of labels that were left, float32 [window, n]."""
+
+        self.earlier: dict[int, list[float]] = {}
+        """Distances with which those of a label that was left are compared."""
+
+        self.distances: dict[int, list[float]] = {0: []}
+        """The newest distances from the reference of each label, oldest first."""
+
+    def observe(self, seen: Seen) -> Verdict:
+        """Measure distances and test them after every full window."""
+        new = points_of(seen)
+        points = torch.cat([self.pending.view(-1, new.shape[1]), new])
+        full = len(points) // self.window * self.window
+        self.pending = points[full:].clone()
+        verdicts = (self._update(window) for window in points[:full].unflatten(0, (-1, self.window)))
+        return next((verdict for verdict in verdicts if verdict is not None), None)
+
+    def start_label(self, label: int, trial: bool) -> None:
+        """Forget the points that are in no window yet, and the history."""
+        self.label, self.is_trial = label, trial
+        self.num_points, self.history, self.pending = 0, [], torch.zeros(0)
+        if not trial:
+            self.references.pop(label, None)
+            self.distances[label] = []
+
+    def _update(self, window: Tensor) -> Verdict:
+        """Measure the distances of a window, and test those of the label."""
+        self.num_points += len(window)
+        if not self.is_trial:
+            self.history = [*self.history, window.clone()][-self.num_windows - 1 :]
+        self._measure(window)
+        return self._accepted() if self.is_trial else self._suspicion()
+
+    def _measure(self, window: Tensor) -> None:
+        """Measure the distance of a window from the reference of each label that has one."""
+        references = dict(self.references)
+        if len(self.history) > WINDOWS_BEFORE:
+            references[self.label] = self.history[0]
+        if not references:
+            return
+        directions = unit_directions(self.num_directions, window.shape[1])
+        found = sliced_distances(torch.stack(list(references.values())), window, directions).tolist()
+        for label, distance in zip(references, found, strict=True):
+            self.distances[label] = [*self.distances[label], distance][-self.num_kept :]
+
+    def _accepted(self) -> Verdict:
+        """Return the label on trial if it is accepted."""
+        earlier, newest = self.earlier[self.label], self.distances[self.label][-self.num_tested :]
+        enough = len(newest) == self.num_tested and self.num_points >= self.num_fresh * self.window
+        return self.label if enough and self._p_value(earlier, newest) > self.accept else None
+
+    def _suspicion(self) -> Verdict:
+        """Return a suspicion if the distances of the present label have grown; it then keeps what it is known by."""
+        distances = self.distances[self.label]
+        if self.num_points <= self.stable_phase or len(distances) <= self.num_left_out:
+            return None
+        if self._p_value(distances[: -self.num_tested], distances[-self.num_tested :]) >= self.alpha:
+            return None
+        self.references[self.label], self.earlier[self.label] = self.history[0], distances[: -self.num_left_out]
+        return SUSPICION
+
+    def _p_value(self, earlier: Sequence[float], newest: Sequence[float]) -> float:
+        return ks_greater([self.adjustment * distance for distance in earlier], newest)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that verdicts depend on."""
+        return {name: copy(getattr(self, name)) for name in STATE}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        for name in STATE:
+            setattr(self, name, copy(state[name]))
+
+
+STATE = ("label", "is_trial", "num_points", "pending", "history", "references", "earlier", "distances")
+"""The attributes that change."""
+
+
+def points_of(seen: Seen) -> Tensor:
+    """Return the steps of a batch as points, row after row: action, sqrt(F) reward, features; float32 [N, 2 + F]."""
+    features = cast(Tensor, seen.features).flatten(0, 1)
+    reward = math.sqrt(features.shape[1]) * seen.reward.flatten()
+    return torch.cat([seen.action.flatten().unsqueeze(1), reward.unsqueeze(1), features], dim=1).float()

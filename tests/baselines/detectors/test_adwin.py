@@ -1,0 +1,110 @@
+"""ADWIN on the return: its bound by hand, false alarms, falls and rises, trials, and River's absence."""
+
+from __future__ import annotations
+
+import io
+import math
+import sys
+
+import pytest
+import torch
+
+from baselines.catalogue import catalogue
+from baselines.detectors.adwin import ADWIN, Returns, bound
+from baselines.detectors.seen import SUSPICION, Seen
+
+pytest.importorskip("river")
+
+DEFAULTS = next(entry.settings for entry in catalogue("detector") if entry.name == "adwin")
+
+
+def episodes(number, success, seed=0):
+    """Yield batches of 2 rows x 16 steps in which each episode has 4 steps, and a return of 1 with a probability."""
+    random = torch.Generator().manual_seed(seed)
+    done = torch.zeros(2, 16, dtype=torch.bool)
+    done[:, 3::4] = True
+    for _ in range(number // 8):
+        returns = torch.where(done, (torch.rand(2, 16, generator=random) < success).float(), 0.5)
+        yield Seen(torch.zeros(2, 16, dtype=torch.int64), returns, ~done, done, returns)
+
+
+def verdicts(detector, batches):
+    """Return the verdicts on batches."""
+    return [detector.observe(batch) for batch in batches]
+
+
+def test_the_bound_is_that_of_adwin():
+    first, second = Returns(100, 0.9, 0.09), Returns(50, 0.6, 0.24)
+    log, variance = math.log(2 * math.log(150) / 0.002), (100 * 0.09 + 50 * 0.24 + 100 * 0.1**2 + 50 * 0.2**2) / 150
+
+    assert bound(first, second, 0.002) == pytest.approx(math.sqrt(2 * 0.03 * variance * log) + 2 / 3 * 0.03 * log)
+
+
+def test_a_fall_is_suspected_within_a_hundred_episodes_and_a_rise_is_not():
+    detector = ADWIN(**DEFAULTS)
+
+    assert set(verdicts(detector, episodes(800, 0.2))) == {None}
+    assert set(verdicts(detector, episodes(800, 0.9, seed=1))) == {None}
+    assert SUSPICION in verdicts(detector, episodes(104, 0.2, seed=2))
+    assert detector.kept[0].mean == pytest.approx(0.9, abs=0.1) and detector.kept[0].number > 500
+
+
+def test_a_return_that_does_not_change_is_suspected_in_few_of_40_streams():
+    """ADWIN promises at most delta at each look, here 0.002 x 31 looks: the quantile 0.999 of a binomial is 8."""
+    binom = pytest.importorskip("scipy.stats").binom
+
+    found = sum(SUSPICION in verdicts(ADWIN(**DEFAULTS), episodes(1000, 0.5, seed)) for seed in range(40))
+
+    assert found <= binom.ppf(0.999, 40, 0.002 * 31)
+
+
+@pytest.mark.parametrize(("success", "accepted"), [(0.9, True), (0.3, False)])
+def test_a_label_on_trial_is_accepted_where_its_returns_are_back(success, accepted):
+    detector = ADWIN(**DEFAULTS)
+    verdicts(detector, episodes(800, 0.9))
+    assert SUSPICION in verdicts(detector, episodes(160, 0.1))
+
+    detector.start_label(0, trial=True)
+    found = verdicts(detector, episodes(400, success, seed=3))
+
+    assert found[:6] == [None] * 6
+    assert (0 in found) is accepted
+
+
+def test_after_a_resume_nothing_differs():
+    batches = [*episodes(800, 0.9), *episodes(160, 0.1, seed=1)]
+    whole, before, after = (ADWIN(**DEFAULTS) for _ in range(3))
+
+    expected = verdicts(whole, batches)
+    verdicts(before, batches[:90])
+    file = io.BytesIO()
+    torch.save(before.state_dict(), file)
+    file.seek(0)
+    after.load_state_dict(torch.load(file, weights_only=True))
+
+    assert SUSPICION in expected
+    assert verdicts(after, batches[90:]) == expected[90:]
+    assert str(after.state_dict()) == str(whole.state_dict())
+
+
+def test_without_river_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "river.drift", None)
+
+    with pytest.raises(
+        ModuleNotFoundError, match=r"^detector=adwin needs river: pip install 'ctgraph_rl\[detectors\]'$"
+    ):
+        ADWIN(**DEFAULTS)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"delta": 0.0}, r"delta must be in \(0, 1\), got 0.0"),
+        ({"delta": "x"}, r"delta must be in \(0, 1\), got 'x'"),
+        ({"clock": 0, "num_trial_episodes": 0}, "clock must be an integer >= 1, got 0; num_trial_episodes must be"),
+        ({"grace_period": -1}, "grace_period must be an integer >= 0, got -1"),
+    ],
+)
+def test_a_setting_out_of_range_is_refused_by_name(changed, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        ADWIN(**{**DEFAULTS, **changed})
