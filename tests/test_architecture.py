@@ -57,6 +57,7 @@ NEVER = {
 """What a package must never import, however low it stands."""
 
 KNOW_HYDRA = (
+    "ctgraph_rl.board.relearn",
     "ctgraph_rl.run",
     "ctgraph_rl.runs.config",
     "ctgraph_rl.runs.job",
@@ -67,6 +68,7 @@ KNOW_HYDRA = (
 DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
     "ctgraph_rl.packages": "the only door to curricula and baselines",
+    "ctgraph_rl.board.relearn": "learners of others, in a process of their own",
     "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
     "ctgraph_rl.report.style": "packages of an extra",

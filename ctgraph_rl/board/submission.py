@@ -380,11 +380,11 @@ def log_sum(log: RunLog) -> str:
     """
     found = hashlib.sha256()
     for measurement in log.measurements:
-        found.update(json.dumps(_counted(measurement), sort_keys=True).encode() + b"\n")
+        found.update(json.dumps(counted(measurement), sort_keys=True).encode() + b"\n")
     return found.hexdigest()
 
 
-def _counted(measurement: Mapping[str, Any]) -> dict[str, Any]:
+def counted(measurement: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of a measurement counts in the sum of a log."""
     kept = without_time(measurement)
     if kept["kind"] != "run":

@@ -49,7 +49,7 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     reason = _why_one_after_the_other(runs[0][0])
     if reason is None:
-        _run_as_one(runs)
+        run_as_one(runs)
     else:
         print(f"note: seeds are trained one after the other, as {terminal_text(reason)}", file=sys.stderr)
         _run_in_turn(runs)
@@ -77,8 +77,15 @@ def _run_in_turn(runs: Sequence[Run]) -> None:
         raise RuntimeError("; ".join(errors))
 
 
-def _run_as_one(runs: Sequence[Run]) -> None:
-    """Run those that are not finished, as one batch; a seed that fails stops no other."""
+def run_as_one(runs: Sequence[Run]) -> None:
+    """Run those that are not finished, as one batch; a seed that fails stops no other.
+
+    Args:
+        runs: the configuration of each seed, and its existing directory.
+
+    Raises:
+        RuntimeError: if seeds have failed.
+    """
     with ExitStack() as stack:
         for _, run_dir in runs:
             stack.enter_context(locked(run_dir))

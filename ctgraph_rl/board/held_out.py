@@ -1,0 +1,144 @@
+"""Level *held out* of a verification: the submitted configuration learns what nobody could tune it for.
+
+Seeds, images and goals follow from the submission and the verifier's number. The scores are tested against the
+submitted ones: are they lower than chance explains?
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.board.rerun import Cell, Result, check_of_scores, job_of, score_name, score_of
+from ctgraph_rl.board.rescore import Check
+from ctgraph_rl.board.submission import Submission
+from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.curriculum_json import file_text
+from ctgraph_rl.tasks.task import Task
+
+SEEDS = range(10**6, 2**31)
+"""Seeds that a verifier draws from, of runs and of images, where no track says otherwise."""
+
+
+HELD_OUT = "held_out"
+
+
+def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:
+    """Return the seeds that a verifier's number draws: by the rule of the track, or from `SEEDS`.
+
+    Args:
+        submission: for which.
+        number: of the verifier, >= 0.
+        count: how many, >= 1.
+    """
+    if submission.track is not None:
+        return submission.track.draw_held_out_seeds(submission.digest, number, count)
+    texts = (f"{submission.digest} {number} {place}" for place in range(2 * count + 100))
+    seeds = dict.fromkeys(SEEDS[drawn(text, len(SEEDS))] for text in texts)
+    return tuple(seeds)[:count]
+
+
+def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[Cell]:
+    """Return what is learned: a seed each, with images and goals of its own, and the submitted configuration.
+
+    Args:
+        submission: with the configuration.
+        number: of the verifier, >= 0.
+        count: how many seeds, >= 1.
+        folder: where each process has a folder, with the file of its curriculum.
+    """
+    cells, first = [], submission.finished[0]
+    for seed in seeds_of(submission, number, count):
+        own = made_folder(folder / f"seed{seed}").resolve()
+        curriculum = other_curriculum(submission.curriculum, f"{submission.digest} {number} {seed}")
+        write_whole(own / CURRICULUM, file_text(curriculum.to_json()))
+        job = job_of(submission, (seed,), first, own / CURRICULUM)
+        cells.append(Cell(own, job, (), curriculum, seconds=first.seconds))
+    return cells
+
+
+def held_out_checks(submission: Submission, results: Sequence[tuple[Cell, Result]]) -> Iterator[Check]:
+    """Yield a check for each run that failed, and that of the scores of the others.
+
+    Args:
+        submission: with the submitted scores.
+        results: of each seed.
+    """
+    name, found = score_name(submission), []
+    for cell, result in results:
+        try:
+            value = None if result.log is None else score_of(result.log, cell.curriculum, name)
+            failure = result.failure
+        except ValueError as error:
+            value, failure = None, str(error)
+        if failure is not None:
+            what = f"run of seed {cell.job.seeds[0]}"
+            yield Check(what, "it finishes", terminal_text(failure), None, level=HELD_OUT)
+        found += [] if value is None else [value]
+    what = f"{name} of {len(found)} runs with other seeds, images and goals"
+    yield check_of_scores(submission, found, what, HELD_OUT)
+
+
+def drawn(text: str, most: int) -> int:
+    """Return an integer in [0, most) that follows from a text by SHA-256; the first 8 bytes modulo ``most``."""
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % most
+
+
+def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
+    """Return a curriculum with other images and goals, and all else alike: what its tasks share, they share still.
+
+    Every generated image set gets another seed, equal ones the same. The branches of every decision state are renamed,
+    in all tasks alike, so that goals that share their first decisions do so afterwards. Image sets without a seed stay.
+
+    Args:
+        curriculum: what was learned.
+        key: decides images and goals.
+    """
+    others: dict[Task, Task] = {}
+    held_out = curriculum.evaluation.held_out
+    for task in (*curriculum.tasks, *held_out):
+        others[task] = other_task(task, key)
+    blocks = tuple(replace(block, tasks=tuple(others[task] for task in block.tasks)) for block in curriculum.blocks)
+    evaluation = replace(curriculum.evaluation, held_out=tuple(others[task] for task in held_out))
+    name, source = f"{curriculum.name} (held out)", f"{curriculum.source}; images and goals drawn by {key}"
+    return replace(curriculum, name=name, source=source, blocks=blocks, evaluation=evaluation)
+
+
+def other_task(task: Task, key: str) -> Task:
+    """Return a task with other images and another goal; see `other_curriculum`."""
+    changed: dict[str, Any] = {"goal": renamed(task.goal, task.graph.branching_factor, key)}
+    if task.image_seed is not None:
+        seed = SEEDS[drawn(f"{key} images {task.image_seed}", len(SEEDS))]
+        changed["images"] = replace(task.images, seed=seed)  # type: ignore[type-var]
+    if task.swapped_branches is not None:
+        path, pair = task.swapped_branches
+        both = (renamed((*path, branch), task.graph.branching_factor, key) for branch in pair)
+        first, second = sorted(both)
+        changed["swapped_branches"] = (first[:-1], (first[-1], second[-1]))
+    return replace(task, **changed)
+
+
+def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int, ...]:
+    """Return a path through a tree whose branches are renamed at every node, decisions in 1..b.
+
+    Args:
+        path: decisions from the home state on.
+        branching_factor: b.
+        key: decides the new names.
+    """
+    names = (_names(path[:place], branching_factor, key) for place in range(len(path)))
+    return tuple(new[decision] for new, decision in zip(names, path, strict=True))
+
+
+def _names(before: tuple[int, ...], branching_factor: int, key: str) -> Mapping[int, int]:
+    """Return the new name of each branch of the node behind some decisions."""
+    branches = range(1, branching_factor + 1)
+    text = f"{key} branches {'.'.join(map(str, before))}"
+    order = sorted(branches, key=lambda branch: hashlib.sha256(f"{text} {branch}".encode()).digest())
+    return dict(zip(branches, order, strict=True))

@@ -1,0 +1,100 @@
+"""What runs in a process of its own: runs are learned again, from a configuration or by the code of others.
+
+``python -m ctgraph_rl.board.relearn JOB.json`` writes a run directory for each seed into the working directory.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.job import run_job
+from ctgraph_rl.runs.settings import with_added
+from ctgraph_rl.runs.together import run_as_one
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+class Job(NamedTuple):
+    """What a process learns, as plain values."""
+
+    seeds: Sequence[int]
+    together: bool  # whether the seeds are trained as one batch
+    config: Mapping[str, Any]  # without the seed
+    num_threads: int
+    entry_point: str | None  # module:function of a learner that is not ours
+    curriculum: str | None  # file of what it learns; None: what the configuration says
+
+    def write(self, path: Path) -> None:
+        """Write the job to a file."""
+        write_whole(path, json.dumps(self._asdict()))
+
+    @classmethod
+    def read(cls, path: Path) -> Job:
+        """Read what `write` wrote."""
+        return cls(**json.loads(path.read_text(encoding="utf-8")))
+
+
+def run_dir_of(folder: Path, seed: int) -> Path:
+    """Return the run directory of a seed within the folder of its process."""
+    return folder / f"seed{seed}"
+
+
+def learn_again(job: Job, folder: Path) -> None:
+    """Learn every seed of a job into a run directory within a folder.
+
+    Raises:
+        ValueError: for a configuration or an entry point that cannot be run here.
+        RuntimeError: if seeds that are trained together have failed.
+    """
+    run_dirs = [run_dir_of(folder, seed) for seed in job.seeds]
+    if job.entry_point is not None:
+        _call(job, run_dirs[0])
+        return
+    runs = [(configuration(_settings(job, seed)), run_dir) for seed, run_dir in zip(job.seeds, run_dirs, strict=True)]
+    for run_dir in run_dirs:
+        run_dir.mkdir(exist_ok=True)
+    if job.together:
+        run_as_one(runs)
+    else:
+        run_job(*runs[0])
+
+
+def configuration(stored: Mapping[str, Any]) -> DictConfig:
+    """Return the configuration whose settings a run stored, with the default of all that changes no result."""
+    settings = dict(config.composed([]))
+    settings |= {key: with_added(value) if isinstance(value, Mapping) else value for key, value in stored.items()}
+    return DictConfig(settings)
+
+
+def _settings(job: Job, seed: int) -> dict[str, Any]:
+    """Return the settings of a seed, with the curriculum of the job's file if it has one."""
+    target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
+    own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}
+    return {**job.config, "seed": seed, **own}
+
+
+def _call(job: Job, run_dir: Path) -> None:
+    """Call the entry point of a learner that is not ours."""
+    module, _, name = str(job.entry_point).partition(":")
+    function = getattr(import_module(module), name, None)
+    require(
+        (callable(function), f"entry_point {job.entry_point}: {module} has no function {name}"),
+        (job.curriculum is not None, "an entry point needs the file of a curriculum"),
+    )
+    assert callable(function)
+    torch.set_num_threads(job.num_threads)
+    function(Curriculum.from_json(str(job.curriculum)), job.seeds[0], run_dir)
+
+
+if __name__ == "__main__":
+    learn_again(Job.read(Path(sys.argv[1])), Path.cwd())

@@ -1,0 +1,326 @@
+"""Level *rerun* of a verification: drawn runs are trained again, in processes of their own, and compared bit by bit.
+
+Nobody knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
+the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.board.isolate import Limits, Outcome, run_isolated
+from ctgraph_rl.board.relearn import Job, run_dir_of
+from ctgraph_rl.board.rescore import Check, equal
+from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, log_sum
+from ctgraph_rl.board.two_samples import compared
+from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.disk import made_folder, open_own, read_text, require_no_link
+from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.files import AGENT, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
+from ctgraph_rl.log.provenance import NUMBERS, machine, versions
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.saved import content_of, read_plain, sum_of_state
+from ctgraph_rl.log.scores import scores
+from ctgraph_rl.portable import VARIABLES, cpu_model
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+RERUN = "rerun"
+
+MODULE = "ctgraph_rl.board.relearn"
+
+JOB = "job.json"
+
+TAIL = 2**14
+"""Bytes at the end of a log in which progress is looked for."""
+
+SCORE = "average_performance"
+"""The metric that is compared where a track does not name its own."""
+
+OWN_VERSION = ("ctgraph_rl", "python")
+"""Versions that may differ between equal bits; `NUMBERS` says when those of this package do."""
+
+
+class Cell(NamedTuple):
+    """What one process learns again."""
+
+    folder: Path  # of the process
+    job: Job
+    runs: tuple[SubmittedRun, ...]  # that it repeats; none for held-out seeds
+    curriculum: Curriculum
+    seconds: float  # that the submitted runs took
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of all seeds."""
+        return self.curriculum.num_frames * len(self.job.seeds)
+
+    @property
+    def run_dirs(self) -> list[Path]:
+        """The run directory of each seed."""
+        return [run_dir_of(self.folder, seed) for seed in self.job.seeds]
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all seeds have results."""
+        return all((run_dir / METRICS).is_file() for run_dir in self.run_dirs)
+
+    @property
+    def frames(self) -> int:
+        """Frames that all seeds have learned from so far."""
+        return sum(map(_frames, self.run_dirs))
+
+
+class Result(NamedTuple):
+    """What a seed that was learned again has left."""
+
+    log: RunLog | None
+    agent_sha256: str
+    failure: str | None  # why it has no results
+
+
+def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun, ...]:
+    """Return the runs that a verifier's number draws, without replacement; failed runs are drawn as others are.
+
+    Args:
+        submission: of which.
+        number: of the verifier, >= 0.
+        count: how many; all, if there are fewer.
+    """
+
+    def place(run: SubmittedRun) -> bytes:
+        return hashlib.sha256(f"{submission.digest} {number} {run.run}".encode()).digest()
+
+    return tuple(sorted(submission.runs, key=place)[:count])
+
+
+def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path) -> list[Cell]:
+    """Return what is learned again for drawn runs: each group of seeds once.
+
+    Args:
+        submission: of the runs.
+        drawn: the runs.
+        folder: where each process has a folder.
+    """
+    groups = dict.fromkeys(run.group or (run.seed,) for run in drawn)
+    return [_cell(submission, seeds, folder / f"seed{'-'.join(map(str, seeds))}") for seeds in groups]
+
+
+def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> Cell:
+    """Return what is learned again for the seeds of a group, or for one that was alone."""
+    runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
+    job = job_of(submission, seeds, runs[0])
+    return Cell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))
+
+
+def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, curriculum: Path | None = None) -> Job:
+    """Return the job of seeds with the submitted configuration.
+
+    Args:
+        submission: of which.
+        seeds: one, or those of a group.
+        run: one of the submitted runs, whose number of threads counts.
+        curriculum: file of another curriculum; None: the submitted one.
+    """
+    entry = submission.method["entry_point"]
+    cores = os.cpu_count() or 1
+    few = f"{run.run} had {run.num_threads} threads, this machine has {cores} cores: verify it on a larger one"
+    require((entry is not None or run.num_threads <= cores, few))
+    given = submission.path.resolve() / "curriculum.json" if entry is not None and curriculum is None else curriculum
+    path = None if given is None else str(given)
+    together = bool(run.group) and len(seeds) > 1
+    return Job(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
+
+
+def learn_again(
+    cell: Cell, limits: Limits, paths: Sequence[Path] = (), watch: Callable[[], object] = lambda: None
+) -> Outcome:
+    """Learn a cell in a process of its own; one that was stopped before is resumed where its learner can be.
+
+    Args:
+        cell: what to learn.
+        limits: of the process.
+        paths: folders with the code of others.
+        watch: is called several times a second.
+    """
+    made_folder(cell.folder)
+    if cell.is_finished:
+        return Outcome(0, None, 0.0, "")
+    if cell.job.entry_point is not None:
+        for run_dir in cell.run_dirs:
+            shutil.rmtree(run_dir, ignore_errors=True)
+    cell.job.write(cell.folder / JOB)
+    variables = VARIABLES if is_portable(cell.job.config) else {}
+    return run_isolated(MODULE, [JOB], cell.folder, limits, paths=paths, variables=variables, watch=watch)
+
+
+def is_portable(config: Mapping[str, Any]) -> bool:
+    """Return whether a configuration asks for the same bits on every CPU."""
+    return config.get("portable") is True
+
+
+def result_of(cell: Cell, seed: int, outcome: Outcome) -> Result:
+    """Read what a seed has left; what cannot be read is a failure."""
+    run_dir = run_dir_of(cell.folder, seed)
+    try:
+        for path in (run_dir, *(run_dir / name for name in (LOG, AGENT, METRICS, FAILURE))):
+            require_no_link(path)
+        if not (run_dir / METRICS).is_file():
+            return Result(None, "", _reason(run_dir, outcome))
+        has_agent = (run_dir / AGENT).exists()
+        agent = sum_of_state(read_plain(content_of(run_dir / AGENT))) if has_agent else ""
+        return Result(RunLog.read(run_dir / LOG), agent, None)
+    except (ValueError, OSError) as error:
+        return Result(None, "", str(error))
+
+
+def _reason(run_dir: Path, outcome: Outcome) -> str:
+    """Return why a seed has no results."""
+    with suppress(OSError, ValueError):
+        return read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
+    return outcome.failure or f"it left no {METRICS}"
+
+
+def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:
+    """Return in words why runs may have other bits here than where they were submitted; none if bits are promised.
+
+    See ``docs/explanation/reproducibility.md``.
+
+    Raises:
+        ValueError: for runs of a package whose numbers are other ones.
+    """
+    about = submission.log(runs[0]).measurements[0]
+    stored, fix = about.get("numbers", 1), "install the versions of versions.txt"
+    require((stored == NUMBERS, f"the runs have numbers version {stored}, this ctgraph_rl has {NUMBERS}: {fix}"))
+    portable, here = is_portable(submission.config), {**machine(), "cpu": cpu_model() or ""}
+    if portable:
+        here["machine"] = f"{platform.machine()} portable"
+    device = str(submission.config.get("device", "cpu"))
+    reasons = [f"device {device}"] if device != "cpu" else []
+    now = {name: version for name, version in versions().items() if name not in OWN_VERSION}
+    then = {name: submission.versions.get(name) for name in now}
+    reasons += [f"{name} {then[name]} there, {now[name]} here" for name in now if then[name] != now[name]]
+    compared_parts = ("machine",) if portable else ("machine", "cpu")
+    pairs = dict.fromkeys((part, getattr(run, part), here[part]) for run in runs for part in compared_parts)
+    return reasons + [f"{part} {before} there, {own} here" for part, before, own in pairs if before != own]
+
+
+def checks_of(run: SubmittedRun, submitted: RunLog, result: Result) -> list[Check]:
+    """Compare a submitted run with what was learned again, bit by bit.
+
+    A run that cannot be finished here, and a failed one that can, decide nothing: the machine or a limit may be why.
+
+    Args:
+        run: the submitted run.
+        submitted: its log.
+        result: of the same seed.
+    """
+    if not run.finished:
+        again = None if result.failure is None else True
+        found = terminal_text(result.failure or "it finished")
+        return [Check("failure", run.reason, found, again, run=run.run, level=RERUN)]
+    if result.log is None:
+        return [Check("rerun", "it finishes", terminal_text(result.failure), None, run=run.run, level=RERUN)]
+    log = equal("log of the rerun", run.log_sha256, log_sum(result.log), run.run)
+    note = "" if log.passed else first_difference(submitted, result.log)
+    agent = equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)
+    return [log._replace(note=note, level=RERUN), agent._replace(level=RERUN)]
+
+
+def first_difference(submitted: RunLog, found: RunLog) -> str:
+    """Return in words the first measurement in which two logs differ; empty if there is none."""
+    lines = [[counted(measurement) for measurement in log.measurements] for log in (submitted, found)]
+    for number, (one, other) in enumerate(zip_longest(*lines, fillvalue={}), 1):
+        keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+        if keys:
+            values = ", ".join(f"{key} {one.get(key)!r:.60} and {other.get(key)!r:.60}" for key in keys[:3])
+            return terminal_text(f"first in line {number}, {one.get('kind', other.get('kind'))}: {values}")
+    return ""
+
+
+def score_name(submission: Submission) -> str:
+    """Return the name of the metric that is compared."""
+    return SCORE if submission.track is None else submission.track.score
+
+
+def score_of(log: RunLog, curriculum: Curriculum, name: str) -> float | None:
+    """Return a metric of a log; None where it has no value.
+
+    Raises:
+        ValueError: for the log of another curriculum.
+    """
+    return scores(log, curriculum)[name].value
+
+
+def submitted_scores(submission: Submission) -> list[float]:
+    """Return the metric that is compared of each submitted run, as far as it has a value."""
+    name = score_name(submission)
+    values = (score_of(submission.log(run), submission.curriculum, name) for run in submission.finished)
+    return [value for value in values if value is not None]
+
+
+def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
+    """Test whether scores are lower than the submitted ones, and say what the test would have found.
+
+    Args:
+        submission: with the submitted scores.
+        found: the other scores.
+        what: what they are.
+        level: of the verification.
+        note: why scores are compared and not bits.
+    """
+    submitted = submitted_scores(submission)
+    if not submitted or not found:
+        why = f"{len(submitted)} submitted runs and {len(found)} others have a value of {score_name(submission)}"
+        return Check(what, "scores of both", why, None, level=level, note=note)
+    difference = compared(submitted, found)
+    passed = False if difference.is_lower else None if difference.is_blind else True
+    expected = f"no lower than the {len(submitted)} submitted"
+    return Check(what, expected, str(difference), passed, level=level, note=note)
+
+
+def verified(submission: Submission, results: Mapping[SubmittedRun, Result], other_bits: Sequence[str]) -> list[Check]:
+    """Return the checks of all runs that were learned again.
+
+    Bits are compared first. Where they differ and are not promised, the scores are tested instead.
+
+    Args:
+        submission: of the runs.
+        results: of each run that was learned again.
+        other_bits: why bits are not promised here; see `why_other_bits`.
+    """
+    by_run = {run: checks_of(run, submission.log(run), result) for run, result in results.items()}
+    differing = [run for run, checks in by_run.items() if run.finished and not all(c.passed for c in checks)]
+    logs = [results[run].log for run in differing]
+    if not other_bits or not differing or None in logs:
+        return [check for checks in by_run.values() for check in checks]
+    name = score_name(submission)
+    values = [score_of(log, submission.curriculum, name) for log in logs if log is not None]
+    note = f"bits differ, as they may with {'; '.join(other_bits)}"
+    what = f"{name} of {len(values)} reruns"
+    check = check_of_scores(submission, [v for v in values if v is not None], what, RERUN, note)
+    return [check, *(check for run, checks in by_run.items() if run not in differing for check in checks)]
+
+
+def _frames(run_dir: Path) -> int:
+    """Return the frames of the last whole line of a log that names them; 0 where there is none."""
+    path = run_dir / LOG
+    with suppress(OSError, ValueError):
+        with open_own(path, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - TAIL))
+            lines = file.read(TAIL).split(b"\n")[:-1]
+        for line in reversed(lines):
+            with suppress(ValueError, AttributeError):
+                frames = json.loads(line).get("frames")
+                if is_int(frames, 0):
+                    return frames
+    return 0

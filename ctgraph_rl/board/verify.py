@@ -1,0 +1,363 @@
+"""Verify a submission: by its own files, by runs that are trained again, and by seeds, images and goals of your choice.
+
+rescored: its numbers are what its logs give; no code runs. rerun: drawn runs are trained again and give the same bits.
+held_out: other seeds, images and goals are learned, and the scores are no lower. A level needs those before it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import secrets
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
+from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
+from ctgraph_rl.board.rerun import RERUN, Cell, cells_of, draw, learn_again, result_of, verified, why_other_bits
+from ctgraph_rl.board.rescore import RESCORED, Check, rescore
+from ctgraph_rl.board.submission import VERIFICATION, Submission, read_submission
+from ctgraph_rl.board.two_samples import runs_needed
+from ctgraph_rl.checks import is_int, is_real, positive, require
+from ctgraph_rl.disk import made_folder, write_whole
+from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.provenance import machine, versions
+from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.sources import is_ours, targets
+from ctgraph_rl.portable import cpu_model
+
+LEVELS = (RESCORED, RERUN, HELD_OUT)
+
+NONE = "none"
+"""The level of a submission that fails the first."""
+
+SCHEMA = 1
+"""Of ``verification.json``."""
+
+LEAST_SECONDS, TIMES = 600, 5
+"""Time limit of a process: so many times what the submitted run took, and so much at least."""
+
+GB = 10**9
+
+NUMBERS = 2**63
+"""A verifier's number is below."""
+
+
+class Plan(NamedTuple):
+    """What a verification will run."""
+
+    submission: Submission
+    number: int
+    level: str
+    reruns: list[Cell]
+    held_out: list[Cell]
+    other_bits: list[str]  # why bits are not promised on this machine
+    folder: Path
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All processes, in order."""
+        return [*self.reruns, *self.held_out]
+
+
+class Means(NamedTuple):
+    """With what a verification runs the code of others."""
+
+    isolation: Isolation
+    hours: float | None  # None: `TIMES` what the submitted runs took
+    memory: float  # GB
+    disk: float  # GB
+    paths: tuple[Path, ...]  # folders with code
+
+    def limits(self, cell: Cell) -> Limits:
+        """Return the limits of a process."""
+        usual = max(LEAST_SECONDS, math.ceil(TIMES * cell.seconds))
+        seconds = usual if self.hours is None else self.hours * 3600
+        return Limits(seconds, round(self.memory * GB), round(self.disk * GB))
+
+
+class Bar(ProgressBar):
+    """Shows run, frames, rate and time left of a verification."""
+
+    @property
+    def beginning(self) -> str:
+        """The text before the first frame."""
+        return "starting"
+
+    shown = 0
+    """Frames of the last update."""
+
+    def update(self, block: int, frames: int, episode_return: float) -> None:
+        """Show progress where there is some; see `ProgressBar.update`."""
+        if frames > max(self.done, self.shown):
+            self.shown = frames
+            super().update(block, frames, episode_return)
+
+    def describe(self, block: int, frames: int, episode_return: float, seconds: float) -> str:
+        """One line: number of the process, frames, rate and time left."""
+        text = super().describe(block, frames, episode_return, seconds)
+        return text.replace("block", "process", 1).replace("  return -", "")
+
+
+def planned(submission: Submission, level: str, number: int, count: int, folder: Path) -> Plan:
+    """Return what a verification runs: as many runs as asked for, and enough for a test where one is needed.
+
+    Args:
+        submission: what is verified.
+        level: one of `LEVELS`, above the first.
+        number: of the verifier.
+        count: runs of each level.
+        folder: where processes have their folders.
+
+    Raises:
+        ValueError: for runs that cannot be made again here.
+    """
+    other_bits = why_other_bits(submission, submission.runs)
+    finished = len(submission.finished)
+    require((finished > 0, f"{submission.path} has no finished run: there is nothing to run again"))
+    enough = max(count, runs_needed(finished))
+    drawn = draw(submission, number, enough if other_bits else count)
+    reruns = cells_of(submission, drawn, folder / RERUN)
+    fresh = held_out_cells(submission, number, enough, folder / HELD_OUT) if level == HELD_OUT else []
+    return Plan(submission, number, level, reruns=reruns, held_out=fresh, other_bits=other_bits, folder=folder)
+
+
+def described(plan: Plan, means: Means) -> list[str]:
+    """Return lines about what will run, in which limits, and what is not isolated."""
+    submission, cells = plan.submission, plan.cells
+    seeds = [f"{RERUN} of seeds {_listed(cell.job.seeds for cell in plan.reruns)}"]
+    seeds += [f"{HELD_OUT} seeds {_listed(cell.job.seeds for cell in plan.held_out)}"] if plan.held_out else []
+    frames, seconds = sum(cell.num_frames for cell in cells), sum(cell.seconds for cell in cells)
+    limits = means.limits(max(cells, key=lambda cell: cell.seconds))
+    most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
+    closed = [text for name, text in CLOSED.items() if getattr(means.isolation, name)]
+    lines = [
+        f"number {plan.number} draws {'; '.join(seeds)}",
+        f"{len(cells)} processes, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
+        f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_listed([means.paths])}",
+        *([f"scores are tested where bits differ: {'; '.join(plan.other_bits)}"] if plan.other_bits else []),
+        f"isolated: {'; '.join(closed) or 'nothing'}",
+        *(f"NOT isolated: {text}" for text in means.isolation.missing()),
+    ]
+    return [terminal_text(line) for line in lines]
+
+
+CLOSED = {
+    "network": "no network",
+    "files": "all files but those of its folder are read-only",
+    "processes": "it sees and signals no other process",
+    "memory": "all its processes share the limit of memory",
+}
+"""What `Isolation` closes off, in words."""
+
+
+def _listed(groups: Iterator[Sequence[object]] | Sequence[Sequence[object]]) -> str:
+    return ", ".join("+".join(map(str, each)) for each in groups)
+
+
+def _time(seconds: float) -> str:
+    return str(timedelta(seconds=math.ceil(seconds)))
+
+
+def code_in_words(submission: Submission) -> str:
+    """Return whose code a submission runs."""
+    entry, code = submission.method["entry_point"], submission.method["code"]
+    others = (
+        dict.fromkeys(name for name in targets(submission.config) if not is_ours(name)) if entry is None else [entry]
+    )
+    source = f"of {code['repository']} at {code['commit']}"
+    return f"{', '.join(others)} {source}" if others else "of this package, as the configuration names it"
+
+
+def ask(lines: Sequence[str], yes: bool) -> None:
+    """Say what will run, and go on if the user agrees.
+
+    Raises:
+        ValueError: where nobody can be asked and ``yes`` is not given.
+        SystemExit: if the user does not agree.
+    """
+    print("\n".join(lines), flush=True)
+    if yes:
+        return
+    require((sys.stdin.isatty(), "this runs the code of others, and nobody can be asked: give --yes to agree"))
+    if input("Run it? [y/N] ").strip().lower() not in ("y", "yes"):
+        print("nothing was run")
+        sys.exit(1)
+
+
+def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
+    """Run all processes of a plan in turn, with progress; return how each ended, by its place in ``cells``.
+
+    What an earlier verification of the same number has finished is not run again.
+    """
+    cells = plan.cells
+    total, before = sum(cell.num_frames for cell in cells), sum(cell.frames for cell in cells)
+    outcomes = {}
+    with Bar(len(cells), total, done=min(before, total)) as bar:
+        for place, cell in enumerate(cells):
+
+            def watch(number: int = place + 1) -> None:
+                bar.update(number, min(sum(each.frames for each in cells), total), math.nan)
+
+            outcomes[place] = learn_again(cell, means.limits(cell), means.paths, watch)
+            watch()
+    return outcomes
+
+
+def checks_of_plan(plan: Plan, outcomes: Mapping[int, Outcome]) -> list[Check]:
+    """Return the checks of all that a plan has run."""
+    ended = list(zip(plan.cells, outcomes.values(), strict=True))
+    again = {run: result_of(cell, run.seed, outcome) for cell, outcome in ended for run in cell.runs}
+    fresh = [(cell, result_of(cell, cell.job.seeds[0], outcome)) for cell, outcome in ended if not cell.runs]
+    checks = verified(plan.submission, again, plan.other_bits)
+    return checks + ([*held_out_checks(plan.submission, fresh)] if fresh else [])
+
+
+def level_of(checks: Sequence[Check]) -> str:
+    """Return the highest level of which, and of those before it, all checks have passed.
+
+    A submission whose files or reruns are not as it says has none. What could not be decided, and lower scores on
+    held-out seeds, only keep it from the next level.
+    """
+    reached = NONE
+    if any(check.passed is False and check.level != HELD_OUT for check in checks):
+        return NONE
+    for level in LEVELS:
+        own = [check.passed for check in checks if check.level == level]
+        if not own or not all(own):
+            break
+        reached = level
+    return reached
+
+
+def write_verification(
+    submission: Submission, checks: Sequence[Check], plan: Plan | None = None, means: Means | None = None
+) -> Path:
+    """Write ``verification.json`` into the folder of a submission; an earlier one is replaced.
+
+    Args:
+        submission: what was verified.
+        checks: of all levels.
+        plan: what was run; None for files alone.
+        means: with which limits and isolation.
+    """
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "level": level_of(checks),
+        "digest": submission.digest,
+        "number": None if plan is None else plan.number,
+        "cells": [] if plan is None else [run.run for cell in plan.reruns for run in cell.runs],
+        "held_out_seeds": [] if plan is None else [seed for cell in plan.held_out for seed in cell.job.seeds],
+        "isolation": None if means is None else means.isolation._asdict(),
+        "checks": [check._asdict() for check in checks],
+        **machine(),
+        "cpu": cpu_model(),
+        "versions": versions(),
+    }
+    path = submission.path / VERIFICATION
+    write_whole(path, json.dumps(content, indent=2) + "\n")
+    return path
+
+
+def report(submission: Submission, checks: Sequence[Check]) -> str:
+    """Return in words what a verification found."""
+    wrong = [check for check in checks if not check.passed]
+    scores = [check for check in checks if check.passed and check.level != RESCORED and not check.run]
+    about = f"{submission.method['name']}: {len(checks)} checks of {len(submission.runs)} runs"
+    verdict = f"{len(wrong)} not passed" if wrong else "all passed"
+    lines = [f"{about}, {verdict}; level {level_of(checks)}"]
+    lines += [f"- {'undecided: ' if check.passed is None else ''}{check.text}" for check in wrong]
+    return "\n".join(map(terminal_text, [*lines, *(f"+ {check.text}" for check in scores)]))
+
+
+def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]:
+    """Verify a submission to the level of the command line, say what will run, and write what was found."""
+    checks = rescore(submission)
+    if arguments.level == RESCORED or not all(check.passed for check in checks):
+        write_verification(submission, checks)
+        return checks
+    number = secrets.randbelow(10**9) if arguments.number is None else arguments.number
+    name = f"{submission.digest[:12]}-{number}"
+    folder = made_folder(arguments.folder / name)
+    plan = planned(submission, arguments.level, number, arguments.cells, folder)
+    paths = () if arguments.code is None else (arguments.code,)
+    means = Means(isolation(folder), arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
+    ask(described(plan, means), arguments.yes)
+    with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command goes on"):
+        checks += checks_of_plan(plan, run_plan(plan, means))
+    write_verification(submission, checks, plan, means)
+    return checks
+
+
+@contextmanager
+def _ended_by_signals(message: str) -> Iterator[None]:
+    """Leave by an exception when asked to stop, so that processes are ended on the way, and say so."""
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit) as error:
+        print(f"\n{message}", file=sys.stderr)
+        sys.exit(error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(prog="ctgraph-rl verify", description=__doc__)
+    made.add_argument("submission", type=Path, metavar="DIR", help="the folder of a submission")
+    made.add_argument("--level", choices=LEVELS, default=RERUN, help="how far to verify (default: %(default)s)")
+    made.add_argument("--cells", type=int, default=2, metavar="N", help="runs of each level (default: %(default)s)")
+    drawn = "draws the runs and the held-out seeds, in 0..2^63-1 (default: a random one, which is printed)"
+    made.add_argument("--number", type=int, help=drawn)
+    made.add_argument("--code", type=Path, metavar="DIR", help="where modules are that are not installed")
+    made.add_argument("--hours", type=float, help=f"of a process, at most (default: {TIMES} times the submitted run's)")
+    made.add_argument("--memory", type=float, default=8.0, metavar="GB", help="of a process (default: %(default)g)")
+    made.add_argument("--disk", type=float, default=4.0, metavar="GB", help="of a process (default: %(default)g)")
+    made.add_argument("--yes", action="store_true", help="agree to run it, with all that is not isolated")
+    made.add_argument(
+        "--folder", type=Path, default=Path("runs/verify"), metavar="DIR", help="of the reruns (default: %(default)s)"
+    )
+    made.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
+    return made
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse values out of range."""
+    number, code, hours = arguments.number, arguments.code, arguments.hours
+    require(
+        (is_int(arguments.cells, 1), f"--cells must be an integer >= 1, got {arguments.cells}"),
+        (number is None or is_int(number, 0, NUMBERS - 1), f"--number must be in [0, 2**63), got {number}"),
+        (code is None or code.is_dir(), f"--code must be a folder, got {code}"),
+        (hours is None or (is_real(hours, 0) and hours > 0), f"--hours must be a number > 0, got {hours}"),
+        *positive(**{"--memory": arguments.memory, "--disk": arguments.disk}),
+    )
+
+
+def main() -> None:
+    """Verify a submission; the exit code is 1 unless it reaches the level that was asked for."""
+    made = parser()
+    arguments = made.parse_args()
+    with refused_by(made):
+        _check(arguments)
+        submission = read_submission(arguments.submission, config_dir=arguments.config_dir)
+        checks = verify(submission, arguments)
+    print(report(submission, checks))
+    print(terminal_lines(f"verification: {submission.path / VERIFICATION}"))
+    if level_of(checks) != arguments.level:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

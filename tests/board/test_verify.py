@@ -1,0 +1,319 @@
+"""Levels *rerun* and *held out*: an honest submission reaches them, and what was made up is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from helpers.sweeping import command_line
+
+import curricula
+from ctgraph_rl.board import relearn, rerun, verify
+from ctgraph_rl.board.held_out import held_out_cells, other_curriculum, seeds_of
+from ctgraph_rl.board.isolate import Limits, Outcome
+from ctgraph_rl.board.relearn import Job, run_dir_of
+from ctgraph_rl.board.rerun import cells_of, draw, result_of
+from ctgraph_rl.board.rescore import Check
+from ctgraph_rl.board.submit import submit
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.train import write_results
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+ENTRY = """
+from pathlib import Path
+
+import numpy as np
+
+from ctgraph_rl import Recorder
+
+
+class Waits:
+    def __call__(self, observation):
+        return np.zeros(len(observation), dtype=np.int64)
+
+
+def train(curriculum, seed, run_dir):
+    with Recorder(curriculum, run_dir, seed, about={"learner": "waits"}, code=[Waits]) as recorder:
+        for frames in recorder.moments:
+            recorder.evaluate(Waits(), frames)
+"""
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Reruns take place in this process; returns the folders in which they did."""
+    folders = []
+
+    def run(module, arguments, folder, limits, **more):
+        folders.append(folder)
+        try:
+            relearn.learn_again(Job.read(folder / arguments[0]), folder)
+        except Exception as error:
+            return Outcome(1, None, 0.0, f"{type(error).__name__}: {error}")
+        more["watch"]()
+        return Outcome(0, None, 0.0, "")
+
+    monkeypatch.setattr(rerun, "run_isolated", run)
+    return folders
+
+
+def call(monkeypatch, home: Path, folder: Path, *arguments: str) -> tuple[int, dict]:
+    """Call ``ctgraph-rl verify``; return its exit code and what it wrote."""
+    more = [f"--config-dir={home / 'conf'}", f"--folder={folder.parent / 'reruns'}", *arguments]
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl verify", str(folder), *more])
+    try:
+        verify.main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code
+    written = folder / "verification.json"
+    return code, json.loads(written.read_text()) if written.exists() else {}
+
+
+def failed(written: dict) -> list[tuple[str, str]]:
+    return [(check["level"], check["what"]) for check in written["checks"] if not check["passed"]]
+
+
+def submitted(home: Path, of_track, method: dict, to: Path) -> Path:
+    return submit([home / "runs"], to, {**method, "track": "tiny"}, of_track).path
+
+
+def test_drawn_runs_follow_from_digest_and_number_and_nothing_else():
+    runs = [SimpleNamespace(run=f"run{number}") for number in range(10)]
+    draws = {
+        (digest, number): draw(SimpleNamespace(digest=digest, runs=runs), number, 2)
+        for digest in ("a", "b")
+        for number in range(100)
+    }
+
+    assert [run.run for run in draws["a", 7]] == ["run5", "run7"]
+    assert draw(SimpleNamespace(digest="a", runs=runs[::-1]), 7, 2) == draws["a", 7]
+    assert {run.run for pair in draws.values() for run in pair} == {run.run for run in runs}
+    assert sum(draws["a", number] == draws["b", number] for number in range(100)) < 10
+
+
+def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
+    tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process, capsys
+):
+    folder = submitted(tiny_home, tiny_track, method, tmp_path / "submission")
+
+    code, written = call(monkeypatch, tiny_home, folder, "--number=3", "--yes")
+
+    assert (code, written["level"], written["number"]) == (0, "rerun", 3)
+    assert sorted(written["cells"]) == ["tiny-seed0", "tiny-seed1"]
+    assert len(in_process) == 2
+    said = capsys.readouterr()
+    assert "number 3 draws rerun of seeds" in said.out
+    assert "NOT isolated: it can read every file that you can" in said.out
+    assert "process 2/2  512/512 frames" in said.err
+    assert call(monkeypatch, tiny_home, folder, "--number=3", "--yes")[1]["level"] == "rerun"
+    assert len(in_process) == 2
+
+
+def test_an_edited_sum_of_an_agent_is_found_by_a_rerun_alone(
+    tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process
+):
+    folder = submitted(tiny_home, tiny_track, method, tmp_path / "submission")
+    lines = (folder / "runs.csv").read_text().splitlines(keepends=True)
+    sums = [line.split(",")[7] for line in lines[1:]]
+    (folder / "runs.csv").write_text("".join(lines).replace(sums[0], "a" * 64).replace(sums[1], "b" * 64))
+
+    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
+
+    assert (code, written["level"]) == (1, "none")
+    assert failed(written) == [("rerun", "agent of the rerun")]
+
+
+def test_a_log_that_was_edited_with_all_that_follows_from_it_is_found_by_a_rerun_alone(
+    tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process, capsys
+):
+    shutil.copytree(tiny_home / "runs", tmp_path / "runs")
+    for run_dir in (tmp_path / "runs").iterdir():
+        log = RunLog.read(run_dir / "run.jsonl")
+        lines = [{**m, "return_mean": 1.0} if m["kind"] == "evaluation" else m for m in log.measurements]
+        (run_dir / "run.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        write_results(RunLog.read(run_dir / "run.jsonl"), Curriculum.from_json(run_dir / "curriculum.json"), run_dir)
+    folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
+
+    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
+
+    assert (code, written["level"]) == (1, "none")
+    assert failed(written) == [("rerun", "log of the rerun")]
+    assert "first in line 2, evaluation: return_mean 1.0 and 0.0" in capsys.readouterr().out
+
+
+def test_nothing_runs_where_nobody_can_be_asked(tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys):
+    folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
+    monkeypatch.setattr(verify, "read_submission", lambda path, config_dir: replace(tiny_submission, path=path))
+    monkeypatch.setattr(verify, "rescore", lambda submission: [])
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: False))
+
+    code, _ = call(monkeypatch, tiny_home, folder)
+
+    assert code == 2
+    assert "give --yes to agree" in capsys.readouterr().err
+    assert in_process == []
+
+
+def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submission, tmp_path):
+    runs = tuple(replace(run, group=(0, 1)) for run in tiny_submission.runs)
+    grouped = replace(tiny_submission, runs=runs)
+
+    (cell,) = cells_of(grouped, draw(grouped, 0, 1), tmp_path)
+
+    assert (cell.job.seeds, cell.job.together, cell.runs) == ((0, 1), True, runs)
+
+
+@pytest.mark.parametrize(
+    ("found", "passed"), [([0.8, 0.9], True), ([0.1, 0.2], False), ([0.1], None)], ids=["equal", "lower", "too few"]
+)
+def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
+    tiny_submission, monkeypatch, found, passed
+):
+    monkeypatch.setattr(rerun, "submitted_scores", lambda submission: [0.8, 0.85, 0.9, 0.8, 0.95])
+    scores = iter(found)
+    monkeypatch.setattr(rerun, "score_of", lambda *_: next(scores))
+    run = tiny_submission.runs[0]
+    results = {replace(run, seed=seed): rerun.Result(RunLog(), "", None) for seed in range(len(found))}
+
+    (check,) = rerun.verified(tiny_submission, results, ["cpu A there, B here"])
+
+    assert check.passed is passed
+    assert check.note == "bits differ, as they may with cpu A there, B here"
+    assert ("would be found with 80% chance" if passed is not None else "cannot show any drop") in check.found
+
+
+def test_bits_are_promised_on_one_machine_and_versions_and_named_where_they_are_not(tiny_submission):
+    runs = tiny_submission.runs
+    other = [replace(run, cpu="Another CPU") for run in runs]
+    versions = {**tiny_submission.versions, "torch": "1.0"}
+
+    assert rerun.why_other_bits(tiny_submission, runs) == []
+    assert "cpu Another CPU there" in rerun.why_other_bits(tiny_submission, other)[0]
+    assert "torch 1.0 there" in rerun.why_other_bits(replace(tiny_submission, versions=versions), runs)[0]
+    portable = replace(tiny_submission, config={**tiny_submission.config, "portable": True})
+    elsewhere = [replace(run, cpu="Another CPU", machine="x86_64 portable") for run in runs]
+    assert rerun.why_other_bits(portable, elsewhere) == []
+
+
+@pytest.mark.parametrize("name", ["ct8", "ct8_md", "dick2020_pair", "su_b1_4images"])
+def test_held_out_images_and_goals_keep_what_tasks_share(name):
+    curriculum = curricula.load(name)
+    other = other_curriculum(curriculum, "key")
+
+    def shared(tasks):
+        pairs = [(one, two) for one in tasks for two in tasks]
+        goals = [[a == b for a, b in zip(one.goal, two.goal, strict=False)] for one, two in pairs]
+        first = [next((place for place, same in enumerate(goal) if not same), len(goal)) for goal in goals]
+        return first, [one.images == two.images for one, two in pairs], [one == two for one, two in pairs]
+
+    assert shared(other.tasks) == shared(curriculum.tasks)
+    assert [task.graph for task in other.tasks] == [task.graph for task in curriculum.tasks]
+    assert not {task.image_seed for task in other.tasks} & ({task.image_seed for task in curriculum.tasks} - {None})
+    assert other.ends == curriculum.ends
+    assert other == other_curriculum(curriculum, "key")
+    assert other != other_curriculum(curriculum, "another key")
+
+
+def test_held_out_seeds_are_neither_submitted_nor_for_tuning(tiny_submission, tmp_path):
+    without = replace(tiny_submission, track=None)
+    for submission in (tiny_submission, without):
+        assert seeds_of(submission, 5, 20) == seeds_of(submission, 5, 20) != seeds_of(submission, 6, 20)
+        assert len(set(seeds_of(submission, 5, 20))) == 20
+        assert min(seeds_of(submission, 5, 20)) >= 10**6
+    one, two = held_out_cells(tiny_submission, 5, 2, tmp_path)
+
+    assert one.curriculum.fingerprint != two.curriculum.fingerprint
+    assert Curriculum.from_json(one.job.curriculum) == one.curriculum
+    assert dict(one.job.config) == dict(tiny_submission.config)
+
+
+def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission, tmp_path, monkeypatch):
+    (tmp_path / "waiting_learner.py").write_text(ENTRY)
+    monkeypatch.syspath_prepend(tmp_path)
+    sums = []
+    for name in ("one", "two"):
+        folder = tmp_path / name
+        folder.mkdir()
+        path = str(tiny_submission.path / "curriculum.json")
+        job = Job((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
+        relearn.learn_again(job, folder)
+        cell = rerun.Cell(folder, job, (), tiny_submission.curriculum, 1.0)
+        result = result_of(cell, 3, Outcome(0, None, 0.0, ""))
+        assert (result.failure, result.agent_sha256) == (None, "")
+        sums.append(rerun.log_sum(result.log))
+
+    assert sums[0] == sums[1]
+    assert cell.is_finished
+    with pytest.raises(ValueError, match="waiting_learner has no function learn"):
+        relearn.learn_again(job._replace(entry_point="waiting_learner:learn"), folder)
+
+
+def test_a_link_in_place_of_a_result_is_a_failure(tiny_home, tiny_submission, tmp_path):
+    (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
+    run_dir_of(cell.folder, 0).parent.mkdir(parents=True)
+    run_dir_of(cell.folder, 0).symlink_to(tiny_home / "runs" / "tiny-seed0")
+
+    assert "symbolic link" in result_of(cell, 0, Outcome(0, None, 0.0, "")).failure
+
+
+@pytest.mark.slow
+def test_a_group_is_rerun_in_a_process_of_its_own(tiny_home, tiny_track, method, tmp_path, monkeypatch):
+    settings = [f"agent.{name}" for name in ("num_envs=8", "num_steps=4", "hidden_size=4", "num_minibatches=1")]
+    where = [f"--config-dir={tiny_home / 'conf'}", f"hydra.sweep.dir={tmp_path / 'runs'}"]
+    assert command_line(monkeypatch, "-m", *where, "track=tiny", "agent=ppo", *settings, "together=true") == 0
+    folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
+
+    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
+
+    assert (code, written["level"], len(written["cells"])) == (0, "rerun", 2)
+
+
+@pytest.mark.slow
+def test_held_out_runs_reach_the_last_level(tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process, capsys):
+    folder = submitted(tiny_home, tiny_track, method, tmp_path / "submission")
+
+    code, written = call(monkeypatch, tiny_home, folder, "--level=held_out", "--number=7", "--yes")
+
+    assert (code, written["level"], len(written["held_out_seeds"])) == (0, "held_out", 5)
+    assert "5 runs with other seeds, images and goals" in capsys.readouterr().out
+
+
+def test_a_level_needs_all_checks_and_a_lower_held_out_score_takes_none_away():
+    def level(*checks):
+        return verify.level_of([Check("", "", "", passed, level=level) for level, passed in checks])
+
+    assert level(("rescored", True), ("rerun", True), ("held_out", True)) == "held_out"
+    assert level(("rescored", True), ("rerun", True), ("held_out", False)) == "rerun"
+    assert level(("rescored", True), ("rerun", None)) == "rescored"
+    assert level(("rescored", True), ("rerun", False), ("rerun", True)) == "none"
+    assert level(("rescored", False)) == level() == "none"
+
+
+def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submission):
+    run = tiny_submission.runs[0]
+    stopped = rerun.Result(None, "", "stopped: it took longer than 1 seconds")
+
+    (check,) = rerun.checks_of(run, tiny_submission.log(run), stopped)
+
+    assert check.passed is None
+    assert "undecided: tiny-seed0: rerun: expected it finishes, found stopped" in verify.report(
+        tiny_submission, [check]
+    )
+    failed_there = replace(run, state="failed", reason="the loss was nan")
+    assert rerun.checks_of(failed_there, RunLog(), stopped)[0].passed is True
+    assert rerun.checks_of(failed_there, RunLog(), stopped._replace(failure=None))[0].passed is None
+
+
+def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
+    means = verify.Means(None, None, memory=2.0, disk=1.0, paths=())
+    (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
+
+    assert means.limits(cell) == Limits(600, 2 * 10**9, 10**9)
+    assert means.limits(cell._replace(seconds=1000.0)).seconds == 5000
+    assert means._replace(hours=0.5).limits(cell).seconds == 1800
