@@ -15,8 +15,8 @@ unit j. W and A start in [0, 0.001). The paper also feeds the last action, the l
 two are settings, and no cell reads the time.
 
 Fast weights are H^2 numbers an environment, 4 H^2 bytes, twice that if retroactive. A batch holds them once, before its
-first step: with 256 environments, 32 steps and H = 64, 4 MB in place of 134 MB. Learning from a sequence keeps some ten
-such matrices for each of its steps while the gradient is computed.
+first step: with 256 environments, 32 steps and H = 64, 4 MB in place of 134 MB. While a gradient is computed, there
+are as many for each step.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, reset, zeros_like_weights
+from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.plastic_sequence import Plastic, PlasticSequence, columns_times
 from ctgraph_rl.checks import one_of, require
 
 LARGEST_FAST_WEIGHT = 2.0
@@ -79,25 +80,28 @@ class Backpropamine(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
         """See `Cell`; inputs are multiplied with their weights once a group."""
-        given, outputs = self.input(inputs), []
-        resets = starts.any(dim=0).tolist() if starts.is_cpu else [True] * starts.shape[1]  # a GPU would have to wait
-        for group, start, some in zip(groups.unbind(1), starts.unbind(1), resets, strict=True):
-            output, state = self._step(given.index_select(0, group), reset(state, start) if some else state)
-            outputs.append(output)
-        return torch.stack(outputs, dim=1)
+        given = self.input(inputs).index_select(0, groups.T.flatten()).unflatten(0, groups.T.shape)
+        resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
+        resets[0] = resets[0][:0]  # zero already
+        return PlasticSequence.apply(self._step, LARGEST_FAST_WEIGHT, resets, given, *self._plastic(), *state)
 
-    def _step(self, given: Tensor, state: State) -> tuple[Tensor, State]:
-        """Take a step from the inputs times their weights, [rows, H]."""
+    def _plastic(self) -> Plastic:
+        """Return the weights other than those of the inputs."""
+        rate = None if self.modulation == "simple" else self.rate
+        layers = () if self.modulation == "none" else (self.modulator, self.fan_out)
+        others = (weights for layer in layers for weights in (layer.weight, layer.bias))
+        return Plastic(self.recurrent, self.plasticity, rate, *others)
+
+    def _step(self, given: Tensor, state: State, product: Tensor | None = None) -> tuple[Tensor, State]:
+        """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""
         before, hebb, *trace = state
-        fast = (before.unsqueeze(1) @ (self.plasticity * hebb)).squeeze(1)
+        fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))
         units = (given + before @ self.recurrent + fast).tanh()
-        pairs = before.unsqueeze(2) * units.unsqueeze(1)
-        change = self._rate(units) * (trace[0] if trace else pairs)
-        following = (hebb + change).clamp(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
-        return units, (units, following, *(each.lerp(pairs, self.rate) for each in trace))
+        eta, column = self._eta(units), before.unsqueeze(2)
+        change = (trace[0], eta.unsqueeze(1)) if trace else (column, (eta * units).unsqueeze(1))
+        following = torch.addcmul(hebb, *change).clamp_(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
+        return units, (units, following, *(each.lerp(column * units.unsqueeze(1), self.rate) for each in trace))
 
-    def _rate(self, units: Tensor) -> Tensor:
-        """Compute eta_t, [rows, 1, H], or the learned rate without modulation."""
-        if self.modulation == "none":
-            return self.rate
-        return self.fan_out(self.modulator(units).tanh()).unsqueeze(1)
+    def _eta(self, units: Tensor) -> Tensor:
+        """Compute eta_t, [rows, H], or the learned rate without modulation, []."""
+        return self.rate if self.modulation == "none" else self.fan_out(self.modulator(units).tanh())

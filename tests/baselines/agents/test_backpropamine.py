@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from helpers.small_agents import batches, learnt_from
 from torch import nn
 
 from baselines.cells.backpropamine import MODULATIONS, Backpropamine
+from baselines.cells.cell import Cell
 from curricula.paper import ct_su_b1
 
 every_modulation = pytest.mark.parametrize("modulation", MODULATIONS)
@@ -113,6 +115,22 @@ def test_gradients_are_those_of_finite_differences(modulation):
         )
 
     assert torch.autograd.gradcheck(outputs, values)
+
+
+@every_modulation
+def test_gradients_written_out_are_those_of_autograd_at_the_bound_and_over_resets(modulation):
+    made = cell(3, 2, modulation=modulation).double()
+    for weights in (made.recurrent, made.plasticity, getattr(made, "rate", torch.empty(0))):
+        nn.init.normal_(weights)
+    inputs, groups, starts = torch.randn(10, 2).double(), torch.arange(20).view(2, 10) % 10, torch.zeros(2, 10) > 0
+    starts[0, 6], slopes = True, torch.randn(2, 10, 3).double()
+    state = [2 * torch.randn_like(value) for value in made.zeros(2)]  # beyond the bound, some fast weights at any rate
+    state = [value.requires_grad_() for value in state]
+
+    outputs = [how(inputs, groups, starts, state) for how in (partial(Cell.sequence, made), made.sequence)]
+
+    expected, found = (torch.autograd.grad(each, [*made.parameters(), *state], slopes) for each in outputs)
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 class Sequences(nn.Module):
