@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from baselines.cells.cell import Cell, State, zeros_like_weights
-from baselines.cells.plastic_sequence import Plastic, PlasticSequence, columns_times
+from baselines.cells.plastic_sequence import Plastic, PlasticSequence, Steps, columns_times
 from ctgraph_rl.checks import one_of, require
 
 LARGEST_FAST_WEIGHT = 2.0
@@ -83,7 +83,8 @@ class Backpropamine(Cell):
         given = self.input(inputs).index_select(0, groups.T.flatten()).unflatten(0, groups.T.shape)
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already
-        return PlasticSequence.apply(self._step, LARGEST_FAST_WEIGHT, resets, given, *self._plastic(), *state)
+        steps = Steps(self._step, LARGEST_FAST_WEIGHT, resets)
+        return PlasticSequence.apply(steps, given, *self._plastic(), *state)
 
     def _plastic(self) -> Plastic:
         """Return the weights other than those of the inputs."""

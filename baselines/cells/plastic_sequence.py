@@ -17,9 +17,19 @@ from torch.nn.functional import linear
 
 from baselines.cells.cell import State
 
-Step = Callable[[Tensor, State, Tensor], tuple[Tensor, State]]
-"""Compute the units and the next state from the inputs times their weights, [rows, H], and a state. The third argument
-is overwritten, [rows, H, H]."""
+
+class Steps(NamedTuple):
+    """How the steps of a sequence are taken."""
+
+    step: Callable[[Tensor, State, Tensor], tuple[Tensor, State]]
+    """Computes the units and the next state from the inputs times their weights, [rows, H], and a state; the third
+    argument is overwritten, [rows, H, H]."""
+
+    bound: float
+    """Of fast weights."""
+
+    resets: Sequence[Tensor]
+    """The rows whose state is reset before each step, int64 [n]; none before the first."""
 
 
 class Plastic(NamedTuple):
@@ -50,25 +60,22 @@ class Plastic(NamedTuple):
 class PlasticSequence(torch.autograd.Function):
     """Take step after step, and compute the units, [rows, steps, H].
 
-    The arguments are the function that takes a step, the bound of fast weights, the rows whose state is reset before
-    each step, int64 [n] and none before the first, the inputs times their weights, [steps, rows, H], the tensors of
-    `Plastic`, and the units, the fast weights and, if retroactive, the trace before the first step.
+    The arguments are how steps are taken, the inputs times their weights, [steps, rows, H], the tensors of `Plastic`,
+    and the units, the fast weights and, if retroactive, the trace before the first step.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, step: Step, bound: float, resets: Sequence[Tensor], given: Tensor, *tensors: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, steps: Steps, given: Tensor, *tensors: Tensor) -> Tensor:
         """See `PlasticSequence`."""
         weights, state = tensors[: len(Plastic._fields)], tensors[len(Plastic._fields) :]
         ctx.save_for_backward(*weights)
-        ctx.bound, ctx.resets, ctx.states, units = bound, resets, [], []
+        ctx.bound, ctx.resets, ctx.states, units = steps.bound, steps.resets, [], []
         product = torch.empty_like(state[1])
-        for values, rows in zip(given, resets, strict=True):
+        for values, rows in zip(given, steps.resets, strict=True):
             if len(rows):
                 state = state[0].index_fill(0, rows, 0.0), *(each.index_fill_(0, rows, 0.0) for each in state[1:])
             ctx.states.append(state)
-            output, state = step(values, state, product)
+            output, state = steps.step(values, state, product)
             units.append(output)
         ctx.states.append(state)
         ctx.units = torch.stack(units)
@@ -84,7 +91,7 @@ class PlasticSequence(torch.autograd.Function):
             for value in gradient.state if len(ctx.resets[t]) else ():
                 value.index_fill_(0, ctx.resets[t], 0.0)
         before = torch.stack([state[0] for state in ctx.states[:-1]])
-        return None, None, None, gradient.given, *gradient.weights(before), *gradient.state
+        return None, gradient.given, *gradient.weights(before), *gradient.state
 
 
 class PlasticGradient:
