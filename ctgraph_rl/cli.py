@@ -39,6 +39,8 @@ COMMANDS = {
     "play": Command("ctgraph_rl.visualize.play", "play a CT-graph, or watch a policy play it"),
     "report": Command("ctgraph_rl.report.__main__", "make a page of figures and tables of runs"),
     "results": Command("ctgraph_rl.report.results", "print a table of runs over seeds"),
+    "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that anybody can check"),
+    "verify": Command("ctgraph_rl.board.verify", "check a submission by its files, reruns and held-out seeds"),
 }
 """Commands by name, each with its module and a line about it."""
 

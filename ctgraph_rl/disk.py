@@ -121,6 +121,16 @@ def made_folder(folder: Path) -> Path:
     return folder
 
 
+def require_new(path: Path) -> None:
+    """Refuse to make a folder where something is.
+
+    Raises:
+        FileExistsError: if something is there.
+    """
+    if os.path.lexists(path):
+        raise FileExistsError(f"{path} exists: choose another folder, nothing is overwritten")
+
+
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder that is there whole, or not at all: it is filled beside its place and then renamed.
@@ -132,8 +142,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         FileExistsError: if something is there.
         OSError: if it cannot be written; nothing is left.
     """
-    if os.path.lexists(path):
-        raise FileExistsError(f"{path} exists: choose another folder, nothing is overwritten")
+    require_new(path)
     made_folder(path.absolute().parent)
     part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.absolute().parent))
     try:

@@ -15,15 +15,16 @@ from ctgraph_rl.disk import read_regular
 from ctgraph_rl.tasks.protocol import Protocol
 
 TEMPLATE = """\
-# About a method, for ctgraph-rl submit RUNS --method method.yaml --to DIR. null: not known, or taken from the runs.
-name: My method             # the name that a board shows
+# About a method, for ctgraph-rl submit RUNS --method method.yaml --to DIR. Of given, hardware and hours, null takes
+# what the runs say.
+name: null                  # the name that a board shows, such as PPO with EWC
 track: null                 # the track of the submission, such as small; --track names it, too
-authors: [First Author, Second Author]
+authors: []                 # their names, such as [Ada Lovelace, Alan Turing]
 paper: null                 # the address of a paper, or null
 code:
-  repository: https://example.org/repository  # where the source of the learner is
-  commit: null              # the commit that was run, 7 to 40 hexadecimal digits
-  licence: MIT              # its licence, by SPDX identifier
+  repository: null          # the address of the source of the learner
+  commit: null              # the commit that was run, 7 to 40 hexadecimal digits in quotes
+  licence: null             # its licence, by SPDX identifier, such as MIT
 entry_point: null           # module:function that trains one seed, for learners that a Recorder measured; else null
 given:                      # the information that the learner is given; null: as the runs say
   boundaries: null          # announced or hidden
@@ -31,7 +32,7 @@ given:                      # the information that the learner is given; null: a
   guide_frames: null        # frames of a block over which a policy that navigates acts in the learner's place
 bytes_per_task: 0           # bytes that the learner keeps for each further task; 0 for weights of a constant size alone
 tuning:
-  how: not tuned            # how settings were chosen, and over which values
+  how: null                 # how settings were chosen, and over which values; not tuned if they were not
   seeds: []                 # the seeds of the runs by which they were chosen; none of them may be submitted
 compute:
   hardware: null            # such as 1 core of an AMD EPYC 9654; null: as the runs say
@@ -116,7 +117,7 @@ def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
         _text_rule("compute.hardware", compute["hardware"], or_null=True),
         (listed, f"authors must be a list of names, got {authors!r:.80}"),
         (_matches(ADDRESS, repository), f"code.repository must be an address, got {repository!r:.80}"),
-        (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, got {commit!r:.80}"),
+        (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, in quotes, got {commit!r:.80}"),
         _entry_rule(method["entry_point"]),
         _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
         _count_rule("bytes_per_task", method["bytes_per_task"]),

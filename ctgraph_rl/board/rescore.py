@@ -6,13 +6,9 @@ runs no code of the submission. What the logs say may still be made up: a rerun 
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.method import fact_rules, facts_of
@@ -24,30 +20,23 @@ from ctgraph_rl.board.submission import (
     METRIC_COLUMNS,
     METRICS,
     RUNS,
-    VERIFICATION,
     VERSIONS,
     Submission,
     SubmittedRun,
     log_sum,
-    read_submission,
 )
 from ctgraph_rl.checks import is_real, require
-from ctgraph_rl.disk import read_regular, write_whole
+from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.log.escape import csv_text, terminal_text
-from ctgraph_rl.log.provenance import machine, versions
-from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
-from ctgraph_rl.portable import cpu_model
 from ctgraph_rl.runs.settings import differences
 
-RESCORED, NONE = "rescored", "none"
-
-SCHEMA = 1
-"""Of ``verification.json``."""
+RESCORED = "rescored"
 
 ROUNDING = 1e-9
 """Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
@@ -103,21 +92,27 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
     method, runs, of_track = submission.method, submission.runs, submission.track
     named = None if of_track is None else of_track.name
     yield equal("track", method["track"], named)
-    yield _rules("curriculum", [curriculum_rule(submission.curriculum, of_track)], submission.curriculum.fingerprint)
+    found = submission.curriculum.fingerprint
+    wanted = "the published one" if of_track is None else f"one of track {of_track.id}"
+    yield _rules("curriculum", [curriculum_rule(submission.curriculum, of_track)], wanted, found)
     seeds = [run.seed for run in runs]
-    yield _rules("seeds", seed_rules(seeds, method["tuning"]["seeds"], of_track), ", ".join(map(str, seeds)))
-    yield _rules("entry point", [entry_rule(submission.config, method["entry_point"])], str(method["entry_point"]))
+    wanted = "no seed of tuning" if of_track is None else ", ".join(map(str, of_track.seeds))
+    rules = seed_rules(seeds, method["tuning"]["seeds"], of_track)
+    yield _rules("seeds", rules, wanted, ", ".join(map(str, seeds)))
+    entry = method["entry_point"]
+    yield _rules("way to run it again", [entry_rule(submission.config, entry)], "agent or entry_point", str(entry))
     facts = facts_of(submission.curriculum.protocol, runs)
     rules = fact_rules(method, facts, runs, len(submission.curriculum.tasks))
-    yield _rules(METHOD, rules, "what the runs say")
+    said = {part: method[part] for part in facts}
+    yield _rules(METHOD, rules, str(facts), str(said))
     failed = [run.seed for run in runs if not run.finished]
     yield equal(f"failed seeds of {METHOD}", sorted(method["failed"]), failed)
 
 
-def _rules(what: str, rules: Sequence[tuple[bool, str]], found: str) -> Check:
+def _rules(what: str, rules: Sequence[tuple[bool, str]], expected: str, found: str) -> Check:
     """Return a check of rules, with the messages of those that are broken."""
     broken = "; ".join(message for holds, message in rules if not holds)
-    return Check(what, "as the rules say", found, not broken, note=broken)
+    return Check(what, expected, found, not broken, note=broken)
 
 
 def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
@@ -185,12 +180,16 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
     if more:
         wrong.append(Check(METRICS, "metrics of finished runs", listed(more), False, note=rule))
     for run, log in logs.items():
-        cells = _metric_cells(run, scores(log, submission.curriculum, submission.experts(run)))
+        try:
+            cells = _metric_cells(run, scores(log, submission.curriculum, submission.experts(run)))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            wrong.append(Check(METRICS, "metrics of the log", "none", False, run.run, note=str(error)))
+            continue
         stated = {name: list(row.values()) for name, row in submission.metrics.get(run.run, {}).items()}
-        for name in {**cells, **stated}:
-            count += 1
-            check = _of_metric(run.run, name, cells.get(name), stated.get(name), same_kind)
-            wrong += [] if check is None else [check]
+        names = {**cells, **stated}
+        count += len(names)
+        found = [_of_metric(run.run, name, cells.get(name), stated.get(name), same_kind) for name in names]
+        wrong += filter(None, found)
     return wrong or [equal(METRICS, f"{count} values", f"{count} values")]
 
 
@@ -260,57 +259,3 @@ def _table(content: bytes, most: int | None = None) -> list[dict[str, Any]]:
         return file.read().to_pylist()
     except (ArrowException, OSError) as error:
         raise ValueError(str(error)) from None
-
-
-def level_of(checks: Sequence[Check]) -> str:
-    """Return the level that checks have reached."""
-    return RESCORED if all(check.passed for check in checks) else NONE
-
-
-def write_verification(submission: Submission, checks: Sequence[Check]) -> Path:
-    """Write ``verification.json`` into the folder of a submission; an earlier one is replaced."""
-    content = {
-        "schema": SCHEMA,
-        "level": level_of(checks),
-        "digest": submission.digest,
-        "number": None,
-        "cells": [],
-        "checks": [check._asdict() for check in checks],
-        **machine(),
-        "cpu": cpu_model(),
-        "versions": versions(),
-    }
-    path = submission.path / VERIFICATION
-    write_whole(path, json.dumps(content, indent=2) + "\n")
-    return path
-
-
-def main() -> None:
-    """Verify a submission by its own files; the exit code is 1 if something differs."""
-    parser = argparse.ArgumentParser(prog="ctgraph-rl verify", description=__doc__)
-    parser.add_argument("submission", type=Path, metavar="DIR", help="the folder of a submission")
-    parser.add_argument(
-        "--level", choices=(RESCORED,), default=RESCORED, help="how far to verify (default: %(default)s)"
-    )
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
-    arguments = parser.parse_args()
-    with refused_by(parser):
-        submission = read_submission(arguments.submission, config_dir=arguments.config_dir)
-        checks = rescore(submission)
-        path = write_verification(submission, checks)
-    print(report(submission, checks))
-    print(f"verification: {terminal_text(path)}")
-    if level_of(checks) == NONE:
-        sys.exit(1)
-
-
-def report(submission: Submission, checks: Sequence[Check]) -> str:
-    """Return in words what a verification found."""
-    wrong = [check.text for check in checks if not check.passed]
-    about = f"{submission.method['name']}: {len(checks)} checks of {len(submission.runs)} runs"
-    verdict = f"{len(wrong)} failed" if wrong else "all passed: its numbers are what its logs give"
-    return "\n".join(map(terminal_text, [f"{about}, {verdict}", *(f"- {line}" for line in wrong)]))
-
-
-if __name__ == "__main__":
-    main()

@@ -41,7 +41,7 @@ from ctgraph_rl.board.submission import (
 )
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import made_folder, new_folder, write_whole
+from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
 from ctgraph_rl.log.provenance import machine
@@ -51,11 +51,18 @@ from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_st
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.runs.read import Run, find_runs
+from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
 
-def submit(paths: Sequence[Path], to: Path, method: Mapping[str, Any], of_track: Track | None = None) -> Submission:
+def submit(
+    paths: Sequence[Path],
+    to: Path,
+    method: Mapping[str, Any],
+    of_track: Track | None = None,
+    only: Mapping[str, Any] | None = None,
+) -> Submission:
     """Make a submission of runs.
 
     Args:
@@ -63,6 +70,7 @@ def submit(paths: Sequence[Path], to: Path, method: Mapping[str, Any], of_track:
         to: the folder to make; must not exist.
         method: what ``method.yaml`` holds; see `ctgraph_rl.board.method.read_method`.
         of_track: the track that it is for; None: it is for none.
+        only: values of settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
 
     Returns:
         The submission, as it is read from its folder.
@@ -73,7 +81,8 @@ def submit(paths: Sequence[Path], to: Path, method: Mapping[str, Any], of_track:
         ModuleNotFoundError: without pyarrow; names the extra to install.
     """
     require_parquet()
-    runs, curriculum = _checked(paths, method, of_track)
+    require_new(to)
+    runs, curriculum = _checked(_found(paths, only or {}), method, of_track)
     names = _names(runs)
     lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
     facts = facts_of(curriculum.protocol, lines)
@@ -87,12 +96,19 @@ def submit(paths: Sequence[Path], to: Path, method: Mapping[str, Any], of_track:
     return read_submission(to, of_track)
 
 
-def _checked(paths: Sequence[Path], method: Mapping[str, Any], of_track: Track | None) -> tuple[list[Run], Curriculum]:
-    """Return the runs by seed, and what they learned; refuse what cannot be submitted."""
+def _found(paths: Sequence[Path], only: Mapping[str, Any]) -> list[Run]:
+    """Return the runs that have some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
-    left_out = [(False, problem.reason) for problem in problems]
-    require(*left_out, *([] if found or problems else [(False, "there is no run")]))
-    runs = sorted(found, key=lambda run: run.seed)
+    require(*((False, problem.reason) for problem in problems))
+    settings = [dict(flat(run.about["config"])) for run in found]
+    chosen = [run for run, has in zip(found, settings, strict=True) if all(has.get(k) == v for k, v in only.items())]
+    there = [f"{key}={listed(dict.fromkeys(str(has.get(key)) for has in settings))}" for key in only]
+    require((bool(chosen), f"no run is left by --only; there are {'; '.join(there)}"))
+    return sorted(chosen, key=lambda run: run.seed)
+
+
+def _checked(runs: list[Run], method: Mapping[str, Any], of_track: Track | None) -> tuple[list[Run], Curriculum]:
+    """Return the runs, and what they learned; refuse what cannot be submitted."""
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
@@ -136,9 +152,8 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
     """Return the line of a run in ``runs.csv``."""
-    log, weights = RunLog.read(run.path / LOG), run.path / AGENT
-    finished = run.reason is None
-    state = read_plain(content_of(weights)) if finished and weights.exists() else None
+    log, finished = RunLog.read(run.path / LOG), run.reason is None
+    state = _state(run.path / AGENT) if finished and (run.path / AGENT).exists() else None
     return SubmittedRun(
         run=name,
         seed=run.seed,
@@ -155,6 +170,14 @@ def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
         cpu=str(run.about.get("cpu") or ""),
         seconds=float(log.measurements[-1].get("seconds", 0.0)),
     )
+
+
+def _state(path: Path) -> Any:
+    """Return what an agent saved."""
+    try:
+        return read_plain(content_of(path))
+    except ValueError as error:
+        raise ValueError(f"{path} {error}: save a state_dict there, or nothing") from error
 
 
 def _write(
@@ -207,6 +230,8 @@ def main() -> None:
     about = "what you say about the method (default: %(default)s)"
     parser.add_argument("--method", type=Path, default=Path("method.yaml"), metavar="FILE", help=about)
     parser.add_argument("--track", metavar="NAME", help="the track; default: as the file says")
+    only = "leave out runs with another value, such as --only curriculum.depth=4"
+    parser.add_argument("--only", metavar="SETTING=VALUE", nargs="+", type=_setting, default=[], help=only)
     parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
     parser.add_argument("--template", action="store_true", help="print a method.yaml to fill in, and do nothing else")
     arguments = parser.parse_args()
@@ -220,8 +245,16 @@ def main() -> None:
         method = read_method(arguments.method)
         name = method["track"] if arguments.track is None else arguments.track
         of_track = None if name is None else track(name, arguments.config_dir)
-        made = submit(arguments.runs, arguments.to, method, of_track)
+        made = submit(arguments.runs, arguments.to, method, of_track, dict(arguments.only))
     print(summary(made))
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """Return a setting of the command line with its value."""
+    key, sign, value = text.partition("=")
+    if not (key and sign):
+        raise argparse.ArgumentTypeError(f"settings are written as in curriculum.depth=4, got {text!r}")
+    return key, yaml.safe_load(value)
 
 
 def summary(made: Submission) -> str:
@@ -233,7 +266,7 @@ def summary(made: Submission) -> str:
         f"submission of {made.method['name']} {where}, on {made.curriculum.name}",
         f"runs: {count}{failed}",
         f"digest: {made.digest}",
-        f"files: {made.path}; ctgraph-rl verify {made.path} checks them",
+        f"files: {made.path}; ctgraph-rl verify {made.path} --level rescored checks them",
     ]
     return "\n".join(map(terminal_text, lines))
 

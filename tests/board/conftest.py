@@ -69,8 +69,8 @@ def tiny_track(tiny_home: Path) -> Track:
 def method() -> dict[str, Any]:
     """What an author says about a method."""
     about = yaml.safe_load(TEMPLATE)
-    about["name"], about["code"]["commit"] = "Tiny PPO", "0123abc"
-    return about
+    code = {"repository": "https://example.org/tiny", "commit": "0123abc", "licence": "MIT"}
+    return {**about, "name": "Tiny PPO", "authors": ["A. Author"], "code": code, "tuning": {"how": "not", "seeds": []}}
 
 
 @pytest.fixture(scope="session")

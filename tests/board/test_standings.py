@@ -32,7 +32,9 @@ SMALL, FORGETTING = track("small"), track("forgetting")
 
 def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant: int = 0, **more: Any) -> Entry:
     """A submission with these scores, one for each seed."""
-    method = yaml.safe_load(TEMPLATE) | {"name": name, "bytes_per_task": more.pop("bytes_per_task", 0)}
+    code = {"repository": "https://example.org/repository", "commit": "0123abc", "licence": "MIT"}
+    method = yaml.safe_load(TEMPLATE) | {"name": name, "authors": ["A. Author"], "code": code}
+    method["bytes_per_task"] = more.pop("bytes_per_task", 0)
     method["compute"]["hours"] = 0.25
     about = {"level": "submitted", "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
     values = dict.fromkeys(("normalised_performance", "average_performance", "forgetting"), tuple(scores))

@@ -29,8 +29,15 @@ OF_RUNS = (
     "... is nan in",
     "portable=true needs",
     "logger=wandb needs",
+    "seeds ... are missing",
+    "seeds ... are for tuning",
+    "curriculum ... has fingerprint",
+    "runs are of several configurations",
+    "... has no results",
+    "the code has changed since the runs",
+    "no agent can be built",
 )
-"""Beginnings of messages that need a run; tests of runs, trackers and faults hold them."""
+"""Beginnings of messages that need a run; tests of runs, trackers, faults and submissions hold them."""
 
 GRAPH, SMALL = CTGraph(2, 2), {"wait_ids": (2, 2), "decision_ids": (3, 3)}
 
