@@ -58,7 +58,7 @@ class Method(Hooks):
             ValueError: if the curriculum's protocol hides what the method needs.
         """
         protocol, name, several = curriculum.protocol, type(self).__name__, multi_task_blocks(curriculum)
-        or_detector = "" if self.reads_tasks else ", or name a detector of task changes, detector=NAME"
+        or_detector = "" if self.reads_tasks else ", or add a detector, such as detector=swoks"
         require(
             (
                 not self.needs_task_id or protocol.task_id != "hidden",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -28,6 +28,30 @@ def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
         for task in curriculum.trained[int(block) - 1]
     ]
     return most_frequent(*zip(*parts, strict=True)) if parts else {}
+
+
+class Span(NamedTuple):
+    """Frames of a run in which one label acted."""
+
+    start: float
+    end: float
+    label: int  # from 1
+    learned: bool
+    alarm: bool  # at its end
+
+
+def label_spans(log: RunLog) -> tuple[Span, ...]:
+    """Return the spans of labels of a run in time order; empty without labels of its own."""
+    spans: list[Span] = []
+    for m in log.of_kind("training"):
+        if m.get("acted_label") is None:
+            return ()
+        start = spans[-1].end if spans else 0
+        own = Span(start, m["frames"], int(m["acted_label"]), bool(m.get("learned")), bool(m.get("alarm")))
+        if spans and spans[-1][2:] == (own.label, own.learned, False):
+            own = own._replace(start=spans.pop().start)
+        spans.append(own)
+    return tuple(spans)
 
 
 def policies_by_label(

@@ -14,6 +14,7 @@ from ctgraph_rl.log.escape import markdown_text, terminal_text
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
+from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table, latex
@@ -21,11 +22,14 @@ from ctgraph_rl.report.names import displayed
 from ctgraph_rl.report.sections import Matrix, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
-from ctgraph_rl.report.terminal import code_notes, group_size, mixed_code
+from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
 
-OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (mean_curves, learning_curves, training_curves)
+OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
+    *(mean_curves, learning_curves),
+    *(training_curves, label_strips),
+)
 """Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
 
 OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
@@ -114,7 +118,7 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None, 
         "title": _title(parts),
         "parts": parts,
         "problems": problems,
-        "code": [*mixed_code(runs), *code_notes(runs)],
+        "code": [*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
         "legend": formats.LEGEND,
         "legend_of_means": formats.MEANS,
         "definitions": _definitions(parts),

@@ -220,7 +220,8 @@ def print_problems(problems: Iterable[Problem], runs: Sequence[Run]) -> bool:
         Whether something is left out, or runs of one configuration are of different code.
     """
     left_out, mixed = [f"left out: {problem.reason}" for problem in problems], mixed_code(runs)
-    for line in (*left_out, *(f"code: {sentence}" for sentence in (*mixed, *code_notes(runs)))):
+    notes = [f"code: {sentence}" for sentence in (*mixed, *code_notes(runs))]
+    for line in (*left_out, *notes, *(f"labels: {sentence}" for sentence in label_notes(runs))):
         print(terminal_text(line), file=sys.stderr)
     return bool(left_out or mixed)
 
@@ -243,3 +244,10 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
         of_size = [run for run in runs if group_size(run) == size]
         found.append((of_size, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
     return [f"{len(some)} of {len(runs)} runs are {what}" for some, what in found if some]
+
+
+def label_notes(runs: Sequence[Run]) -> list[str]:
+    """Return what is to be known of evaluations of runs whose learners gave tasks labels themselves, if there are."""
+    count = sum(run.history is not None and bool(run.history.spans) for run in runs)
+    how = "each task is played with the label that acted in most of its frames, an oracle in evaluation alone"
+    return [f"{count} of {len(runs)} runs have labels of a detector: {how}"] if count else []

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
+from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
@@ -51,6 +52,7 @@ class History(NamedTuple):
     performance: list[list[float]]  # mean return [blocks + 1][tasks]; NaN where not evaluated
     evaluations: Mapping[str, Curve]  # by label
     training: Mapping[int, Curve]  # by block, of finished episodes
+    spans: tuple[Span, ...]  # of labels that the learner gave tasks itself
     seconds: float
 
 
@@ -181,13 +183,8 @@ def read_run(path: Path) -> Run:
         {label_of(m): m.get(name) for m in ends} for name in ("success_rate", "return_mean")
     )  # the last
     tasks = list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out")))
-    results: dict[str, Any] = {
-        "metrics": metrics,
-        "success": success,
-        "returns": returns,
-        "tasks": tasks,
-        "history": history,
-    }
+    results: dict[str, Any] = {"metrics": metrics, "success": success, "returns": returns}
+    results |= {"tasks": tasks, "history": history}
     return Run(path, about, agent, settings, seed, reason=why, **results)
 
 
@@ -276,6 +273,7 @@ def _history(log: RunLog) -> History:
         performance=performance,
         evaluations=evaluations,
         training=training,
+        spans=label_spans(log),
         seconds=seconds,
     )
 

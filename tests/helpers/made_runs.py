@@ -23,6 +23,7 @@ def write_run(
     performance: Sequence[Sequence[float]] = ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)),
     labels: Sequence[str] = LABELS,
     intervals: int = 2,
+    acted: Sequence[tuple[int, int, int]] = (),
     finished: bool = True,
 ) -> Path:
     """A run that trains each task in a block of its own.
@@ -35,6 +36,7 @@ def write_run(
         performance: mean return [blocks + 1][tasks].
         labels: of the tasks.
         intervals: of training in each block.
+        acted: of each interval, in order, the label, whether it was learned and whether there is an alarm at its end.
         finished: whether it has metrics.
     """
     path.mkdir(parents=True)
@@ -45,10 +47,13 @@ def write_run(
     config = {"agent": {"_target_": f"baselines.made.{agent}", "gamma": 0.9}, "seed": seed, "device": "cpu"}
     numbers = [[task + 1 for task in block] for block in trained]
     log.append("run", **about, **system, tasks=list(labels), trained=numbers, config=config)
+    number = 0
     for block, row in enumerate(performance):
         for interval in range(intervals if block else 0):
             frames = (block - 1) * FRAMES + FRAMES * (interval + 1) // intervals
-            log.append("training", block=block, frames=frames, episodes=8, return_mean=row[block - 1])
+            given = dict(zip(("acted_label", "learned", "alarm"), acted[number] if acted else (), strict=False))
+            log.append("training", block=block, frames=frames, episodes=8, return_mean=row[block - 1], **given)
+            number += 1
         where = {"moment": "after" if block else "before", "block": block, "frames": block * FRAMES, "held_out": False}
         for task, (label, value) in enumerate(zip(labels, row, strict=True), 1):
             log.append("evaluation", **where, task=task, label=label, return_mean=value, success_rate=value)

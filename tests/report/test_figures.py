@@ -17,8 +17,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
+from ctgraph_rl.report.figures.labels import draw_labels, label_strips
 from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks
 from ctgraph_rl.report.style import contrast, ink, style
+from ctgraph_rl.report.terminal import label_notes
 
 
 @pytest.fixture
@@ -98,3 +100,40 @@ def test_few_seeds_are_thin_lines_beside_their_mean_and_no_band(section):
 
     assert widths == [0.4, 0.4, 0.4, 1.4]
     assert not axes.collections
+
+
+def test_labels_are_drawn_over_the_frames_in_which_they_acted_in_the_colour_of_their_task(tmp_path):
+    acted = [(1, 1, 0), (1, 1, 0), (1, 1, 1), (2, 0, 0), (3, 1, 0), (3, 1, 0), (3, 1, 0), (3, 1, 0)]
+    write_run(tmp_path / "0", agent="A", intervals=4, acted=acted)
+    write_run(tmp_path / "1", agent="B")
+    section = sections(find_runs([tmp_path])[0])[0]
+
+    with style():
+        figure = draw_labels(section)
+    (axes,) = figure.axes
+
+    bars = [(*bar.get_xy(), bar.get_width(), bar.get_facecolor()) for bar in axes.patches]
+    first, second = bars[0][3], bars[1][3]
+    assert first[:3] != second[:3]
+    assert [bar[0] for bar in bars] == [0, 1000, 0, 750, 1000]
+    assert [bar[2] for bar in bars] == [1000, 1000, 750, 250, 1000]
+    assert [bar[3][:3] for bar in bars[2:]] == [first[:3], first[:3], second[:3]]
+    assert bars[3][3][3] < bars[2][3][3] == 1  # not learned from: pale
+    assert [text.get_text() for text in axes.texts] == ["1", "2", "1", "2", "3"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["true task", "A, 0"]
+    assert [line.get_xdata()[0] for line in axes.lines] == [750, 1000]  # the alarm and the change
+
+
+def test_without_labels_of_a_detector_there_is_no_figure_of_them_and_with_them_it_says_how_tasks_are_evaluated(
+    tmp_path,
+):
+    write_run(tmp_path / "0")
+    runs, _ = find_runs([tmp_path])
+    assert (label_strips(sections(runs)[0]), label_notes(runs)) == (None, [])
+
+    write_run(tmp_path / "1", seed=1, acted=[(1, 1, 0)] * 4)
+    runs, _ = find_runs([tmp_path])
+    with style():
+        found = label_strips(sections(runs)[0])
+    assert found is not None and "an oracle in evaluation alone" in found.caption
+    assert label_notes(runs)[0].startswith("1 of 2 runs have labels of a detector: each task is played with the label")
