@@ -228,7 +228,8 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Result) -> list[Chec
         found = terminal_text(result.failure or "it finished")
         return [Check("failure", run.reason, found, again, run=run.run, level=RERUN)]
     if result.log is None:
-        return [Check("rerun", "it finishes", terminal_text(result.failure), None, run=run.run, level=RERUN)]
+        note = "--code DIR says where its modules are" if "ModuleNotFoundError" in str(result.failure) else ""
+        return [Check("rerun", "it finishes", terminal_text(result.failure), None, run.run, note=note, level=RERUN)]
     log = equal("log of the rerun", run.log_sha256, log_sum(result.log), run.run)
     note = "" if log.passed else first_difference(submitted, result.log)
     agent = equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)

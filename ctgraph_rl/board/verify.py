@@ -140,7 +140,7 @@ def described(plan: Plan, means: Means) -> list[str]:
     closed = [text for name, text in CLOSED.items() if getattr(means.isolation, name)]
     lines = [
         f"number {plan.number} draws {'; '.join(seeds)}",
-        f"{len(cells)} processes, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
+        f"{len(cells)} process{'es' * (len(cells) > 1)}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
         f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_listed([means.paths])}",
         *([f"scores are tested where bits differ: {'; '.join(plan.other_bits)}"] if plan.other_bits else []),
         f"isolated: {'; '.join(closed) or 'nothing'}",
