@@ -1,4 +1,4 @@
-"""Level *held out* of a verification: the submitted configuration learns what nobody could tune it for.
+"""Level *held out* of a verification: the submitted configuration learns what no one could tune it for.
 
 Seeds, images and goals follow from the submission and the verifier's number. The scores are tested against the
 submitted ones: are they lower than chance explains?

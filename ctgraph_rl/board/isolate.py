@@ -299,7 +299,7 @@ def _unshared(flags: int) -> bool:
 
 
 def _become_first_process() -> None:
-    """Go on in a child, the first process of a new name space, with which all others of it end; wait for it here."""
+    """Continue in a child, the first process of a new name space, with which all others of it end; wait for it here."""
     child = os.fork()
     if child == 0:
         _libc().prctl(DIE_WITH_PARENT, signal.SIGKILL)

@@ -1,6 +1,6 @@
 """Level *rerun* of a verification: drawn runs are trained again, in processes of their own, and compared bit by bit.
 
-Nobody knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
+No one knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
 the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group.
 """
 

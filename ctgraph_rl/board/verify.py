@@ -137,10 +137,11 @@ def described(plan: Plan, means: Means) -> list[str]:
     frames, seconds = sum(cell.num_frames for cell in cells), sum(cell.seconds for cell in cells)
     limits = means.limits(max(cells, key=lambda cell: cell.seconds))
     most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
+    count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
     closed = [text for name, text in CLOSED.items() if getattr(means.isolation, name)]
     lines = [
         f"number {plan.number} draws {'; '.join(seeds)}",
-        f"{len(cells)} process{'es' * (len(cells) > 1)}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
+        f"{count}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
         f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_listed([means.paths])}",
         *([f"scores are tested where bits differ: {'; '.join(plan.other_bits)}"] if plan.other_bits else []),
         f"isolated: {'; '.join(closed) or 'nothing'}",
@@ -177,16 +178,16 @@ def code_in_words(submission: Submission) -> str:
 
 
 def ask(lines: Sequence[str], yes: bool) -> None:
-    """Say what will run, and go on if the user agrees.
+    """Say what will run, and return if the user agrees.
 
     Raises:
-        ValueError: where nobody can be asked and ``yes`` is not given.
+        ValueError: without a terminal to ask, if ``yes`` is not given.
         SystemExit: if the user does not agree.
     """
     print("\n".join(lines), flush=True)
     if yes:
         return
-    require((sys.stdin.isatty(), "this runs the code of others, and nobody can be asked: give --yes to agree"))
+    require((sys.stdin.isatty(), "this runs the code of others, and there is no terminal to ask: give --yes to agree"))
     if input("Run it? [y/N] ").strip().lower() not in ("y", "yes"):
         print("nothing was run")
         sys.exit(1)
@@ -290,7 +291,7 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     paths = () if arguments.code is None else (arguments.code,)
     means = Means(isolation(folder), arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
     ask(described(plan, means), arguments.yes)
-    with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command goes on"):
+    with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"):
         checks += checks_of_plan(plan, run_plan(plan, means))
     write_verification(submission, checks, plan, means)
     return checks

@@ -284,6 +284,15 @@ def test_held_out_runs_reach_the_last_level(tiny_home, tiny_track, method, tmp_p
     assert "5 runs with other seeds, images and goals" in capsys.readouterr().out
 
 
+def test_runs_of_other_numbers_and_of_more_threads_than_cores_are_refused(tiny_submission, tmp_path, monkeypatch):
+    runs = tuple(replace(run, num_threads=4096) for run in tiny_submission.runs)
+    with pytest.raises(ValueError, match=r"had 4096 threads, this machine has .* cores: verify it on a larger one"):
+        cells_of(replace(tiny_submission, runs=runs), runs, tmp_path)
+    monkeypatch.setattr(rerun, "NUMBERS", 2)
+    with pytest.raises(ValueError, match="numbers version 1, this ctgraph_rl has 2: install the versions of versions"):
+        rerun.why_other_bits(tiny_submission, tiny_submission.runs)
+
+
 def test_a_level_needs_all_checks_and_a_lower_held_out_score_takes_none_away():
     def level(*checks):
         return verify.level_of([Check("", "", "", passed, level=level) for level, passed in checks])

@@ -36,6 +36,9 @@ OF_RUNS = (
     "... has no results",
     "the code has changed since the runs",
     "no agent can be built",
+    "this runs the code of others",
+    "the runs have numbers version",
+    "... had 8 threads",
 )
 """Beginnings of messages that need a run; tests of runs, trackers, faults and submissions hold them."""
 
