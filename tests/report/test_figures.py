@@ -120,7 +120,7 @@ def test_labels_are_drawn_over_the_frames_in_which_they_acted_in_the_colour_of_t
     assert [bar[3][:3] for bar in bars[2:]] == [first[:3], first[:3], second[:3]]
     assert bars[3][3][3] < bars[2][3][3] == 1  # not learned from: pale
     assert [text.get_text() for text in axes.texts] == ["1", "2", "1", "2", "3"]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["true task", "A, 0"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["true task", "A, seed 0"]
     assert [line.get_xdata()[0] for line in axes.lines] == [750, 1000]  # the alarm and the change
 
 

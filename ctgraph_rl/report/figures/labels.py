@@ -62,7 +62,14 @@ def draw_labels(section: Section) -> Any:
             }
             _part(axes, row, place, str(span.label), **look)
             if span.alarm:
-                axes.plot([span.end, span.end], [row + 0.3, row + 0.48], color="black", linewidth=0.8)
+                axes.plot(
+                    [span.end, span.end],
+                    [row + 0.3, row + 0.48],
+                    color="black",
+                    linestyle="-",
+                    marker="",
+                    linewidth=1.2,
+                )
     for start, _, tasks in blocks[1:]:
         if tasks != next(before for _, end, before in blocks if end == start):
             axes.axvline(start, color="black", linestyle=(0, (3, 2)), linewidth=0.6)
@@ -78,7 +85,9 @@ def _runs(section: Section) -> list[tuple[str, Run]]:
     """Return the finished runs with labels of their own, each with agent and seed."""
     found = [(result.agent, run) for result in section.results for run in result.finished]
     return [
-        (f"{short(terminal_text(agent))}, {run.seed}", run) for agent, run in found if run.history and run.history.spans
+        (f"{short(terminal_text(agent))}, seed {run.seed}", run)
+        for agent, run in found
+        if run.history and run.history.spans
     ]
 
 
