@@ -47,6 +47,8 @@ class ADWIN(Detector):
         ModuleNotFoundError: without River; names the extra to install.
     """
 
+    reads = "returns"
+
     def __init__(
         self,
         delta: float,

@@ -35,10 +35,11 @@ class AMD(Detector):
 
         X = sum (O - E)^2 / E,   p = P(chi^2 with k degrees of freedom > X)
 
-    with k = n |o| (``published``), which accepts too often, or n (|o| - 1) (``corrected``), where n is the number of
-    pairs of a cluster and an action in it. The p-value of a batch is the smallest one of its W windows, times W. A
-    label fits if that is at least ``threshold``. Where the present label does not fit, the next batch decides, as the
-    steps of this one may be of two tasks: the label of the largest p-value is next, or a new one if none fits.
+    with k = n m (``published``), which accepts too often, or n (m - 1) (``corrected``), where n is the number of pairs
+    of a cluster and an action in it, and m that of observations. The p-value of a batch is the smallest one of its W
+    windows, times W. A label fits if that is at least ``threshold``. Where the present label does not fit, the next
+    batch decides, as the steps of this one may be of two tasks: the label of the largest p-value is next, or a new one
+    if none fits.
 
     Args:
         window: steps of a test.
@@ -53,6 +54,7 @@ class AMD(Detector):
         max_labels: most labels.
     """
 
+    reads = "one-hot observations"
     needs = ("observation_id",)
 
     def __init__(

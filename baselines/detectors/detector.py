@@ -28,6 +28,9 @@ class Detector:
             there are none, and a suspicion restores nothing.
     """
 
+    reads: ClassVar[str] = ""
+    """What its verdicts depend on, in a few words."""
+
     needs: ClassVar[tuple[str, ...]] = ()
     """What it reads of `Seen` beside the fields that are always there: ``features``, ``observation_id``."""
 

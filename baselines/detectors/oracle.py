@@ -21,6 +21,7 @@ class Oracle(Detector):
         max_labels: most labels; None: one for each task.
     """
 
+    reads = "the true tasks"
     is_oracle = True
 
     def __init__(self, max_labels: int | None = None) -> None:

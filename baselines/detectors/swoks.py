@@ -53,6 +53,7 @@ class SWOKS(Detector):
         max_labels: as the following, of `Detector`.
     """
 
+    reads = "features, rewards"
     needs = ("features",)
 
     def __init__(

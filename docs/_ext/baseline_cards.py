@@ -1,4 +1,4 @@
-"""A card for each agent, each cell and each lifelong-learning method, from its yaml, its class and the raw results."""
+"""A card for each agent, cell, method and detector, from its yaml, its class and the raw results."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from baselines.catalogue import Entry, catalogue
 from baselines.cells.cell import Cell
 from baselines.methods.__main__ import needs_ids
 
+DETECTABLE = "curriculum=dick2020_pair agent=ppo method=mask_ri "
+"""A run in which every detector can work."""
+
 
 def baseline_cards() -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each card, and of the lists of them, in Markdown."""
-    for group, facts in (("agent", _agent_facts), ("cell", _cell_facts), ("method", _method_facts)):
+    groups = {"agent": _agent_facts, "cell": _cell_facts, "method": _method_facts, "detector": _detector_facts}
+    for group, facts in groups.items():
         entries = list(catalogue(group))
         yield f"{group}s/index.md", _index(group, entries)
         first = {entry.kind: entry.name for entry in reversed(entries)}
@@ -45,8 +49,12 @@ def _method_facts(entry: Entry) -> dict[str, str]:
     return {"needs task ids": ids, "needs to know boundaries": "yes" if entry.kind.needs_boundaries else "no"}
 
 
+def _detector_facts(entry: Entry) -> dict[str, str]:
+    return {"reads": entry.kind.reads}
+
+
 def _card(group: str, entry: Entry, facts: dict[str, str], is_first: bool) -> str:
-    chosen = {"agent": "", "cell": "agent=lstm_ppo ", "method": "agent=ppo "}[group]
+    chosen = {"agent": "", "cell": "agent=lstm_ppo ", "method": "agent=ppo ", "detector": DETECTABLE}[group]
     results = {"agent": agents_results, "method": methods_results}.get(group, lambda name: "")(entry.name)
     prefix = "agent.cell." if group == "cell" else f"{group}."
     rows = ["| | |", "|---|---|", *(f"| {fact} | {value} |" for fact, value in facts.items())]
@@ -63,14 +71,14 @@ def _card(group: str, entry: Entry, facts: dict[str, str], is_first: bool) -> st
         *(["## Results", results] if results else []),
         *_source(entry),
         "## Class",
-        _class(entry.kind, is_first),
+        _class(entry.kind, is_first, with_members=group != "detector"),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _class(kind: type, is_first: bool = True) -> str:
+def _class(kind: type, is_first: bool = True, with_members: bool = True) -> str:
     """Return the reference of a class, which is indexed where it stands first."""
-    options = "   :members:" + ("" if is_first else "\n   :no-index:")
+    options = "   :members:" * with_members + ("" if is_first else "\n   :no-index:")
     return f"```{{eval-rst}}\n.. autoclass:: {kind.__module__}.{kind.__name__}\n{options}\n```"
 
 

@@ -16,7 +16,6 @@ from yaml_settings import Setting, escaped, first_comment, names_in, settings_of
 from ctgraph_rl import cli
 
 GROUPS = {
-    "detector": ("Detectors", "`detector=NAME` finds task changes, for methods that then need no labels."),
     "exchange": ("Exchanges", "`exchange=NAME` lets several learners share what they learn."),
     "logger": ("Loggers", "`logger=NAME` also sends measurements elsewhere."),
     "experiment": ("Experiments", "`ctgraph-rl -m experiment=NAME` runs a recorded comparison."),

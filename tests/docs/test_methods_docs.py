@@ -45,7 +45,7 @@ def blocks(language: str, page: str = TEXT) -> list[str]:
     return [content for marked, content in fenced if marked == language]
 
 
-def test_the_page_shows_the_list_of_methods_as_it_is_printed(capsys, monkeypatch):
+def test_the_pages_show_the_lists_of_methods_and_detectors_as_they_are_printed(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["baselines.methods"])
     main()
     printed = capsys.readouterr().out
@@ -55,6 +55,7 @@ def test_the_page_shows_the_list_of_methods_as_it_is_printed(capsys, monkeypatch
     assert printed == capsys.readouterr().out
     shown = blocks("")[0].splitlines()
     assert shown == [line for line in printed.splitlines() if line in shown]  # the page may lack new ones
+    assert printed.partition("\n\n")[2] in CHECKOUT.joinpath("docs/reference/detectors.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", YAML)

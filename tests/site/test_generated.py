@@ -78,10 +78,10 @@ def test_every_source_of_a_curriculum_has_bibtex(site):
     assert [name for name in curricula.names() if not entries_of(curricula.load(name).source)] == []
 
 
-def test_every_agent_method_and_metric_has_a_card(site):
+def test_every_agent_method_detector_and_metric_has_a_card(site):
     pages = {*dict(site("baseline_cards").baseline_cards()), *dict(site("metric_cards").metric_cards())}
 
-    for group in ("agent", "cell", "method"):
+    for group in ("agent", "cell", "method", "detector"):
         assert {f"{group}s/{entry.name}.md" for entry in catalogue(group)} <= pages
     assert {f"metrics/{name}.md" for name in metrics.definitions()} <= pages
 
