@@ -12,7 +12,7 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.method import fact_rules, facts_of
-from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, seed_rules
+from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, oracle_rule, seed_rules
 from ctgraph_rl.board.submission import (
     CONFIG,
     EVALUATIONS,
@@ -23,6 +23,7 @@ from ctgraph_rl.board.submission import (
     VERSIONS,
     Submission,
     SubmittedRun,
+    experts_of,
     log_sum,
 )
 from ctgraph_rl.checks import is_real, require
@@ -101,6 +102,8 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
     yield _rules("seeds", rules, wanted, ", ".join(map(str, seeds)))
     entry = method["entry_point"]
     yield _rules("way to run it again", [entry_rule(submission.config, entry)], "agent or entry_point", str(entry))
+    rule = oracle_rule(submission.config)
+    yield _rules("oracle", [rule], "none", "none" if rule[0] else "one")
     facts = facts_of(submission.curriculum.protocol, runs)
     rules = fact_rules(method, facts, runs, len(submission.curriculum.tasks))
     said = {part: method[part] for part in facts}
@@ -130,6 +133,9 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
+        said = [each.get("fingerprint") for each in experts_of(log)]
+        alone = [expert.of_kind("run")[0].get("fingerprint") for expert in submission.experts(run) or ()]
+        yield equal("curricula of experts", said, alone, run.run)
         yield from _of_the_protocol(submission, run, log)
 
 

@@ -14,14 +14,20 @@ from ctgraph_rl.board.tracks import Track
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
 from ctgraph_rl.log.sources import SCRIPTS, sources_of
-from ctgraph_rl.packages import is_published
+from ctgraph_rl.packages import class_named, is_published
+from ctgraph_rl.runs.load import OURS
 from ctgraph_rl.runs.read import MODIFIED, Run
+from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 Rule = tuple[bool, str]
 
 MOST_SHOWN = 3
 """Of things that a message lists."""
+
+
+MAY_BE_READ = ("", "the frames of each block")
+"""What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
 
 
 def listed(values: Iterable[Any]) -> str:
@@ -151,3 +157,27 @@ def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
     is_built = isinstance(agent, Mapping) and "_target_" in agent
     fix = "set entry_point: module:function in method.yaml, a function (curriculum, seed, run_dir) that trains a run"
     return is_built or entry_point is not None, f"no agent can be built from the configuration of the runs: {fix}"
+
+
+def oracle_rule(config: Mapping[str, Any]) -> Rule:
+    """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given."""
+    parts = {part: _part(part, config.get(part)) for part in ("method", "detector")}
+    reads = [getattr(parts["method"], "reads_tasks", ""), getattr(parts["detector"], "is_oracle", False)]
+    named = [f"{part}={type(each).__name__}" for part, each in parts.items() if each is not None]
+    return reads[0] in MAY_BE_READ and not reads[1], (
+        f"{' '.join(named)} is an oracle, which reads {reads[0] or 'the true tasks'}: it is a reference for others, "
+        f"submit runs without it"
+    )
+
+
+def _part(part: str, settings: Any) -> object:
+    """Return what a group of a configuration builds, if its class is one of `baselines`; None for any other."""
+    settings = settings if isinstance(settings, Mapping) else {}
+    ours = OURS[part].fullmatch(str(settings.get("_target_")))
+    kind = None if ours is None else class_named(ours[1], ours[2])
+    if kind is None:
+        return None
+    try:
+        return kind(**{key: value for key, value in with_added(settings).items() if not key.startswith("_")})
+    except (TypeError, ValueError):  # settings of another version
+        return None

@@ -23,6 +23,7 @@ from ctgraph_rl.board.rules import (
     entry_rule,
     failure_rules,
     listed,
+    oracle_rule,
     same_rules,
     seed_rules,
 )
@@ -112,7 +113,8 @@ def _checked(runs: list[Run], method: Mapping[str, Any], of_track: Track | None)
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
-    rules.append(entry_rule(runs[0].about["config"], method["entry_point"]))
+    config = runs[0].about["config"]
+    rules += [entry_rule(config, method["entry_point"]), oracle_rule(config)]
     curricula = [(run, run.path / CURRICULUM) for run in runs]
     unwritten = [path for _, path in curricula if not path.exists()]
     message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a curriculum of ours"

@@ -46,6 +46,12 @@ TINY = ("agent=ppo", "agent.num_envs=8", "agent.num_steps=4", "agent.hidden_size
 
 
 @pytest.fixture(scope="session")
+def tiny_settings() -> tuple[str, ...]:
+    """The settings of the runs."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
 def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``conf/track/tiny.yaml`` and, in ``runs``, the runs of two seeds of the track."""
     home = tmp_path_factory.mktemp("tiny")

@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.sweeping import command_line
 
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
 from ctgraph_rl.board.method import read_method
+from ctgraph_rl.board.rules import oracle_rule
 from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.log.saved import sum_of_state
+from ctgraph_rl.runs.config import plain
 
 pytest.importorskip("pyarrow")
 
@@ -218,6 +221,25 @@ def test_a_method_that_contradicts_its_runs_is_refused(tiny_home, tiny_track, me
         submit([tiny_home / "runs"], tmp_path / "made", {**method, **part}, tiny_track)
 
 
+@pytest.mark.parametrize(
+    ("method", "settings", "reads"),
+    [
+        ("detector", {}, "Oracle is an oracle, which reads the true tasks: it is a reference for others, submit runs"),
+        ("mask_sc", {"selection": "parent"}, "method=MaskSC is an oracle, which reads the tasks' goals and images"),
+        ("mask_amsc", {"competence": "evaluation"}, "is an oracle, which reads evaluations of the task that ends"),
+        ("mask_sc", {"selection": "similarity"}, None),
+        ("packnet", {}, None),
+        ("finetune", {}, None),
+    ],
+)
+def test_a_learner_that_reads_what_only_an_oracle_knows_is_refused(compose, method, settings, reads):
+    names = ("detector=oracle",) if method == "detector" else (f"method={method}",)
+    holds, message = oracle_rule(plain(compose(*names, *(f"method.{key}={value}" for key, value in settings.items()))))
+
+    assert holds == (reads is None)
+    assert reads is None or reads in message
+
+
 def test_a_failed_run_that_is_accounted_for_is_a_line_with_its_reason(runs, tiny_track, method):
     failed(runs / "tiny-seed1")
 
@@ -309,3 +331,24 @@ def test_the_command_prints_a_template_that_reads_once_it_is_filled_in(tiny_home
     said = capsys.readouterr().out.splitlines()
     assert said[:2] == ["submission of Tiny for track tiny-v1, on su_b1_4tasks", "runs: 2"]
     assert said[2] == f"digest: {read_submission(tmp_path / 'made', config_dir=tiny_home / 'conf').digest}"
+
+
+def test_the_logs_of_experts_are_submitted_and_their_metrics_are_those_of_the_run(
+    tiny_home, tiny_track, tiny_settings, method, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    one = replace(tiny_track, seeds=(0,))
+    words = ("--config-dir", str(tiny_home / "conf"), "track=tiny", "experts=true", "seed=0", "hydra.run.dir=runs/one")
+    assert command_line(monkeypatch, *words, *tiny_settings) == 0
+
+    made = submit([Path("runs")], Path("made"), method, one)
+
+    (run,) = made.runs
+    stored = json.loads(Path("runs/one/metrics.json").read_text())
+    assert [log.of_kind("run")[0]["curriculum"] for log in made.experts(run)] == ["single-task expert"] * 4
+    reasons = {name: cells["undefined"] for name, cells in made.metrics["one"].items()}
+    assert reasons == {name: metric["undefined"] or "" for name, metric in stored.items()}
+    assert "no experts were given" not in reasons.values()
+    shutil.rmtree("runs/experts")
+    with pytest.raises(ValueError, match=r"was trained with experts, runs/experts/.* cannot be found: submit from the"):
+        submit([Path("runs")], Path("again"), method, one)
