@@ -328,7 +328,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--disk", type=float, default=4.0, metavar="GB", help="of a process (default: %(default)g)")
     made.add_argument("--yes", action="store_true", help="agree to run it, with all that is not isolated")
     made.add_argument(
-        "--folder", type=Path, default=Path("runs/verify"), metavar="DIR", help="of the reruns (default: %(default)s)"
+        "--folder", type=Path, default=Path("verify"), metavar="DIR", help="of the reruns (default: %(default)s)"
     )
     made.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
     return made
