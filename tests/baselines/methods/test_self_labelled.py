@@ -26,7 +26,7 @@ from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent
 from ctgraph_rl.tasks.images import PaperImages
 
-EVALUATION = Evaluation(1, greedy=False, every=64)
+EVALUATION = Evaluation(1, greedy=False, every=32)
 
 BLOCKS = (Block(ONE, 80), Block(TWO, 64), Block(ONE, 48))
 """Batches of 32 frames, and at the end of announced blocks of less; the first task comes again."""
@@ -150,7 +150,7 @@ def own(measured: list[dict[str, float]]) -> list[tuple[float, ...]]:
 def test_a_suspicion_restores_the_older_snapshot_and_a_label_that_is_found_again_learns_on_from_it(
     labelled, every, kept
 ):
-    agent, given = labelled({6: SUSPICION, 8: 0}, snapshot_every=every)
+    agent, given = labelled({6: SUSPICION, 8: 0}, "scratch", snapshot_every=every)
     states = [deepcopy(agent.learner.state_dict())]
 
     measured = []
@@ -263,11 +263,24 @@ def test_each_task_is_evaluated_with_the_label_that_acted_in_most_of_its_frames(
     monkeypatch.setattr(
         SelfLabelledAgent, "policy_for_label", lambda self, label: asked.append(label) or policy_for_label(self, label)
     )
-    curriculum = of(Block(ONE, 96), Block(TWO, 96), evaluation=Evaluation(2), boundaries="hidden")
+    evaluation = Evaluation(2, every=112)
+    curriculum = of(Block(ONE, 96), Block(TWO, 96), evaluation=evaluation, boundaries="hidden")
 
     learned(maker(compose, "mask_ri", lambda: Script({1: 1, 3: 0, 4: 2})), curriculum)
 
-    assert asked == [None, None, 1, None, 1, 2]  # before; after the first block, where the second has none; at the end
+    before, first, within, last = [None, None], [1, None], [1, 0], [1, 2]  # within: the second task's first batch acts
+    assert asked == [*before, *first, *within, *last]
+
+
+def test_an_alarm_counts_once_where_a_batch_goes_over_a_boundary(compose):
+    curriculum = of(*BLOCKS, evaluation=Evaluation(1, before=False), boundaries="hidden")
+
+    _, log, _ = learned(maker(compose, "finetune", lambda: Script({3: 1, 5: SUSPICION})), curriculum)
+
+    frames, alarms, undone = (log.training(name).tolist() for name in ("frames", "alarm", "rolled_back"))
+    assert frames == [32, 64, 80, 96, 128, 144, 160, 192]
+    assert alarms == [0, 0, 0, 1, 0, 0, 1, 0]
+    assert undone == [0, 0, 0, 0, 0, 0, 32, 0]
 
 
 def test_a_run_with_a_detector_says_so_in_its_name_metrics_and_directory(monkeypatch, tmp_path):
