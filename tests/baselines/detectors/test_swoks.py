@@ -121,6 +121,13 @@ def test_a_change_is_suspected_after_14_windows_that_are_further_away(changes_at
     assert first_suspicion(changes_at, changes_at + 4_000) == changes_at // 240 * 240 + 14 * 240
 
 
+def test_distances_that_grow_by_less_than_the_adjustment_are_as_before():
+    detector = SWOKS(**PUBLISHED)
+
+    assert detector._p_value([1.0] * 200, [1.09] * 42) == 1
+    assert detector._p_value([1.0] * 200, [1.11] * 42) < 1e-30
+
+
 def test_after_a_longer_stay_more_earlier_distances_save_a_window():
     assert first_suspicion(61_440, 65_000) == 61_440 + 13 * 240
 
@@ -134,6 +141,18 @@ def test_an_independent_stream_is_not_suspected():
     detector = SWOKS(**PUBLISHED)
 
     assert {detector.observe(seen(batch)) for batch in stream(72_000).split(480)} == {None}
+
+
+def test_a_label_that_is_left_keeps_its_oldest_window_and_all_but_the_newest_distances():
+    detector = SWOKS(**{**PUBLISHED, **SMALL, "stable_phase": 1_000})
+    points = torch.cat([stream(1_400), stream(400, shift=1.0)])
+
+    windows = enumerate(points.split(20), 1)
+    number = next(number for number, window in windows if detector.observe(seen(window)) is SUSPICION)
+
+    oldest = points[20 * (number - 41) :][:20]
+    assert number > 70 and torch.equal(detector.references[0], points_of(seen(oldest)))
+    assert len(detector.distances[0]) == 40 and detector.earlier[0] == detector.distances[0][:30]
 
 
 @pytest.mark.parametrize(
