@@ -28,6 +28,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
+from torch.func import functional_call
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -190,12 +191,13 @@ class Target(LossModule):
         self.convert_to_functional(network, "value_network", create_target_params=True)
         self.in_keys, self.out_keys = network.in_keys, ["features", "action_value"]
 
-    def forward(self, data: Data) -> tuple[Tensor, Tensor]:
+    def outputs(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute phi and q with the target network's weights."""
         trunk, head = self.value_network
-        with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
-            features = trunk.over_time(data)
-            return features, head.module(features)
+        parts = (self.target_value_network_params["module", place, "module"] for place in ("0", "1"))
+        of_trunk, of_head = (dict(part.flatten_keys(".").items()) for part in parts)
+        features = functional_call(trunk.module, of_trunk, tuple(data[key] for key in trunk.in_keys))
+        return features, functional_call(head.module, of_head, (features,))
 
 
 class MOHQA(QLearner):
@@ -317,6 +319,13 @@ class MOHQA(QLearner):
             self.target_weights.copy_(self.hebbian.weights)
         return super().after_update(measured)
 
+    def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
+        """See `QLearner`; one step needs none of `MultiStep`'s operations, which take long for a batch of one step."""
+        if self.multi_step.n_steps > 1:
+            return super().with_targets(batch)
+        steps = torch.ones(batch.shape, dtype=torch.int64, device=batch.device)
+        return batch.clone(False).set("steps_to_next_obs", steps)
+
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return every step as a transition of up to ``n_steps`` steps."""
         seen = (*self.policy.greedy.in_keys, "average")
@@ -328,7 +337,7 @@ class MOHQA(QLearner):
         values = self.values(batch) if self.predict_sum else self.policy.head(self.policy.features(batch))
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))
         with torch.no_grad():
-            features, later = self.target({key: batch["next", key] for key in self.policy.greedy.in_keys})
+            features, later = self.target.outputs({key: batch["next", key] for key in self.policy.greedy.in_keys})
             y = (features - batch["next", "average"]).tanh()
             best = (later + nn.functional.linear(y, self.target_weights).sigmoid()).amax(dim=-1, keepdim=True)
             gamma = best.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(best)

@@ -177,13 +177,17 @@ class QLearner(Learner):
         values = self.values(data)
         return {"log_probs": values.log_softmax(dim=-1), "action_value": values}
 
+    def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a batch with multi-step rewards, what follows them, and how many steps they span."""
+        return self.multi_step(batch)
+
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""
         raise NotImplementedError
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
         """Store a batch, and yield minibatches of replayed items."""
-        self.replay.extend(self.experience(self.multi_step(batch)))
+        self.replay.extend(self.experience(self.with_targets(batch)))
         for _ in range(self.num_updates):
             self.replayed, items = self._sample()
             yield items

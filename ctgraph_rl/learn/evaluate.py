@@ -186,6 +186,10 @@ def as_policy(policy: Policy | nn.Module, num_actions: int) -> Policy:
     return LogitsPolicy(policy, num_actions) if plain else policy  # type: ignore[arg-type]
 
 
+EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
+"""What `episode_means` reads."""
+
+
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
     """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
 

@@ -18,7 +18,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import batches, make_env
-from ctgraph_rl.learn.evaluate import Evaluator, episode_means
+from ctgraph_rl.learn.evaluate import EPISODE_KEYS, Evaluator, episode_means
 from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Block, Curriculum
@@ -272,7 +272,8 @@ def log_training(
     frames, end = start, start + batch.numel()
     for part in _of_one_block(batch, start, curriculum.ends):
         frames += part.numel()
-        episodes = episode_means(part["next"][part["next", "done"].squeeze(-1)])
+        after = part["next"]
+        episodes = episode_means(after.select(*EPISODE_KEYS)[after["done"].squeeze(-1)])
         events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
         given = {**episodes, **measurements, **events}
         log.append("training", block=curriculum.block_at(frames), frames=frames, **given)
