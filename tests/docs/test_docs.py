@@ -1,4 +1,4 @@
-"""The page for those who come from the authors' implementation: its Python runs, and its table says what happens."""
+"""The pages on the authors' implementation and on TorchRL: their Python runs, and what they say happens."""
 
 import inspect
 import json
@@ -157,3 +157,25 @@ def test_the_page_has_every_key_of_every_dialect():
     missing = [key for key in [*keys, *SHIPPED_2023] if f"`{key}`" not in PROSE]
 
     assert missing == []
+
+
+TORCHRL = (CHECKOUT / "docs" / "how-to" / "torchrl.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def loops():
+    """What the page's blocks, one program, define."""
+    names = {}
+    exec(compile("\n\n".join(re.findall(r"```python\n(.*?)```", TORCHRL, re.DOTALL)), "torchrl.md", "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["train_ppo", "train_dqn", "train_lstm_ppo"])
+def test_every_loop_of_the_page_reaches_nine_tenths_of_the_optimum(loops, name):
+    assert loops[name](seed=0) >= 0.9
+
+
+def test_the_page_has_the_loops_that_are_tested_and_no_baseline(loops):
+    assert sorted(name for name in loops if name.startswith("train_")) == ["train_dqn", "train_lstm_ppo", "train_ppo"]
+    assert "baselines" not in TORCHRL

@@ -36,7 +36,7 @@ ELSEWHERE = {
     "README.md": "test_readme",
     "docs/how-to/migrate.md": "test_docs",
     "docs/how-to/sweeps.md": "test_sweeps",
-    "docs/how-to/torchrl.md": "test_torchrl_page",
+    "docs/how-to/torchrl.md": "test_docs",
     "docs/reference/curricula.md": "test_cli",
     "docs/reference/methods.md": "test_methods_docs",
     "docs/reference/metrics.md": "test_metrics_page",

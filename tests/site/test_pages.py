@@ -10,7 +10,10 @@ import pytest
 from helpers.paths import CHECKOUT, sources
 
 TEXTS = (".md", ".ipynb", ".py", ".yaml", ".toml", ".cff")
-TEMPLATES = {"template.md": "results", "lifelong_template.md": "results", "statistics_template.md": "explanation"}
+TEMPLATES = {
+    **dict.fromkeys(("template.md", "lifelong_template.md", "memory_template.md"), "results"),
+    "statistics_template.md": "explanation",
+}
 """Templates of pages, and the folder of docs that their pages are in."""
 
 

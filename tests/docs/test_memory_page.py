@@ -1,0 +1,77 @@
+"""docs/results/memory.md: made from the raw results beside it, and what it says of them holds."""
+
+from __future__ import annotations
+
+import csv
+import sys
+
+import pytest
+from helpers.paths import CHECKOUT
+
+FOLDER = CHECKOUT / "docs" / "results"
+PAGE = " ".join((FOLDER / "memory.md").read_text(encoding="utf-8").split())
+
+
+@pytest.fixture(scope="module")
+def cells():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(FOLDER))
+        yield __import__("memory_cells")
+        for name in ("memory_cells", "raw"):
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def hardest():
+    """Greedy returns on the graph of the claims, by agent and whether first rewards were given."""
+    found: dict[tuple[str, bool], list[float]] = {}
+    with open(FOLDER / "memory_cells.csv", newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            graph = (line["depth"], line["wait_prob"], line["unique_decisions"], line["num_wait_images"])
+            if graph == ("2", "0.9", "False", "500"):
+                found.setdefault((line["agent"], line["guide_frames"] != "0"), []).append(float(line["greedy_return"]))
+    return {key: values for key, values in found.items() if len(values) == 5}
+
+
+def test_the_page_is_what_its_raw_results_make(cells):
+    assert cells.page() == (FOLDER / "memory.md").read_text(encoding="utf-8")
+
+
+def test_each_run_is_one_line_with_the_share_of_the_gap_or_its_reason(cells):
+    lines = cells.read(cells.NAME)
+
+    assert len({tuple(line[key] for key in ("agent", "seed", *cells.CONDITION)) for line in lines}) == len(lines)
+    for line in lines:
+        best, ceiling = float(line["optimum"]), float(line["ceiling_without_memory"])
+        share = (float(line["greedy_return"]) - ceiling) / (best - ceiling) if best > ceiling else None
+        if share is None:
+            assert "memory gains nothing there" in line["memory_gap_closed"]
+        else:
+            assert float(line["memory_gap_closed"]) == pytest.approx(share, abs=1e-6)
+
+
+def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(hardest):
+    solved = {key: f"{sum(value >= 0.9 for value in values)} of 5" for key, values in hardest.items()}
+    cell, one, six = "lstm_ppo", "dqn, 1 step", "dqn, 6 steps"
+
+    of = {name: solved[name, True] for name, given in solved if given}
+    assert f"PPO with an LSTM solves the task in {of[cell]} seeds once its first rewards are given" in PAGE
+    assert f"with a GRU in {of[f'{cell}-gru']}, with AMRL-Max in {of[f'{cell}-amrl_max']}" in PAGE
+    assert f"and with AMRL-Avg in {of[f'{cell}-amrl_avg']}." in PAGE
+    assert f"A2C in {of['a2c']}, REINFORCE in {of['reinforce']}, DQN in {of[one]} with one step" in PAGE
+    assert f"and in {of[six]} with six. QRDQN+LSTM does in {of['qrdqn_lstm']}." in PAGE
+    rows = {"DQN, 1 step": one, "QRDQN+LSTM": "qrdqn_lstm", "AMRL-Avg": f"{cell}-amrl_avg", "MOHQA": "mohqa"}
+    for row, name in rows.items():
+        given, to_find = (solved.get((name, guided), "not run") for guided in (True, False))
+        assert f"| {row} | {given} | {to_find} |" in PAGE
+
+
+def test_what_the_page_says_in_words_of_the_claims_holds(hardest):
+    best = {key: max(values) for key, values in hardest.items()}
+    to_find = [value for (_, given), value in best.items() if not given]
+
+    assert set(to_find) == {0.0} and f"{len(to_find)} of {len(to_find)} agents get nothing in any seed" in PAGE
+    assert "the claim holds here of every agent that was run, an LSTM and a GRU among them" in PAGE
+    assert all(best[name, True] < 0.9 for name in ("a2c", "reinforce", "dqn, 1 step", "dqn, 6 steps", "lstm_ppo-none"))
+    assert all(sum(value >= 0.9 for value in hardest[f"lstm_ppo-amrl_{kind}", True]) >= 4 for kind in ("max", "avg"))
+    assert "With first rewards given it does not hold of AMRL" in PAGE
