@@ -65,7 +65,10 @@ class SelfLabelled:
                 not (self.detector.is_oracle and several),
                 f"{detector} needs blocks of one task each, and blocks {several} have several: take another detector",
             ),
-            (not reads, f"{method} needs {reads}, which no detector gives: take another method, or leave it out"),
+            (
+                not reads,
+                f"{method} needs {reads}, which no detector gives: take another method, or leave the detector out",
+            ),
             (wants <= room, f"max_labels={room} is too few for {wants} tasks: set detector.max_labels=null"),
         )
         labelled = as_labelled(curriculum)
