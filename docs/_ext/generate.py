@@ -14,6 +14,7 @@ from gallery import gallery_page
 from links import OUTSIDE, relocated
 from metric_cards import metric_cards
 from sphinx.application import Sphinx
+from track_cards import track_cards
 
 FOLDER = "generated"
 
@@ -29,7 +30,8 @@ def generate(app: Sphinx) -> None:
     """Write all generated pages, and remove those that are generated no more."""
     folder = Path(app.srcdir) / FOLDER
     figures = draw_all(folder / "figures")
-    made = (api_pages(), command_pages(), baseline_cards(), metric_cards(), curriculum_cards(figures))
+    cards = (baseline_cards(), metric_cards(), track_cards(), curriculum_cards(figures))
+    made = (api_pages(), command_pages(), *cards)
     pages = {folder / path: text for path, text in chain(*made)}
     pages[folder / "gallery.md"] = gallery_page(folder / "figures")
     pages |= {folder.parents[1] / page: _copy(app, name, page) for name, page in OUTSIDE.items() if FOLDER in page}

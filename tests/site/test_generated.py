@@ -54,6 +54,17 @@ def test_every_setting_of_a_run_has_its_default_and_a_comment(site):
     assert [setting.key for setting in own if not setting.comment] == []
 
 
+def test_a_track_has_a_card_with_what_its_tasks_allow(site):
+    pages = dict(site("track_cards").track_cards())
+
+    assert sorted(pages) == sorted(f"tracks/{name}.md" for name in ("index", *site("yaml_settings").names_in("track")))
+    hidden = (
+        "| nothing | `protocol.task_id=hidden` `protocol.boundaries=hidden` | 409,600 | 1 | 0.25 | 1 | 1 | 0.004115 |"
+    )
+    deeper = "| depth 3 | nothing | `curriculum.depth=3` | 3,072,000 | 1 | 0.5625 | 0.0004572 | 5,919 |"
+    assert hidden in pages["tracks/small.md"] and deeper in pages["tracks/adaptation.md"]
+
+
 def test_a_card_of_a_curriculum_has_its_parts(site):
     card = site("curriculum_cards").card(curricula.load("su_b1_4tasks"), "graphs.png", "similarity.png")
 

@@ -1,0 +1,86 @@
+"""A card for each track of the board: what it measures, what its tasks allow, how to run it, and what is published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from yaml_settings import ALONE, escaped
+
+from ctgraph_rl.board.standings.ceilings import Ceilings, ceilings_of
+from ctgraph_rl.board.tracks import Track, Variant, tracks
+
+COLUMNS = {
+    "optimal": "optimum",
+    "one_policy": "one policy for tasks that look the same",
+    "search": "best search",
+    "memoryless": "without memory",
+    "open_loop": "without observations",
+    "random": "random policy",
+}
+"""Ceilings by the headings of their columns; one that no variant of a track has is left out."""
+
+
+def track_cards() -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each card, and of the list of them, in Markdown."""
+    found = tracks()
+    rows = [f"| [`{each.name}`]({each.name}.md) | {each.version} | {escaped(each.measures)} |" for each in found]
+    words = (
+        "The [rules](../../reference/tracks.md) of tracks, and how to [submit and read results](../../how-to/board.md)."
+    )
+    yield (
+        "tracks/index.md",
+        "\n".join(
+            ["# Track cards", "", words, "", "| track | version | what it measures |", "|---|--:|---|", *rows, ""]
+        ),
+    )
+    for each in found:
+        yield f"tracks/{each.name}.md", _card(each)
+
+
+def _card(track: Track) -> str:
+    seeds = f"{track.seeds[0]} to {track.seeds[-1]}"
+    tuning = f"{track.tuning_seeds[0]} to {track.tuning_seeds[-1]}"
+    names = dict.fromkeys(variant.curriculum.name for variant in track.variants)
+    facts = {
+        "curriculum": ", ".join(
+            f"[`{name}`](../curricula/{name}.md), modified where settings differ" for name in names
+        ),
+        "score": f"`{track.score}`",
+        "seeds of a submission": seeds,
+        "seeds for tuning": tuning,
+        "seeds that verifiers draw from": f"{track.held_out_seeds[0]:,} to {track.held_out_seeds[-1]:,}",
+    }
+    which = "every rung as the track gives it" if len(track.rungs) > 1 else "the first one"
+    parts = [
+        ALONE,
+        f"# `track={track.name}`",
+        "[All tracks](index.md)",
+        f"{escaped(track.measures)}",
+        f"**Breakthrough.** {escaped(track.breakthrough)}",
+        "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts.items())]),
+        f"```bash\nctgraph-rl -m track={track.name} agent=lstm_ppo\n```",
+        "## What may be submitted, and what its tasks allow",
+        "Mean returns over the tasks, in closed form. Each row is a table of its own on a board. The line above runs "
+        f"{which}; others need their settings, too.",
+        _table(track),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(track: Track) -> str:
+    """Return the variants of a track with what their tasks allow."""
+    found = [(variant, ceilings_of(variant.curriculum)) for variant in track.variants]
+    shown = [key for key in COLUMNS if any(getattr(ceilings, key) is not None for _, ceilings in found)]
+    head = ["rung"] * (len(track.rungs) > 1) + ["given", "settings", "steps", *(COLUMNS[key] for key in shown)]
+    head.append("frames to a random policy's first reward")
+    rows = [_row(track, variant, ceilings, shown) for variant, ceilings in found]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def _row(track: Track, variant: Variant, ceilings: Ceilings, shown: list[str]) -> list[str]:
+    settings = " ".join(f"`{setting}`" for setting in variant.settings)
+    values = ["" if getattr(ceilings, key) is None else f"{getattr(ceilings, key):.4g}" for key in shown]
+    frames = ceilings.random_frames
+    rung = [variant.rung] * (len(track.rungs) > 1)
+    last = f"{frames:,.0f}" if frames < 1e7 else f"{frames:.1e}"
+    return [*rung, variant.given, settings, f"{variant.curriculum.num_frames:,}", *values, last]
