@@ -22,7 +22,7 @@ track: null                 # the track of the submission, such as small; --trac
 authors: []                 # their names, such as [Ada Lovelace, Alan Turing]
 paper: null                 # the address of a paper, or null
 code:
-  repository: null          # the address of the source of the learner
+  repository: null          # the address of the source of the learner; ctgraph_rl: it is in this package
   commit: null              # the commit that was run, 7 to 40 hexadecimal digits in quotes
   licence: null             # its licence, by SPDX identifier, such as MIT
 entry_point: null           # module:function that trains one seed, for learners that a Recorder measured; else null
@@ -53,6 +53,9 @@ ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 COMMIT = re.compile(r"[0-9a-f]{7,40}")
 HOURS_APART, SHARE_APART = 0.01, 0.05
 """How far the hours of a ``method.yaml`` may be from those of the logs."""
+
+OURS = "ctgraph_rl"
+"""Stands for the repository of this package."""
 
 ADDRESS = re.compile(r"https?://\S+")
 
@@ -116,7 +119,10 @@ def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
         _text_rule("tuning.how", tuning["how"]),
         _text_rule("compute.hardware", compute["hardware"], or_null=True),
         (listed, f"authors must be a list of names, got {authors!r:.80}"),
-        (_matches(ADDRESS, repository), f"code.repository must be an address, got {repository!r:.80}"),
+        (
+            repository == OURS or _matches(ADDRESS, repository),
+            f"code.repository must be an address, or {OURS}, got {repository!r:.80}",
+        ),
         (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, in quotes, got {commit!r:.80}"),
         _entry_rule(method["entry_point"]),
         _count_rule("given.guide_frames", given["guide_frames"], or_null=True),

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from ctgraph_rl import __version__
+from ctgraph_rl.board.method import OURS
 from ctgraph_rl.board.standings.ceilings import in_words
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
 from ctgraph_rl.board.standings.tables import Standing, Table, is_significant
@@ -20,6 +21,9 @@ from ctgraph_rl.report.statistics import Estimate
 
 SCHEMA = 1
 """Of ``board.json``."""
+
+PAPER = "https://arxiv.org/abs/2302.10887"
+"""Source of methods that are part of this package."""
 
 TASK = {"type": "reinforcement-learning", "name": "Lifelong reinforcement learning"}
 """What a model hub calls the task."""
@@ -281,6 +285,8 @@ def _result(table: Table, line: Standing) -> dict[str, Any]:
             {"type": name, "value": estimate.value, "name": f"{measure_name(name)}, {estimate.method}, {estimate}"}
             for name, estimate in named.items()
         ],
-        "source": {"name": f"submission {line.entry.id}, {shown_level(line.entry.level)}"}
-        | {"url": method["code"]["repository"]},
+        "source": {
+            "name": f"submission {line.entry.id}, {shown_level(line.entry.level)}",
+            "url": PAPER if method["code"]["repository"] == OURS else method["code"]["repository"],
+        },
     }

@@ -1,0 +1,156 @@
+"""Makes board.md, its figure and the files of the board from the submissions in ``board``; and submissions from runs.
+
+``python docs/results/board.py`` makes the page. ``python docs/results/board.py submit RUNS COMMIT`` submits the runs of
+the track ``small`` in a folder, of each method of `METHODS` of which all seeds finished, with the commit that ran them;
+``--given=-at_boundaries`` ends the names of submissions of learners that are given less. ``ctgraph-rl verify
+docs/results/board/NAME --cells 2`` then verifies each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from datetime import date
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+from raw import HERE, table
+
+from ctgraph_rl.board.method import OURS
+from ctgraph_rl.board.standings.entries import shown_level
+from ctgraph_rl.board.standings.formats import columns
+from ctgraph_rl.board.standings.page import write_board
+from ctgraph_rl.board.standings.tables import Table
+
+FOLDER = HERE / "board"
+PUBLISHED = date(2026, 11, 23)
+TRACK = "small"
+
+WEIGHTS = 4 * 13956
+"""Bytes of the weights of PPO's network, float32."""
+
+HEAD = 1040
+"""Bytes of the weights of its output layers."""
+
+ACTOR = 780
+"""Bytes of the weights of its actor's head."""
+
+ARXIV = "https://arxiv.org/abs/"
+
+
+class About(NamedTuple):
+    """What a submission says of a method: its name, its paper, and the bytes that it keeps for each further task."""
+
+    name: str
+    paper: str | None
+    bytes_per_task: int
+
+
+METHODS = {
+    "ppo": About("PPO", ARXIV + "1707.06347", 0),
+    "ppo-scratch": About("PPO, a network for each task", None, WEIGHTS),
+    "ppo-l2": About("PPO + L2", ARXIV + "1612.00796", HEAD),
+    "ppo-ewc": About("PPO + EWC", ARXIV + "1612.00796", HEAD),
+    "ppo-si": About("PPO + SI", ARXIV + "1703.04200", HEAD),
+    "ppo-mas": About("PPO + MAS", ARXIV + "1711.09601", HEAD),
+    "ppo-clear": About("PPO + CLEAR", ARXIV + "1811.11682", 0),
+    "ppo-packnet": About("PPO + PackNet", ARXIV + "1711.05769", HEAD),
+    "ppo-mask_ri": About("PPO + Mask RI", ARXIV + "2212.11110", WEIGHTS),
+    "ppo-mask_lc": About("PPO + Mask LC", ARXIV + "2212.11110", WEIGHTS + 32),
+    "ppo-mask_blc": About("PPO + Mask BLC", ARXIV + "2212.11110", WEIGHTS + 32),
+    "ppo-cka_rl": About("PPO + CKA-RL", ARXIV + "2510.19314", ACTOR),
+}
+"""The beginning of the names of runs, and what is submitted of them."""
+
+TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
+
+
+def submit_all(runs: Path, commit: str, given: str) -> None:
+    """Submit every method of `METHODS` of which there are all runs in a folder; a submission is replaced."""
+    from ctgraph_rl.board.submit import submit
+    from ctgraph_rl.board.tracks import track
+
+    of_track = track(TRACK)
+    names = [path.parent.name for path in sorted(runs.glob("*/metrics.json"))]
+    for start, about in METHODS.items():
+        folders = [runs / name for name in names if name.startswith(f"{start}-seed")]
+        if len(folders) >= len(of_track.seeds):
+            folder = FOLDER / f"{start}{given}"
+            shutil.rmtree(folder, ignore_errors=True)
+            print(submit(folders, folder, _method(about, commit), of_track).digest, folder.name)
+
+
+def _method(about: About, commit: str) -> dict[str, Any]:
+    """Return what ``method.yaml`` says."""
+    import yaml
+
+    from ctgraph_rl.board.method import TEMPLATE
+
+    method = yaml.safe_load(TEMPLATE)
+    method |= {"name": about.name, "track": TRACK, "authors": ["The ctgraph_rl developers"], "paper": about.paper}
+    method |= {"code": {"repository": OURS, "commit": commit, "licence": "Apache-2.0"}}
+    method["bytes_per_task"], method["tuning"]["how"] = about.bytes_per_task, TUNING
+    return method
+
+
+def page(tables: list[Table]) -> str:
+    """Return the page: its template with its tables."""
+    shown = [part for each in tables for part in (f"## {each.title}", _table(each))]
+    lines = [line for each in tables for line in each.standings]
+    levels = [shown_level(line.entry.level) for line in lines]
+    counts = ", ".join(f"{levels.count(level)} {level}" for level in dict.fromkeys(levels))
+    template = Template((HERE / "board_template.md").read_text(encoding="utf-8"))
+    return template.substitute(tables="\n\n".join(shown), levels=counts, count=len(lines))
+
+
+def _table(of: Table) -> str:
+    rows = [[f"{cell.shown} {cell.interval}".strip() for cell in columns(line)] for line in of.standings]
+    return table([cell.head for cell in columns(of.standings[0])], rows)
+
+
+def draw(of: Table, path: Path) -> None:
+    """Draw every seed, the mean and its interval of each submission of a table, beside the bytes for a further task."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    lines = list(reversed(of.standings))
+    figure, axes = pyplot.subplots(figsize=(7.2, 0.32 * len(lines) + 0.9))
+    for place, line in enumerate(lines):
+        score = line.score
+        axes.plot(line.entry.scores, [place] * len(line.entry.scores), "|", color="0.6", markersize=9)
+        axes.plot([score.low, score.high], [place, place], color="tab:blue", linewidth=2)
+        axes.plot(score.value, place, "o", color="tab:blue", markersize=5)
+        size = line.entry.method["bytes_per_task"]
+        axes.annotate(f"{size:,} bytes", (1.03, place), va="center", fontsize=8, annotation_clip=False)
+    axes.set_yticks(range(len(lines)), [f"{line.name}  ({line.rank})" for line in lines], fontsize=8)
+    axes.set_xlim(0, 1.01)
+    axes.set_xlabel("normalised performance: mean and 95 % interval, and every seed", fontsize=8)
+    axes.set_title(f"{of.title} (rank); at the right: kept for a further task", fontsize=9)
+    axes.grid(axis="x", alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """See above."""
+    parser = argparse.ArgumentParser(prog="python docs/results/board.py", description=__doc__)
+    commands = parser.add_subparsers(dest="command")
+    submitting = commands.add_parser("submit", help="make submissions from runs")
+    submitting.add_argument("runs", type=Path, help="folder with run directories")
+    submitting.add_argument("commit", help="of the code that ran them")
+    submitting.add_argument("--given", default="", help="ends the names of the submissions")
+    options = parser.parse_args()
+    if options.command == "submit":
+        submit_all(options.runs, options.commit, options.given)
+        return
+    made = write_board([FOLDER], FOLDER, published=PUBLISHED)
+    (FOLDER / "board.md").unlink()  # the page has the same tables
+    (HERE / "board.md").write_text(page(made.tables), encoding="utf-8")
+    draw(made.tables[0], HERE / "board.png")
+
+
+if __name__ == "__main__":
+    main()

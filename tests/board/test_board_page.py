@@ -1,0 +1,78 @@
+"""docs/results/board.md: its tables are those of the submissions beside it, and its command verifies one of them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import sys
+
+import pytest
+from helpers.paths import CHECKOUT
+
+from ctgraph_rl import cli
+from ctgraph_rl.board.standings.entries import read_entries
+from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.board.submission import VERIFICATION, read_submission
+from ctgraph_rl.log.provenance import machine
+from ctgraph_rl.portable import cpu_model
+
+for package in ("scipy", "jinja2", "pyarrow"):
+    pytest.importorskip(package)
+
+RESULTS = CHECKOUT / "docs" / "results"
+SUBMISSIONS = RESULTS / "board"
+MOST_BYTES = 4 * 2**20
+"""Of all submissions together; their logs are compressed, and git compresses the rest."""
+
+
+@pytest.fixture(scope="module")
+def made() -> list[Table]:
+    """The tables of the submissions."""
+    entries, problems = read_entries([SUBMISSIONS])
+    assert problems == []
+    return tables(entries)
+
+
+def test_the_page_is_that_of_the_submissions(made, monkeypatch):
+    monkeypatch.syspath_prepend(str(RESULTS))
+    before = set(sys.modules)
+
+    page = importlib.import_module("board").page(made)
+
+    for name in set(sys.modules) - before:
+        if name in ("board", "raw"):
+            del sys.modules[name]
+    assert (RESULTS / "board.md").read_text(encoding="utf-8") == page
+    names = [table["given"] for table in json.loads((SUBMISSIONS / "board.json").read_text())["tables"]]
+    assert names == [table.variant.given for table in made]
+
+
+def test_every_submission_is_verified_at_rerun_and_small(made):
+    lines = [line for table in made for line in table.standings]
+
+    assert len(lines) >= 11 and {line.entry.level for line in lines} == {"rerun"}
+    assert sum(path.stat().st_size for path in SUBMISSIONS.rglob("*") if path.is_file()) < MOST_BYTES
+
+
+def test_the_table_says_what_the_page_says_of_it(made):
+    ranks = [(line.name, line.rank) for line in made[0].standings]
+
+    assert {rank for _, rank in ranks[:9]} == {"1 to 9"}
+    assert ranks[9:] == [("PPO + CLEAR", "10"), ("PPO + CKA-RL", "11 to 12"), ("PPO", "11 to 12")]
+
+
+@pytest.mark.slow
+def test_the_command_of_the_page_verifies_a_submission(tmp_path, monkeypatch):
+    copy = shutil.copytree(SUBMISSIONS / "ppo", tmp_path / "ppo")
+    (copy / VERIFICATION).unlink(missing_ok=True)
+    run = read_submission(copy).runs[0]
+    if (machine()["machine"], cpu_model()) != (run.machine, run.cpu):
+        pytest.skip("other bits are possible on another kind of machine")
+    words = ["verify", str(copy), "--cells", "1", "--number", "7", "--yes", "--folder", str(tmp_path / "reruns")]
+    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", *words])
+
+    cli.main()
+
+    found = json.loads((copy / VERIFICATION).read_text())
+    assert (found["level"], len(found["cells"])) == ("rerun", 1)
