@@ -108,13 +108,13 @@ def test_one_transition_that_changes_is_seen_within_one_window():
 def test_the_pair_that_alternates_has_the_labels_0_1_0_1_without_false_alarms():
     detector = amd(16, 3, 8, num_untested=1_000)
     found = []
-    for number, batch in enumerate(chain(*(walk(task, 4_096, seed) for seed, task in enumerate((0, 1, 0, 1))))):
+    for number, batch in enumerate(chain(*(walk(task, 3_072, seed) for seed, task in enumerate((0, 1, 0, 1))))):
         verdict = detector.observe(batch)
         if verdict is not None:
             found.append((number, verdict))
             detector.start_label(verdict, trial=False)
 
-    assert found == [(9, 1), (17, 0), (25, 1)]
+    assert found == [(7, 1), (13, 0), (19, 1)]
 
 
 def test_the_history_of_a_step_is_that_of_its_episode_whatever_the_batches():
@@ -134,6 +134,13 @@ def test_the_history_of_a_step_is_that_of_its_episode_whatever_the_batches():
     assert torch.cat(parts)[:, 1:].tolist() == [
         list(each) for each in zip(action[0].tolist(), ids.roll(-1, 1)[0].tolist(), strict=True)
     ]
+
+
+def test_the_smallest_p_value_of_a_batch_counts_times_its_windows(monkeypatch):
+    detector, windows = amd(num_untested=0), torch.zeros(12, 40, 3)
+    monkeypatch.setattr(detector, "p_values", lambda label, windows: torch.full((len(windows),), 0.002))
+
+    assert [detector._label_of(windows[:number]) for number in (4, 5, 12)] == [1, 0, 0]
 
 
 def test_the_best_label_is_taken_at_once_only_as_published():

@@ -89,7 +89,7 @@ def test_p_values_are_those_of_scipy(m, n, shift, ties):
 
 
 def test_independent_streams_are_suspected_as_often_as_alpha_says():
-    """80 streams, each with one test at alpha=0.2: the number of suspicions is binomial, with a chance of at most 0.2.
+    """60 streams, each with one test at alpha=0.2: the number of suspicions is binomial, with a chance of at most 0.2.
 
     A p-value of two samples has 0.154 = P(p < 0.2) as m=32 and n=8 have few different ones. The bounds are the
     quantiles 0.0005 and 0.9995 of the two.
@@ -98,12 +98,12 @@ def test_independent_streams_are_suspected_as_often_as_alpha_says():
     settings = {**PUBLISHED, **SMALL, "alpha": 0.2, "adjustment": 1.0, "stable_phase": 43 * 20, "num_fresh": 0}
 
     found = 0
-    for seed in range(80):
+    for seed in range(60):
         detector = SWOKS(**settings)
         assert detector.observe(seen(stream(43 * 20, seed=seed, width=2))) is None
         found += detector.observe(seen(stream(20, seed=1000 + seed, width=2))) is SUSPICION
 
-    assert binom.ppf(0.0005, 80, 0.15) <= found <= binom.ppf(0.9995, 80, 0.2)
+    assert binom.ppf(0.0005, 60, 0.15) <= found <= binom.ppf(0.9995, 60, 0.2)
 
 
 def first_suspicion(changes_at, length):
@@ -111,8 +111,8 @@ def first_suspicion(changes_at, length):
     detector = SWOKS(**PUBLISHED)
     points = stream(240).repeat(-(-length // 240), 1)[:length]
     points[changes_at:] += 1.0
-    batches = enumerate(points.split(80), 1)
-    return next((80 * number for number, batch in batches if detector.observe(seen(batch)) is SUSPICION), None)
+    batches = enumerate(points.split(240), 1)
+    return next((240 * number for number, batch in batches if detector.observe(seen(batch)) is SUSPICION), None)
 
 
 @pytest.mark.parametrize("changes_at", [50_400, 50_500, 51_599])
