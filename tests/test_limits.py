@@ -314,6 +314,7 @@ MADE = {
 }
 
 
+@pytest.mark.slow
 def test_making_images_takes_a_limited_multiple_of_their_size():
     code = "from ctgraph_rl.tasks.images import *\n" + "".join(
         f"before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\nmade = {kind}\n"

@@ -36,6 +36,7 @@ def bytes_of(rows: Rows) -> int:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the unit of ru_maxrss is that of Linux")
+@pytest.mark.slow
 def test_a_million_rows_of_ct_co_b1_take_less_than_a_gibibyte_beyond_two_observations_each():
     found = subprocess.run([sys.executable, "-c", MEASURE], capture_output=True, text=True, check=True)
 

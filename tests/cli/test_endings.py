@@ -30,7 +30,7 @@ def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):
         "agents",
         "curricula",
         "run --help",
-        "results RUNS",
+        pytest.param("results RUNS", marks=pytest.mark.slow),
         "compare RUNS/run RUNS/run",
         "report RUNS --out RUNS/report",
     ],

@@ -52,6 +52,7 @@ def says(prose: str, *claims: str) -> None:
     assert [claim for claim in claims if claim not in prose] == []
 
 
+@pytest.mark.slow
 def test_the_environment_is_what_its_notebook_says(tmp_path, monkeypatch):
     names, prose = run("environment.ipynb", tmp_path, monkeypatch)
 

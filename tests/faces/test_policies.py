@@ -64,6 +64,7 @@ def test_the_searcher_tries_each_end_state_at_most_once_and_then_stays_with_the_
     assert first[0::2].max() <= 7 and first[1::2].max() <= 8
 
 
+@pytest.mark.slow
 def test_the_searcher_needs_as_many_episodes_as_e_kappa_says():
     task = surjective(3, 2, goal=(2, 1))
     rows = 4000

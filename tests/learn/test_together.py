@@ -200,7 +200,14 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     return value.double() if value.is_floating_point() else value
 
 
-@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in AGENTS), *(("ppo", m) for m in METHODS)])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, "finetune") for name in AGENTS),
+        *(("ppo", method) for method in ("ewc", "mask_lc")),
+        *(pytest.param("ppo", m, marks=pytest.mark.slow) for m in METHODS if m not in ("ewc", "mask_lc")),
+    ],
+)
 def test_each_seed_ends_near_its_run_alone(make, name, method):
     its = make(name, method)
 
@@ -297,7 +304,12 @@ def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [("ppo", "finetune"), ("ppo", "ewc"), ("ppo_published", "mask_lc"), ("a2c", "scratch"), ("prioritized dqn", "l2")],
+    [
+        ("ppo", "ewc"),
+        ("ppo_published", "mask_lc"),
+        ("prioritized dqn", "l2"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [("ppo", "finetune"), ("a2c", "scratch")]),
+    ],
 )
 def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_path, name, method):
     its, kept = make(name, method), []
