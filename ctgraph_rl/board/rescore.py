@@ -178,9 +178,15 @@ def near(one: object, other: object) -> bool:
 
 
 def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> list[Check]:
-    """Return the checks of ``metrics.csv``: one for each difference, or one for all."""
+    """Return the checks of ``metrics.csv``: one for each difference, or one for all.
+
+    A metric that no run states may have been defined since, and is not missed, but for that which orders the track's
+    table.
+    """
     same_kind = submission.scored_on == machine()["machine"]
     wrong, count = [], 0
+    needed = {name for stated in submission.metrics.values() for name in stated}
+    needed |= set() if submission.track is None else {submission.track.score}
     runs = {run.run for run in logs}
     more, rule = sorted(set(submission.metrics) - runs), "no finished run has this name"
     if more:
@@ -192,7 +198,7 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
             wrong.append(Check(METRICS, "metrics of the log", "none", False, run.run, note=str(error)))
             continue
         stated = {name: list(row.values()) for name, row in submission.metrics.get(run.run, {}).items()}
-        names = {**cells, **stated}
+        names = [name for name in {**cells, **stated} if name in needed]
         count += len(names)
         found = [_of_metric(run.run, name, cells.get(name), stated.get(name), same_kind) for name in names]
         wrong += filter(None, found)

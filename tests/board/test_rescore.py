@@ -90,6 +90,15 @@ def test_a_changed_metric_is_found_to_its_last_digit(submission, monkeypatch):
         assert found(submission).keys() == {"memoryless_ceiling in metrics.csv"}
 
 
+@pytest.mark.parametrize(("metric", "missed"), [("forgetting", False), ("average_performance", True)])
+def test_a_metric_that_no_run_states_is_missed_where_it_orders_the_table(submission, metric, missed):
+    path = submission.path / "metrics.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if f",{metric}," not in line))
+
+    assert ({f"{metric} in metrics.csv"} == found(submission).keys()) is missed
+
+
 def test_a_changed_evaluation_is_found_with_its_row(submission):
     logs = [submission.log(run) for run in submission.runs]
     better(logs[1].measurements)
@@ -138,8 +147,10 @@ def test_an_edited_file_is_found(submission, file, before, after, what):
     assert what in found(submission)
 
 
-def test_a_log_that_leaves_an_evaluation_out_or_ends_early_is_found(submission):
-    edit_log(submission.path, lambda lines: lines.pop(2), with_sum=True)
+def test_a_log_that_leaves_an_evaluation_out_or_has_one_twice_or_ends_early_is_found(submission):
+    edit_log(submission.path, lambda lines: lines.insert(2, lines[2]), with_sum=True)
+    assert "evaluations" in found(submission)
+    edit_log(submission.path, lambda lines: lines.__delitem__(slice(2, 4)), with_sum=True)
     assert "missing (frames, task, episodes): (0, 2, 2)" in found(submission)["evaluations"]
 
     edit_log(submission.path, lambda lines: lines.__delitem__(slice(-20, None)))
