@@ -63,6 +63,9 @@ METHODS = {
 }
 """The beginning of the names of runs, and what is submitted of them."""
 
+ELSEWHERE = ("average performance", "bytes of the agent", "steps")
+"""Columns that stand on the board itself alone, for want of room."""
+
 TUNING = "the settings of the package; strengths of methods were chosen for PPO, on seeds that were not recorded"
 
 
@@ -105,8 +108,9 @@ def page(tables: list[Table]) -> str:
 
 
 def _table(of: Table) -> str:
-    rows = [[f"{cell.shown} {cell.interval}".strip() for cell in columns(line)] for line in of.standings]
-    return table([cell.head for cell in columns(of.standings[0])], rows)
+    lines = [[cell for cell in columns(line) if cell.head not in ELSEWHERE] for line in of.standings]
+    rows = [[f"{cell.shown} {cell.interval}".strip() for cell in cells] for cells in lines]
+    return table([cell.head for cell in lines[0]], rows)
 
 
 def draw(of: Table, path: Path) -> None:
