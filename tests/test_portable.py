@@ -33,11 +33,11 @@ EMULATIONS = {
 }
 """Variables by which a process takes the code of another CPU."""
 
-LEARNERS = {
-    **{name: [f"agent={name}"] for name in ("ppo", "a2c", "dqn", "lstm_ppo")},
-    "ppo_published": ["agent=ppo_published", "agent.num_minibatches=8"],
-    "ppo-mask_lc": ["agent=ppo", "method=mask_lc", "protocol.task_id=one_hot"],
-}
+LEARNERS = [
+    *({"agent": name} for name in ("ppo", "a2c", "dqn", "lstm_ppo")),
+    {"agent": "ppo_published", "agent.num_minibatches": 8},
+    {"agent": "ppo", "method": "mask_lc", "protocol.task_id": "one_hot"},
+]
 
 
 @pytest.fixture
@@ -65,17 +65,33 @@ def test_a_portable_run_says_so_whatever_variables_its_command_has(tmp_path):
     assert about["config"]["portable"] is True and about["cpu"] == portable.cpu_model()
 
 
+def results_of_all(folder: Path, setting: str, emulation: str) -> dict[str, tuple]:
+    """All measurements and the weights of each learner's run, by the run's name, from one process."""
+    folder.mkdir()
+    variants = json.dumps(LEARNERS).replace('"', "").replace(" ", "")
+    command = [sys.executable, "-m", "ctgraph_rl.run", "-m", *SHORT, f"portable={setting}"]
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT), **EMULATIONS[emulation]}
+    done = subprocess.run(
+        [*command, f"hydra.sweeper.variants={variants}"], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    found = {path.parent.name: path.parent for path in sorted(folder.rglob("agent.pt"))}
+    assert len(found) == len(LEARNERS)
+    return {name: (lines(run)[1:], torch.load(run / "agent.pt", weights_only=True)) for name, run in found.items()}
+
+
 @pytest.mark.slow
 def test_portable_runs_are_equal_under_the_instructions_of_other_cpus_and_ordinary_ones_are_not(tmp_path):
-    for name, arguments in LEARNERS.items():
+    def run_as(emulation, setting):
+        return results_of_all(tmp_path / f"{emulation} {setting}", setting, emulation)
 
-        def run_as(emulation, setting, name=name, arguments=arguments):
-            folder = tmp_path / f"{name} {emulation} {setting}"
-            return results(folder, *arguments, f"portable={setting}", **EMULATIONS[emulation])[1:]
+    held = [run_as(emulation, "true") for emulation in EMULATIONS]
+    ordinary = [run_as(emulation, "false") for emulation in ("avx512", "old")]
 
-        held = [run_as(emulation, "true") for emulation in EMULATIONS]
-        assert all(equal(each, held[0]) for each in held), name
-        assert not equal(run_as("avx512", "false"), run_as("old", "false")), name
+    for name in held[0]:
+        assert all(equal(each[name], held[0][name]) for each in held), name
+    for name in ordinary[0]:
+        assert not equal(ordinary[0][name], ordinary[1][name]), name
 
 
 @pytest.mark.slow
