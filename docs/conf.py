@@ -46,4 +46,4 @@ autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 100
 napoleon_use_rtype = False
 OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
-nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", "Path|Sequence|Tensor|TensorDictBase")]
+nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", "Path|Sequence|Span|Tensor|TensorDictBase")]

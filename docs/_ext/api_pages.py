@@ -48,6 +48,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (
             "ctgraph_rl.agent",
             "ctgraph_rl.learn.lifelong",
+            "ctgraph_rl.learn.labels",
             "ctgraph_rl.learn.collective",
             "ctgraph_rl.learn.messages",
             "ctgraph_rl.log.tables",
@@ -75,6 +76,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.metrics.lifetime",
             "ctgraph_rl.metrics.optimum",
             "ctgraph_rl.metrics.regimes",
+            "ctgraph_rl.metrics.labels",
         ),
     ),
     "figures": (
