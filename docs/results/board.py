@@ -49,6 +49,11 @@ class About(NamedTuple):
 
 METHODS = {
     "ppo": About("PPO", ARXIV + "1707.06347", 0),
+    "a2c": About("A2C", ARXIV + "1602.01783", 0),
+    "reinforce": About("REINFORCE", "https://doi.org/10.1007/BF00992696", 0),
+    "ppo_count": About("PPO with a count-based bonus", ARXIV + "1611.04717", 0),
+    "lstm_ppo": About("LSTM-PPO", ARXIV + "1707.06347", 0),
+    "dqn": About("DQN", "https://doi.org/10.1038/nature14236", 0),
     "ppo-scratch": About("PPO, a network for each task", None, WEIGHTS),
     "ppo-l2": About("PPO + L2", ARXIV + "1612.00796", HEAD),
     "ppo-ewc": About("PPO + EWC", ARXIV + "1612.00796", HEAD),
