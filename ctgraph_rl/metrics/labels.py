@@ -39,20 +39,12 @@ class Labelling(NamedTuple):
     announced: bool = False  # whether changes were announced
 
     def check_one_task_each(self) -> None:
-        """Refuse intervals of several tasks.
-
-        Raises:
-            Undefined: if there is one.
-        """
+        """Leave the metric undefined where an interval has several tasks."""
         if (self.task == SEVERAL).any():
             raise Undefined("needs blocks of one task each: others have no true label")
 
     def check_hidden(self) -> None:
-        """Refuse announced changes.
-
-        Raises:
-            Undefined: if changes are announced.
-        """
+        """Leave the metric undefined where changes are announced."""
         if self.announced:
             raise Undefined("task changes are announced, there is nothing to detect")
 
