@@ -12,7 +12,7 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.method import fact_rules, facts_of
-from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, oracle_rule, seed_rules
+from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, one_line, oracle_rule, seed_rules
 from ctgraph_rl.board.submission import (
     CONFIG,
     EVALUATIONS,
@@ -35,9 +35,13 @@ from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
+from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences
 
 RESCORED = "rescored"
+
+MEASURES = ("average_performance", "forgetting")
+"""Metrics that each table of a board shows beside the score of its track."""
 
 ROUNDING = 1e-9
 """Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
@@ -129,6 +133,11 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     yield equal(VERSIONS, dict(submission.versions), about.get("versions"), run.run)
     yield equal("curriculum of the log", submission.curriculum.fingerprint, about.get("fingerprint"), run.run)
     yield equal(f"curriculum of {RUNS}", submission.curriculum.fingerprint, run.fingerprint, run.run)
+    named = str(about.get("curriculum")).removesuffix(MODIFIED)
+    yield equal(f"name of the curriculum in {RUNS}", named, run.curriculum, run.run)
+    yield equal(f"seconds of {RUNS}", (log.measurements or [{}])[-1].get("seconds", 0.0), run.seconds, run.run)
+    reason = "" if run.finished else one_line(submission.method["failed"].get(run.seed, ""))
+    yield equal(f"reason of {RUNS}", reason, run.reason, run.run)
     yield equal("group", run.group, tuple(about.get("together") or ()), run.run)
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
@@ -180,13 +189,13 @@ def near(one: object, other: object) -> bool:
 def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> list[Check]:
     """Return the checks of ``metrics.csv``: one for each difference, or one for all.
 
-    A metric that no run states may have been defined since, and is not missed, but for that which orders the track's
-    table.
+    A metric that no run states may have been defined since, and is not missed unless a board shows it: the score of
+    the track and `MEASURES`.
     """
     same_kind = submission.scored_on == machine()["machine"]
     wrong, count = [], 0
     needed = {name for stated in submission.metrics.values() for name in stated}
-    needed |= set() if submission.track is None else {submission.track.score}
+    needed |= {*MEASURES} if submission.track is None else {*MEASURES, submission.track.score}
     runs = {run.run for run in logs}
     more, rule = sorted(set(submission.metrics) - runs), "no finished run has this name"
     if more:

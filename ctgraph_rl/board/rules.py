@@ -26,6 +26,9 @@ MOST_SHOWN = 3
 """Of things that a message lists."""
 
 
+OF_OURS = "baselines."
+"""Beginning of the names of our classes."""
+
 MAY_BE_READ = ("", "the frames of each block")
 """What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
 
@@ -35,6 +38,11 @@ def listed(values: Iterable[Any]) -> str:
     texts = [str(value) for value in values]
     more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
     return ", ".join(texts[:MOST_SHOWN]) + more
+
+
+def one_line(reason: str) -> str:
+    """Return the reason for a failed seed as ``runs.csv`` holds it."""
+    return " ".join(reason.split())
 
 
 def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
@@ -160,8 +168,16 @@ def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
 
 
 def oracle_rule(config: Mapping[str, Any]) -> Rule:
-    """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given."""
-    parts = {part: _part(part, config.get(part)) for part in ("method", "detector")}
+    """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
+
+    A class of `baselines` goes by the name of the module that defines it alone: what other names stand for is unknown.
+    """
+    groups = {part: config.get(part) for part in ("method", "detector")}
+    names = {part: str(each.get("_target_")) for part, each in groups.items() if isinstance(each, Mapping)}
+    unknown = [f"{part}={name}" for part, name in names.items() if name.startswith(OF_OURS) and not _kind(part, name)]
+    if unknown:
+        return False, f"{listed(unknown)} is no method or detector of baselines: name it by the module that defines it"
+    parts = {part: _part(part, each) for part, each in groups.items()}
     reads = [getattr(parts["method"], "reads_tasks", ""), getattr(parts["detector"], "is_oracle", False)]
     named = [f"{part}={type(each).__name__}" for part, each in parts.items() if each is not None]
     return reads[0] in MAY_BE_READ and not reads[1], (
@@ -170,11 +186,16 @@ def oracle_rule(config: Mapping[str, Any]) -> Rule:
     )
 
 
+def _kind(part: str, name: str) -> type | None:
+    """Return the class of `baselines` that a group names; None for any other."""
+    ours = OURS[part].fullmatch(name)
+    return None if ours is None else class_named(ours[1], ours[2])
+
+
 def _part(part: str, settings: Any) -> object:
     """Return what a group of a configuration builds, if its class is one of `baselines`; None for any other."""
     settings = settings if isinstance(settings, Mapping) else {}
-    ours = OURS[part].fullmatch(str(settings.get("_target_")))
-    kind = None if ours is None else class_named(ours[1], ours[2])
+    kind = _kind(part, str(settings.get("_target_")))
     if kind is None:
         return None
     try:

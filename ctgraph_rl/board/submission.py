@@ -53,7 +53,7 @@ MOST_BYTES_OF_A_FILE = 2**28
 
 MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**20, 16
 
-MOST_RUNS = 10_000
+MOST_RUNS, MOST_SECONDS = 10_000, 1e9
 
 MACHINE = "machine"
 
@@ -262,7 +262,7 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     whole = {**numbers, **{f"group {number}": number for number in group}}
     whole |= {"agent_bytes": row["agent_bytes"]} if row["agent_bytes"] else {}
     sums = {"log_sha256": row["log_sha256"]} | ({"agent_sha256": row["agent_sha256"]} if row["agent_sha256"] else {})
-    is_time = re.fullmatch(r"\d+(\.\d+)?", row["seconds"]) is not None
+    is_time = re.fullmatch(r"\d+(\.\d+)?", row["seconds"]) is not None and float(row["seconds"]) <= MOST_SECONDS
     require(
         (NAME.fullmatch(row["run"]) is not None, f"{place}: run must be a name of a file, got {row['run']!r:.80}"),
         (
@@ -277,7 +277,7 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
             (SUM.fullmatch(value) is not None, f"{place}: {key} must be 64 hexadecimal digits, got {value!r:.80}")
             for key, value in sums.items()
         ),
-        (is_time, f"{place}: seconds must be a number >= 0, got {row['seconds']!r:.80}"),
+        (is_time, f"{place}: seconds must be a number in 0..{MOST_SECONDS:,.0f}, got {row['seconds']!r:.80}"),
     )
     values: dict[str, Any] = {**row, **{key: int(value) for key, value in numbers.items()}}
     values |= {"group": tuple(map(int, group)), "seconds": float(row["seconds"])}

@@ -70,13 +70,15 @@ def test_what_is_no_submission_is_refused_with_the_file(submission, file, conten
         ("tiny-seed1,1,", "tiny-seed1,0,", "runs.csv has a seed twice: 0"),
         ("tiny-seed1,1,", "tiny-seed0,1,", "runs.csv names a run twice: tiny-seed0"),
         ("tiny-seed1,1,", "tiny-seed1,x,", "line 3: seed must be an integer >= 0, got 'x'"),
+        (",{seconds}", "," + 400 * "9", r"line 2: seconds must be a number in 0..1,000,000,000, got '9999"),
+        (",{seconds}", ",1000000000.1", r"line 2: seconds must be a number in 0..1,000,000,000, got '1000000000.1'"),
         ("finished,", "done,", "line 2: state must be finished or failed, got 'done'"),
         ("agent_sha256", "sha256", "runs.csv must have the columns run, seed"),
     ],
 )
 def test_a_line_of_runs_csv_out_of_range_is_refused(submission, before, after, message):
     path = submission.path / "runs.csv"
-    path.write_text(path.read_text().replace(before, after, 1))
+    path.write_text(path.read_text().replace(before.format(seconds=submission.runs[0].seconds), after, 1))
 
     with pytest.raises(ValueError, match=message):
         read_submission(submission.path, submission.track)

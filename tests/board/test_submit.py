@@ -240,6 +240,16 @@ def test_a_learner_that_reads_what_only_an_oracle_knows_is_refused(compose, meth
     assert reads is None or reads in message
 
 
+@pytest.mark.parametrize("part", ["method", "detector"])
+@pytest.mark.parametrize(
+    "name", ["detectors.Oracle", "detectors.seen.Oracle", "methods.self_labelled.Oracle", "none.N"]
+)
+def test_a_class_of_ours_by_another_name_than_that_of_its_module_is_refused(part, name):
+    holds, message = oracle_rule({part: {"_target_": f"baselines.{name}"}})
+
+    assert (holds, f"{part}=baselines.{name} is no method or detector of baselines" in message) == (False, True)
+
+
 def test_a_failed_run_that_is_accounted_for_is_a_line_with_its_reason(runs, tiny_track, method):
     failed(runs / "tiny-seed1")
 
