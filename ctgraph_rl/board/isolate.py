@@ -1,8 +1,9 @@
 """The code of others in a process of its own: limits of time, memory and disk, and what the system can close off.
 
 On Linux the process gets name spaces of its own, where the system allows them to users: no network, no other process
-in sight, and all files but those of its folder read-only. Limits hold on every POSIX system; `Isolation` says what
-this system cannot do. ``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process.
+in reach, and all files but those of its folder read-only. Limits hold on every POSIX system; `Isolation` says what
+this system cannot do. ``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process: no module
+of others can be imported before all of that is done.
 """
 
 from __future__ import annotations
@@ -40,11 +41,14 @@ SECONDS_BETWEEN_LOOKS = 0.2
 KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "CC", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 """Variables of the environment that a process is given; no other is."""
 
+SOCKETS = ("/run", "/var/run", "/tmp")
+"""Folders in which programs listen on Unix sockets: a process finds them empty, but for what it runs from."""
+
 PROC = Path("/proc")
 
 # from linux/sched.h, linux/mount.h, linux/prctl.h and linux/capability.h
 NEW_USER, NEW_NETWORK, NEW_PROCESSES, NEW_MOUNTS = 0x10000000, 0x40000000, 0x20000000, 0x00020000
-BIND, RECURSIVE, PRIVATE = 0x1000, 0x4000, 0x40000
+BIND, RECURSIVE, PRIVATE, DETACH = 0x1000, 0x4000, 0x40000, 2
 MOUNT_SETATTR, AT_CWD, AT_RECURSIVE, READ_ONLY = 442, -100, 0x8000, 1
 DIE_WITH_PARENT, DROP_FROM_BOUNDS, NO_NEW_PRIVILEGES, LAST_CAPABILITY = 1, 24, 38, 40
 CAPABILITIES_3 = 0x20080522
@@ -65,17 +69,20 @@ class Isolation(NamedTuple):
     files: bool  # all but those of its folder are read-only
     processes: bool  # others are out of reach, and its own end with it
     memory: bool  # the use of all its processes is seen; else each alone is limited
+    sockets: bool  # those of `SOCKETS` are out of sight
 
     def missing(self) -> list[str]:
         """Return a sentence for each thing that the code of others could do here."""
         open_ways = {
             "network": "it can use the network",
             "files": "it can read and change every file that you can",
-            "processes": "it can signal your other processes, and leave some behind",
+            "processes": "it can signal your other processes and read their environment, and leave some behind",
             "memory": "its memory is limited for each process alone, and not for all together",
+            "sockets": "it can connect to every Unix socket that you can, such as those of ssh-agent and docker",
         }
-        reads = ["it can read every file that you can"] if self.files else []
-        return [text for name, text in open_ways.items() if not getattr(self, name)] + reads
+        reads = "it can read every file that you can"
+        reads += f", and connect to Unix sockets outside {', '.join(SOCKETS)}" if self.sockets else ""
+        return [text for name, text in open_ways.items() if not getattr(self, name)] + [reads] * self.files
 
 
 class Outcome(NamedTuple):
@@ -107,7 +114,8 @@ def isolation(folder: Path) -> Isolation:
         found = json.loads(done.stdout)
     except ValueError:
         found = []
-    return Isolation("network" in found, "files" in found, processes="processes" in found, memory=PROC.is_dir())
+    closed = {name: name in found for name in ("network", "files", "processes", "sockets")}
+    return Isolation(**closed, memory=PROC.is_dir())
 
 
 def run_isolated(
@@ -127,7 +135,7 @@ def run_isolated(
         arguments: of the module.
         folder: an existing directory, the only one that it may change; its working directory and its home.
         limits: what it may use.
-        paths: folders in which it finds more modules.
+        paths: folders in which it finds more modules, after those that are installed.
         variables: of its environment, beside `KEPT`.
         watch: is called several times a second.
 
@@ -138,7 +146,8 @@ def run_isolated(
     folder = folder.resolve()
     (folder / "tmp").mkdir(exist_ok=True)
     spec = {"folder": str(folder), "limits": limits, "module": module, "arguments": list(arguments)}
-    environment = {**_environment(folder, paths), **(variables or {})}
+    spec["paths"] = [str(path.resolve()) for path in paths]
+    environment = {**_environment(folder), **(variables or {})}
     (folder / OUTPUT).unlink(missing_ok=True)
     with (folder / OUTPUT).open("x+b") as output:
         with _process(_command(spec), folder, environment, output) as process:
@@ -158,15 +167,15 @@ def _tail(output: IO[bytes]) -> str:
 
 
 def _command(spec: Mapping[str, object]) -> list[str]:
-    return [sys.executable, "-P", "-m", HERE, json.dumps(spec)]
+    """Return what starts a process that finds no modules in its working directory or its home."""
+    return [sys.executable, "-P", "-s", "-m", HERE, json.dumps(spec)]
 
 
-def _environment(folder: Path, paths: Sequence[Path] = ()) -> dict[str, str]:
+def _environment(folder: Path) -> dict[str, str]:
     """Return the variables of a new process: no credentials, and its folder as its home."""
     kept = {name: os.environ[name] for name in KEPT if name in os.environ}
     package = Path(__file__).resolve().parents[2]
-    found = os.pathsep.join(map(str, (package, *(path.resolve() for path in paths))))
-    own = {"HOME": str(folder), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": found}
+    own = {"HOME": str(folder), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(package)}
     return {**kept, **own, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
@@ -260,11 +269,15 @@ def main() -> None:
     spec = json.loads(sys.argv[1])
     with suppress(OSError, AttributeError):
         _libc().prctl(DIE_WITH_PARENT, signal.SIGKILL)
-    closed = _close_off(Path(spec["folder"]))
+    paths = spec.get("paths", [])
+    closed = _close_off(Path(spec["folder"]), paths)
     if "module" not in spec:
         print(json.dumps(closed))
         return
     _limit(Limits(*spec["limits"]))
+    # not before: Python imports a sitecustomize that it finds, and modules of these names in place of its own
+    sys.path += paths
+    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *paths])
     sys.argv = [spec["module"], *spec["arguments"]]
     runpy.run_module(spec["module"], run_name="__main__", alter_sys=True)
 
@@ -273,7 +286,7 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-def _close_off(folder: Path) -> list[str]:
+def _close_off(folder: Path, paths: Sequence[str]) -> list[str]:
     """Enter name spaces of this process's own, as many as the system allows; return what they close off."""
     if sys.platform != "linux":
         return []
@@ -287,8 +300,11 @@ def _close_off(folder: Path) -> list[str]:
     if _unshared(NEW_PROCESSES):
         closed.append("processes")
         _become_first_process()
-    if _unshared(NEW_MOUNTS) and _only_writes(os.fsencode(folder)):
-        closed.append("files")
+    if _unshared(NEW_MOUNTS) and _libc().mount(b"none", b"/", None, RECURSIVE | PRIVATE, None) == 0:
+        needed = _needed([str(folder), *paths])
+        emptied = [_emptied(os.path.realpath(place), needed) for place in SOCKETS]
+        closed += ["sockets"] * all(emptied)
+        closed += ["files"] * _only_writes(os.fsencode(folder))
     os.chdir(folder)
     _drop_capabilities()
     return closed
@@ -308,11 +324,33 @@ def _become_first_process() -> None:
     os._exit(os.waitstatus_to_exitcode(status) % 256)
 
 
+def _needed(given: Sequence[str]) -> list[str]:
+    """Return the folders that a process runs from: given ones, and those of Python, programs and libraries."""
+    listed = [os.environ.get(name, "").split(os.pathsep) for name in ("PATH", "LD_LIBRARY_PATH")]
+    folders = [*given, sys.prefix, sys.base_prefix, *sys.path, *(each for some in listed for each in some)]
+    both = [path for each in folders if each for path in (os.path.abspath(each), os.path.realpath(each))]
+    return sorted({path for path in both if os.path.isdir(path)})
+
+
+def _emptied(place: str, needed: Sequence[str]) -> bool:
+    """Mount an empty folder over one, and in it what is needed of the one; return whether all else is out of sight."""
+    libc, target = _libc(), os.fsencode(place)
+    if any(Path(place).is_relative_to(path) for path in needed):
+        return False
+    within = {path: os.open(path, os.O_PATH) for path in needed if Path(path).is_relative_to(place)}
+    if not os.path.isdir(place) or libc.mount(b"none", target, b"tmpfs", 0, None) != 0:
+        return not os.path.isdir(place)
+    for path, number in within.items():
+        os.makedirs(path, exist_ok=True)
+        if libc.mount(os.fsencode(f"/proc/self/fd/{number}"), os.fsencode(path), None, BIND | RECURSIVE, None) != 0:
+            libc.umount2(target, DETACH)
+            return False
+    return True
+
+
 def _only_writes(folder: bytes) -> bool:
     """Make all mounted files but those of one folder read-only; return whether that worked."""
-    libc = _libc()
-    is_own = libc.mount(b"none", b"/", None, RECURSIVE | PRIVATE, None) == 0
-    is_own = is_own and libc.mount(folder, folder, None, BIND | RECURSIVE, None) == 0
+    is_own = _libc().mount(folder, folder, None, BIND | RECURSIVE, None) == 0
     return is_own and _mount_flags(b"/", AT_RECURSIVE, READ_ONLY, 0) and _mount_flags(folder, 0, 0, READ_ONLY)
 
 

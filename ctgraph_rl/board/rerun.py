@@ -20,15 +20,15 @@ from typing import Any, NamedTuple
 from ctgraph_rl.board.isolate import Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Job, run_dir_of
 from ctgraph_rl.board.rescore import Check, equal
-from ctgraph_rl.board.submission import Submission, SubmittedRun, counted, log_sum
+from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compared
 from ctgraph_rl.checks import is_int, require
-from ctgraph_rl.disk import made_folder, open_own, read_text, require_no_link
+from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.files import AGENT, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
+from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.provenance import NUMBERS, machine, versions
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.saved import content_of, read_plain, sum_of_state
+from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.portable import VARIABLES, cpu_model
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -44,6 +44,12 @@ TAIL = 2**14
 
 SCORE = "average_performance"
 """The metric that is compared where a track does not name its own."""
+
+BYTES = "bytes of the agent"
+"""The check of what is equal also where bits differ."""
+
+NOT_OF_THE_RUN = ("MemoryError", "ModuleNotFoundError")
+"""Errors that limits and missing code cause here."""
 
 OWN_VERSION = ("ctgraph_rl", "python")
 """Versions that may differ between equal bits; `NUMBERS` says when those of this package do."""
@@ -85,6 +91,9 @@ class Result(NamedTuple):
     log: RunLog | None
     agent_sha256: str
     failure: str | None  # why it has no results
+    agent_bytes: int | None = None  # of its tensors; None if it saved none
+    experts: tuple[RunLog, ...] = ()  # logs of its single-task experts
+    failed_alone: bool = False  # whether it failed by itself, and not by a limit or without its code
 
 
 def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun, ...]:
@@ -157,9 +166,18 @@ def learn_again(
     if cell.job.entry_point is not None:
         for run_dir in cell.run_dirs:
             shutil.rmtree(run_dir, ignore_errors=True)
-    cell.job.write(cell.folder / JOB)
+    _with_its_curriculum(cell).write(cell.folder / JOB)
     variables = VARIABLES if is_portable(cell.job.config) else {}
     return run_isolated(MODULE, [JOB], cell.folder, limits, paths=paths, variables=variables, watch=watch)
+
+
+def _with_its_curriculum(cell: Cell) -> Job:
+    """Return the job of a cell with the file of its curriculum in the cell's folder, where its process sees it."""
+    if cell.job.curriculum is None:
+        return cell.job
+    own = cell.folder.resolve() / CURRICULUM
+    write_whole(own, read_regular(Path(cell.job.curriculum), MOST_BYTES_OF_A_FILE))
+    return cell.job._replace(curriculum=str(own))
 
 
 def is_portable(config: Mapping[str, Any]) -> bool:
@@ -174,19 +192,30 @@ def result_of(cell: Cell, seed: int, outcome: Outcome) -> Result:
         for path in (run_dir, *(run_dir / name for name in (LOG, AGENT, METRICS, FAILURE))):
             require_no_link(path)
         if not (run_dir / METRICS).is_file():
-            return Result(None, "", _reason(run_dir, outcome))
-        has_agent = (run_dir / AGENT).exists()
-        agent = sum_of_state(read_plain(content_of(run_dir / AGENT))) if has_agent else ""
-        return Result(RunLog.read(run_dir / LOG), agent, None)
+            return _failed(run_dir, outcome)
+        log, has_agent = RunLog.read(run_dir / LOG), (run_dir / AGENT).exists()
+        state = read_plain(content_of(run_dir / AGENT)) if has_agent else None
+        agent, size = (sum_of_state(state), num_bytes_of(state)) if has_agent else ("", None)
+        return Result(log, agent, None, size, _experts(cell.folder.resolve(), log))
     except (ValueError, OSError) as error:
         return Result(None, "", str(error))
 
 
-def _reason(run_dir: Path, outcome: Outcome) -> str:
-    """Return why a seed has no results."""
+def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
+    """Return the logs of the single-task experts that a log names; they must be in the folder of its process."""
+    paths = [(folder / str(each.get("run")) / LOG).resolve() for each in experts_of(log)]
+    inside = all(path.is_relative_to(folder) for path in paths)
+    require((inside, "its experts are outside the folder of its process: experts_dir must be a relative path"))
+    return tuple(map(RunLog.read, paths))
+
+
+def _failed(run_dir: Path, outcome: Outcome) -> Result:
+    """Return that a seed has no results, and why."""
     with suppress(OSError, ValueError):
-        return read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
-    return outcome.failure or f"it left no {METRICS}"
+        reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
+        alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
+        return Result(None, "", reason, failed_alone=alone)
+    return Result(None, "", outcome.failure or f"it left no {METRICS}")
 
 
 def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:
@@ -213,18 +242,20 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     return reasons + [f"{part} {before} there, {own} here" for part, before, own in pairs if before != own]
 
 
-def checks_of(run: SubmittedRun, submitted: RunLog, result: Result) -> list[Check]:
+def checks_of(run: SubmittedRun, submitted: RunLog, result: Result, experts: Sequence[RunLog] = ()) -> list[Check]:
     """Compare a submitted run with what was learned again, bit by bit.
 
-    A run that cannot be finished here, and a failed one that can, decide nothing: the machine or a limit may be why.
+    A run that cannot be finished here, and a failed one that does not fail by itself, decide nothing: the machine or a
+    limit may be why.
 
     Args:
         run: the submitted run.
         submitted: its log.
         result: of the same seed.
+        experts: the submitted logs of its single-task experts.
     """
     if not run.finished:
-        again = None if result.failure is None else True
+        again = True if result.failed_alone else None
         found = terminal_text(result.failure or "it finished")
         return [Check("failure", run.reason, found, again, run=run.run, level=RERUN)]
     if result.log is None:
@@ -232,8 +263,12 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Result) -> list[Chec
         return [Check("rerun", "it finishes", terminal_text(result.failure), None, run.run, note=note, level=RERUN)]
     log = equal("log of the rerun", run.log_sha256, log_sum(result.log), run.run)
     note = "" if log.passed else first_difference(submitted, result.log)
-    agent = equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)
-    return [log._replace(note=note, level=RERUN), agent._replace(level=RERUN)]
+    checks = [log._replace(note=note), equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)]
+    checks.append(equal(BYTES, run.agent_bytes, result.agent_bytes, run.run))
+    sums = [[log_sum(each) for each in some] for some in (experts, result.experts)]
+    pairs = enumerate(zip_longest(*sums, fillvalue="none"), 1)
+    checks += [equal(f"log of expert {number} of the rerun", one, other, run.run) for number, (one, other) in pairs]
+    return [check._replace(level=RERUN) for check in checks]
 
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
@@ -291,24 +326,32 @@ def check_of_scores(submission: Submission, found: Sequence[float], what: str, l
 def verified(submission: Submission, results: Mapping[SubmittedRun, Result], other_bits: Sequence[str]) -> list[Check]:
     """Return the checks of all runs that were learned again.
 
-    Bits are compared first. Where they differ and are not promised, the scores are tested instead.
+    Bits are compared first. Where they differ and are not promised, the scores of these runs are tested instead.
 
     Args:
         submission: of the runs.
         results: of each run that was learned again.
         other_bits: why bits are not promised here; see `why_other_bits`.
     """
-    by_run = {run: checks_of(run, submission.log(run), result) for run, result in results.items()}
-    differing = [run for run, checks in by_run.items() if run.finished and not all(c.passed for c in checks)]
-    logs = [results[run].log for run in differing]
-    if not other_bits or not differing or None in logs:
+    by_run = {
+        run: checks_of(run, submission.log(run), result, submission.experts(run) or () if run.finished else ())
+        for run, result in results.items()
+    }
+    logs = {run: results[run].log for run, checks in by_run.items() if run.finished and _has_other_bits(checks)}
+    differing = {run: log for run, log in logs.items() if log is not None}
+    if not other_bits or not differing:
         return [check for checks in by_run.values() for check in checks]
     name = score_name(submission)
-    values = [score_of(log, submission.curriculum, name) for log in logs if log is not None]
+    values = [score_of(log, submission.curriculum, name) for log in differing.values()]
     note = f"bits differ, as they may with {'; '.join(other_bits)}"
     what = f"{name} of {len(values)} reruns"
     check = check_of_scores(submission, [v for v in values if v is not None], what, RERUN, note)
-    return [check, *(check for run, checks in by_run.items() if run not in differing for check in checks)]
+    pairs = [(run, each) for run, checks in by_run.items() for each in checks]
+    return [check, *(each for run, each in pairs if run not in differing or each.what == BYTES)]
+
+
+def _has_other_bits(checks: Sequence[Check]) -> bool:
+    return any(check.passed is False for check in checks if check.what != BYTES)
 
 
 def _frames(run_dir: Path) -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
-from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
+from ctgraph_rl.board.isolate import SOCKETS, Isolation, Limits, Outcome, isolation
 from ctgraph_rl.board.rerun import RERUN, Cell, cells_of, draw, learn_again, result_of, verified, why_other_bits
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import VERIFICATION, Submission, read_submission
@@ -153,8 +153,9 @@ def described(plan: Plan, means: Means) -> list[str]:
 CLOSED = {
     "network": "no network",
     "files": "all files but those of its folder are read-only",
-    "processes": "it sees and signals no other process",
+    "processes": "it signals no other process",
     "memory": "all its processes share the limit of memory",
+    "sockets": f"no Unix sockets in {', '.join(SOCKETS)}",
 }
 """What `Isolation` closes off, in words."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+import tempfile
 import time
 from pathlib import Path
 
@@ -40,10 +41,12 @@ while what == "many files":
     time.sleep(0.005)
 if what == "network":
     socket.create_connection(("127.0.0.1", int(sys.argv[2])), timeout=5)
+if what == "socket":
+    socket.socket(socket.AF_UNIX).connect(sys.argv[2])
 if what == "write elsewhere":
     Path(sys.argv[2]).write_text("x")
 if what == "environment":
-    print(sorted(os.environ))
+    print(sorted(os.environ), os.environ["PYTHONPATH"])
 if what == "daemon" and os.fork() == 0:
     os.setsid()
     if os.fork() == 0:
@@ -107,6 +110,26 @@ def test_code_of_others_has_no_network_where_the_system_allows(place):
     assert "Network is unreachable" in outcome.failure
 
 
+def test_code_of_others_finds_no_socket_of_other_programs_where_the_system_allows(place):
+    needs(place, "sockets")
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder, socket.socket(socket.AF_UNIX) as server:
+        server.bind(f"{folder}/socket")
+        server.listen()
+        outcome = run(place, "socket", f"{folder}/socket")
+
+    assert "No such file or directory" in outcome.failure
+
+
+def test_modules_of_others_are_not_imported_before_limits_and_isolation(place):
+    for name in ("sitecustomize", "usercustomize", "types", "ctypes"):
+        (place / "code" / f"{name}.py").write_text(f"open({str(place / 'ran')!r}, 'w').close()")
+
+    outcome = run(place, "environment")
+
+    assert (outcome.code, (place / "ran").exists()) == (0, False)
+    assert outcome.output.strip().endswith(f":{place / 'code'}")
+
+
 def test_code_of_others_writes_into_its_folder_alone_where_the_system_allows(place):
     needs(place, "files")
     outcome = run(place, "write elsewhere", str(place / "elsewhere"))
@@ -144,15 +167,17 @@ def test_no_process_is_left_behind_also_after_an_interrupt(place, is_interrupted
 
 
 def test_what_a_system_cannot_close_off_is_said():
-    nothing = Isolation(network=False, files=False, processes=False, memory=False)
+    nothing = Isolation(network=False, files=False, processes=False, memory=False, sockets=False)
 
     assert [text.split(" ")[:4] for text in nothing.missing()] == [
         ["it", "can", "use", "the"],
         ["it", "can", "read", "and"],
         ["it", "can", "signal", "your"],
         ["its", "memory", "is", "limited"],
+        ["it", "can", "connect", "to"],
     ]
-    assert Isolation(*[True] * 4).missing() == ["it can read every file that you can"]
+    (reads,) = Isolation(*[True] * 5).missing()
+    assert reads == "it can read every file that you can, and connect to Unix sockets outside /run, /var/run, /tmp"
 
 
 @pytest.mark.parametrize("limits", [ROOMY._replace(seconds=0), ROOMY._replace(memory=-1)])

@@ -120,13 +120,15 @@ def test_an_edited_sum_of_an_agent_is_found_by_a_rerun_alone(
 ):
     folder = submitted(tiny_home, tiny_track, method, tmp_path / "submission")
     lines = (folder / "runs.csv").read_text().splitlines(keepends=True)
-    sums = [line.split(",")[7] for line in lines[1:]]
-    (folder / "runs.csv").write_text("".join(lines).replace(sums[0], "a" * 64).replace(sums[1], "b" * 64))
+    for line in lines[1:]:
+        agent_sha256, agent_bytes = line.split(",")[7:9]
+        lines = [each.replace(f"{agent_sha256},{agent_bytes}", f"{'a' * 64},1") for each in lines]
+    (folder / "runs.csv").write_text("".join(lines))
 
     code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
 
     assert (code, written["level"]) == (1, "none")
-    assert failed(written) == [("rerun", "agent of the rerun")]
+    assert failed(written) == [("rerun", "agent of the rerun"), ("rerun", "bytes of the agent")]
 
 
 def test_a_log_that_was_edited_with_all_that_follows_from_it_is_found_by_a_rerun_alone(
@@ -179,11 +181,15 @@ def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
     scores = iter(found)
     monkeypatch.setattr(rerun, "score_of", lambda *_: next(scores))
     run = tiny_submission.runs[0]
-    results = {replace(run, seed=seed): rerun.Result(RunLog(), "", None) for seed in range(len(found))}
+    other = rerun.Result(RunLog(), "", None, run.agent_bytes)
+    results = {replace(run, seed=seed): other for seed in range(1, len(found) + 1)}
+    stopped = rerun.Result(None, "", "stopped: it took longer than 1 seconds")
 
-    (check,) = rerun.verified(tiny_submission, results, ["cpu A there, B here"])
+    check, *sizes, undecided = rerun.verified(tiny_submission, {**results, run: stopped}, ["cpu A there, B here"])
 
     assert check.passed is passed
+    assert ({size.what for size in sizes}, all(size.passed for size in sizes)) == ({rerun.BYTES}, True)
+    assert (undecided.what, undecided.passed) == ("rerun", None)
     assert check.note == "bits differ, as they may with cpu A there, B here"
     assert ("would be found with 80% chance" if passed is not None else "cannot show any drop") in check.found
 
@@ -315,8 +321,51 @@ def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submi
         tiny_submission, [check]
     )
     failed_there = replace(run, state="failed", reason="the loss was nan")
-    assert rerun.checks_of(failed_there, RunLog(), stopped)[0].passed is True
-    assert rerun.checks_of(failed_there, RunLog(), stopped._replace(failure=None))[0].passed is None
+    assert rerun.checks_of(failed_there, RunLog(), stopped)[0].passed is None
+    assert rerun.checks_of(failed_there, RunLog(), stopped._replace(failed_alone=True))[0].passed is True
+
+
+@pytest.mark.parametrize(
+    ("mark", "stopped", "alone"),
+    [
+        ("ValueError: the loss was nan", None, True),
+        ("ValueError: the loss was nan", "it took longer than 1 seconds", False),
+        ("MemoryError", None, False),
+        (None, None, False),
+    ],
+)
+def test_a_failed_run_is_confirmed_by_its_own_failure_alone(tiny_submission, tmp_path, mark, stopped, alone):
+    (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
+    run_dir_of(cell.folder, 0).mkdir(parents=True)
+    if mark is not None:
+        (run_dir_of(cell.folder, 0) / "failed.txt").write_text(mark)
+
+    result = result_of(cell, 0, Outcome(1, stopped, 0.0, "ModuleNotFoundError: No module named 'theirs'"))
+
+    assert (result.log, result.failed_alone) == (None, alone)
+    assert result.failure
+
+
+def test_logs_of_experts_are_compared_and_are_those_of_the_rerun(tiny_home, tiny_submission, tmp_path):
+    run, (cell,) = tiny_submission.runs[0], cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
+    for copy in ("seed0", "experts/one"):
+        shutil.copytree(tiny_home / "runs" / "tiny-seed0", cell.folder / copy)
+    log_of = cell.folder / "seed0" / "run.jsonl"
+    lines = log_of.read_text().splitlines(keepends=True)
+
+    def found(folder):
+        experts = json.dumps({"kind": "experts", "experts": [{"task": 1, "run": folder}]})
+        log_of.write_text("".join([*lines, experts + "\n"]))
+        return result_of(cell, 0, Outcome(0, None, 0.0, ""))
+
+    other = RunLog.of_content("".join(lines[:-1]).encode(), log_of)
+    result = found("experts/one")
+    checks = [rerun.checks_of(run, result.log, result, experts)[-1] for experts in (result.experts, [other], [])]
+
+    assert [(check.what, check.passed) for check in checks] == [
+        ("log of expert 1 of the rerun", passed) for passed in (True, False, False)
+    ]
+    assert "outside the folder of its process" in found(str(tiny_home / "runs" / "tiny-seed0")).failure
 
 
 def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
