@@ -42,6 +42,9 @@ failed: {}                  # seeds of runs without results, each with the reaso
 """
 """A ``method.yaml`` to fill in, with a comment on every line."""
 
+WRITTEN = ("track_version",)
+"""Keys that `ctgraph_rl.board.submit` writes, and earlier submissions do not have."""
+
 MOST_BYTES = 2**16
 """Largest ``method.yaml`` that is read."""
 
@@ -78,6 +81,11 @@ def read_method(path: Path) -> dict[str, Any]:
     return dict(method)
 
 
+def track_version(method: Mapping[str, Any]) -> Any:
+    """Return the version of the track that a method was submitted to."""
+    return method.get("track_version", 1)
+
+
 def check_method(method: Any) -> None:
     """Refuse what does not describe a method.
 
@@ -94,7 +102,8 @@ def check_method(method: Any) -> None:
 def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str) -> list[tuple[bool, str]]:
     """Return the rules that an object has the keys of another one, and so have its parts."""
     rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
-    rules += [(key in example, f"unknown key {prefix}{key}: {did_you_mean(str(key), example)}") for key in given]
+    known = [*example, *(() if prefix else WRITTEN)]
+    rules += [(key in known, f"unknown key {prefix}{key}: {did_you_mean(str(key), known)}") for key in given]
     for key, part in example.items():
         if isinstance(part, Mapping) and part and key in given:
             is_part = isinstance(given[key], Mapping)
@@ -125,6 +134,7 @@ def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
         ),
         (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, in quotes, got {commit!r:.80}"),
         _entry_rule(method["entry_point"]),
+        (is_int(track_version(method), 1), f"track_version must be an integer >= 1, got {track_version(method)!r:.80}"),
         _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
         _count_rule("bytes_per_task", method["bytes_per_task"]),
         (whole, f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
-from ctgraph_rl.board.method import fact_rules, facts_of
+from ctgraph_rl.board.method import fact_rules, facts_of, track_version
 from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, one_line, oracle_rule, seed_rules
 from ctgraph_rl.board.submission import (
     CONFIG,
@@ -97,6 +97,8 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
     method, runs, of_track = submission.method, submission.runs, submission.track
     named = None if of_track is None else of_track.name
     yield equal("track", method["track"], named)
+    if of_track is not None:
+        yield equal("version of the track", track_version(method), of_track.version)
     found = submission.curriculum.fingerprint
     wanted = "the published one" if of_track is None else f"one of track {of_track.id}"
     yield _rules("curriculum", [curriculum_rule(submission.curriculum, of_track)], wanted, found)

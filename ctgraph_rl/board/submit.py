@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from ctgraph_rl.board import submission as files
-from ctgraph_rl.board.method import TEMPLATE, completed, fact_rules, facts_of, read_method
+from ctgraph_rl.board.method import TEMPLATE, WRITTEN, completed, fact_rules, facts_of, read_method
 from ctgraph_rl.board.rescore import metrics_text, near, rescore
 from ctgraph_rl.board.rules import (
     code_rules,
@@ -89,13 +89,21 @@ def submit(
     lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
-    about = {**completed(method, facts), "track": None if of_track is None else of_track.name}
+    about = _for_track(completed(method, facts), of_track)
     with new_folder(to) as folder:
         _write(folder, runs, lines, about, curriculum=curriculum)
         made = read_submission(folder, of_track)
         wrong = [check.text for check in rescore(made) if not check.passed]
         require((not wrong, f"the submission would not pass its own check: {listed(wrong)}"))
     return read_submission(to, of_track)
+
+
+def _for_track(method: Mapping[str, Any], of_track: Track | None) -> dict[str, Any]:
+    """Return a method with its track and the version of it."""
+    kept = {key: value for key, value in method.items() if key not in WRITTEN}
+    if of_track is None:
+        return {**kept, "track": None}
+    return {**kept, "track": of_track.name, "track_version": of_track.version}
 
 
 def _found(paths: Sequence[Path], only: Mapping[str, Any]) -> list[Run]:

@@ -15,9 +15,11 @@ from datetime import date
 import pytest
 
 from ctgraph_rl import cli
-from ctgraph_rl.board.standings.entries import entry_of, level_of
+from ctgraph_rl.board import verify
+from ctgraph_rl.board.rescore import Check, rescore
+from ctgraph_rl.board.standings.entries import entry_of, read_entries, verification_of
 from ctgraph_rl.board.standings.page import write_board
-from ctgraph_rl.board.submission import VERIFICATION
+from ctgraph_rl.board.submission import VERIFICATION, read_submission
 
 for package in ("jinja2", "scipy", "pyarrow"):
     pytest.importorskip(package)
@@ -42,19 +44,85 @@ def test_an_entry_has_the_numbers_of_its_submission(submission):
     assert found.agent_bytes == submission.runs[0].agent_bytes and found.hours == submission.method["compute"]["hours"]
 
 
-@pytest.mark.parametrize("level", ["rescored", "rerun", "held_out"])
-def test_a_level_is_that_of_the_verification_of_these_very_files(submission, level):
-    file = submission.path / VERIFICATION
+def verified(submission, levels=verify.LEVELS, passed=True, **more):
+    """What a verification says that has checked these levels; the last of them is the one that it states."""
+    checks = [Check("what", "1", "1", passed, level=level)._asdict() for level in levels]
+    level = levels[-1] if passed else "none"
+    return {"schema": 1, "level": level, "digest": submission.digest, "checks": checks, **more}
 
-    file.write_text(json.dumps({"level": level, "digest": submission.digest}))
-    assert level_of(submission) == level
-    file.write_text(json.dumps({"level": level, "digest": "0" * 64}))
-    assert level_of(submission) == "submitted"
-    file.write_text(json.dumps({"level": "none", "digest": submission.digest}))
-    assert level_of(submission) == "failed"
-    file.write_text("[")
-    with pytest.raises(ValueError, match="has no level; verify the submission again"):
-        level_of(submission)
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_level_is_that_of_the_verification_of_these_very_files(submission, count):
+    file, levels = submission.path / VERIFICATION, verify.LEVELS[:count]
+
+    file.write_text(json.dumps(verified(submission, levels)))
+    assert verification_of(submission) == (levels[-1], True, "")
+    file.write_text(json.dumps(verified(submission, levels, bits=False)))
+    assert verification_of(submission) == (levels[-1], False, "")
+    file.write_text(json.dumps(verified(submission, levels, passed=False)))
+    assert verification_of(submission).level == "failed"
+    file.write_text(json.dumps(verified(submission, levels, digest="0" * 64)))
+    assert verification_of(submission) == (
+        *("submitted", True),
+        "verification.json is of other files; verify the submission again",
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("[", "Expecting value: line 1 column 2"),
+        ("[1]", "its schema must be 1, got None"),
+        ({"schema": 2}, "its schema must be 1, got 2"),
+        ({"level": ["x"]}, r"its level must be none, rescored, rerun, held_out, got ['x']"),
+        ({"level": {}}, "its level must be none, rescored, rerun, held_out, got {}"),
+        ({"level": "rerun"}, "its checks give the level held_out, not rerun"),
+        ({"checks": []}, "its checks give the level none, not held_out"),
+        ({"checks": [{"what": "all", "passed": 1, "level": "rescored"}]}, "its checks must be a list of checks"),
+        ({"bits": "no"}, "its bits must be true or false, got 'no'"),
+    ],
+)
+def test_what_is_no_verification_counts_for_nothing_and_the_board_says_why(tiny_home, submission, change, why):
+    text = change if isinstance(change, str) else json.dumps(verified(submission) | change)
+    (submission.path / VERIFICATION).write_text(text)
+
+    (entry,), problems = read_entries([submission.path], tiny_home / "conf")
+
+    assert (entry.level, problems) == ("submitted", [])
+    assert entry.verification.why_none.startswith(f"verification.json counts for nothing, {why}")
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "7", "abc", "0_1"])
+def test_a_value_that_the_metric_cannot_have_is_left_out_with_file_metric_and_run(tiny_home, submission, cell):
+    path = submission.path / "metrics.csv"
+    path.write_text(re.sub(r"(tiny-seed1,1,average_performance,)[\d.]+", rf"\g<1>{cell}", path.read_text()))
+
+    entries, (problem,) = read_entries([submission.path], tiny_home / "conf")
+
+    wanted = "must be a finite number in [0, 1], got"
+    assert not entries and problem.reason == (
+        f"{submission.path}: metrics.csv: average_performance of tiny-seed1 {wanted} '{cell}'; verify the submission"
+    )
+
+
+def test_a_submission_to_an_earlier_version_of_a_track_is_in_a_table_of_its_own_and_fails_under_the_new_one(
+    tiny_home, submission, tmp_path
+):
+    conf = shutil.copytree(tiny_home / "conf", tmp_path / "conf")
+    assert submission.method["track_version"] == 1
+    method, track = submission.path / "method.yaml", conf / "track" / "tiny.yaml"
+    method.write_text(method.read_text().replace("track_version: 1\n", ""))  # as before there were any
+    (before,) = read_entries([submission.path], conf)[0]
+
+    track.write_text(track.read_text().replace("version: 1", "version: 2"))
+    (after,) = read_entries([submission.path], conf)[0]
+    wrong = [check.text for check in rescore(read_submission(submission.path, config_dir=conf)) if not check.passed]
+    method.write_text(method.read_text() + "track_version: 3\n")
+    (problem,) = read_entries([submission.path], conf)[1]
+
+    assert (before.track.id, after.track.id) == ("tiny-v1", "tiny-v1")
+    assert wrong == ["version of the track: expected 1, found 2"]
+    assert "the newest version of the track is tiny-v2; it was submitted to tiny-v3: use a package" in problem.reason
 
 
 def test_all_files_are_written_and_describe_each_other(board):

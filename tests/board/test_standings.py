@@ -18,7 +18,7 @@ from ctgraph_rl import Protocol
 from ctgraph_rl.board.method import TEMPLATE
 from ctgraph_rl.board.standings import formats
 from ctgraph_rl.board.standings.ceilings import ceilings_of
-from ctgraph_rl.board.standings.entries import Entry
+from ctgraph_rl.board.standings.entries import Entry, Verification
 from ctgraph_rl.board.standings.page import html
 from ctgraph_rl.board.standings.tables import Table, tables
 from ctgraph_rl.board.tracks import Track, track
@@ -36,7 +36,8 @@ def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant:
     method = yaml.safe_load(TEMPLATE) | {"name": name, "authors": ["A. Author"], "code": code}
     method["bytes_per_task"] = more.pop("bytes_per_task", 0)
     method["compute"]["hours"] = 0.25
-    about = {"level": "submitted", "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
+    verification = Verification(more.pop("level", "submitted"), *more.pop("verification", ()))
+    about = {"verification": verification, "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
     values = dict.fromkeys(("normalised_performance", "average_performance", "forgetting"), tuple(scores))
     digest = hashlib.sha256(name.encode()).hexdigest()
     return Entry(digest, method, of, of.variants[variant], seeds=of.seeds, values=values, **about)
@@ -97,13 +98,15 @@ def test_what_is_of_another_track_version_rung_or_protocol_is_in_another_table()
 def test_without_all_scores_or_with_a_failed_verification_there_is_no_rank():
     missing = entry("missing", [1.0] * 19 + [None], failed={19: "out of memory"})
     wrong = entry("wrong", [1.0] * 20, level="failed")
-    (table,) = tables([missing, wrong, entry("whole", [0.5] * 20)])
+    other = entry("whole", [0.5] * 20, verification=(True, "verification.json is of other files"))
+    (table,) = tables([missing, wrong, other])
 
     assert ranks(table) == {"missing": "-", "wrong": "-", "whole": "1"}
     assert formats.notes(table) == [
         "missing has no rank: no score of seed 19.",
         "missing, seed 19 failed: out of memory",
         "wrong has no rank: its verification found differences.",
+        "whole: verification.json is of other files.",
     ]
 
 
@@ -146,7 +149,8 @@ def test_ceilings_are_those_by_hand(curriculum, expected):
 def made() -> list[Table]:
     """Two tables, with a name that means something in every format."""
     best = entry("<b>A_1</b> & *co* | $x$", [1.0] * 20, level="rerun", bytes_per_task=4096)
-    return tables([best, entry("PPO", some(0.0, 1.0)), entry("other", [0.5] * 20, variant=1)])
+    other = entry("other", [0.5] * 20, variant=1, level="held_out", verification=(False,))
+    return tables([best, entry("PPO", some(0.0, 1.0)), other])
 
 
 def test_markdown_has_a_line_for_each_submission(made):
@@ -162,7 +166,12 @@ def test_markdown_has_a_line_for_each_submission(made):
         *("2", "PPO", *["0.50 [0.27, 0.73]"] * 2, "0.50 [0.18, 0.73]"),
         *("20", "0", "1,234", "409,600", "0.25", "submitted"),
     ]
-    assert rows[1][0] == "1" and rows[1][-1] == "rerun" and "<b>" not in rows[1][1] and len(rows[1]) == 11
+    assert (
+        rows[1][0] == "1"
+        and (rows[1][-1], rows[-1][-1]) == ("rerun", "held out, scores")
+        and "<b>" not in rows[1][1]
+        and len(rows[1]) == 11
+    )
 
 
 def test_latex_has_a_table_for_each_and_names_are_text(made):
@@ -192,6 +201,9 @@ def test_json_and_csv_hold_the_numbers_of_each_seed(made):
 
     entries, scores = formats.entries_csv(made).splitlines(), formats.scores_csv(made).splitlines()
     assert entries[0].split(",") == list(formats.ENTRY_COLUMNS) and len(entries) == 4
+    assert (
+        entries[3].endswith(',"held out, scores"') and formats.as_json(made)["tables"][1]["entries"][0]["bits"] is False
+    )
     assert len(scores) == 1 + 3 * 3 * 20 and scores[0] == "submission,seed,metric,value"
 
 

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ctgraph_rl.board.submission import METHOD, RUNS, VERIFICATION, Submission, read_submission
+from ctgraph_rl.board import verify
+from ctgraph_rl.board.method import track_version
+from ctgraph_rl.board.rescore import MEASURES, Check
+from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import read_regular
+from ctgraph_rl.report.bounds import bounds_of_curriculum
+from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
 
 LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
@@ -20,14 +27,22 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
 """Levels by the names that ``verification.json`` gives them."""
 
-MEASURES = ("average_performance", "forgetting")
-"""Metrics that each table shows beside the score."""
+NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
+"""A value in ``metrics.csv``."""
 
 MOST_BYTES = 2**24
 """Largest ``verification.json`` that is read."""
 
 DIGITS = 12
 """Of a digest, for readers."""
+
+
+class Verification(NamedTuple):
+    """How far a submission was verified."""
+
+    level: str  # one of `LEVELS`
+    bits: bool = True  # whether reruns are held to the same bits; False: only scores were tested
+    why_none: str = ""  # why a ``verification.json`` that is there counts for nothing
 
 
 @dataclass(frozen=True)
@@ -39,7 +54,7 @@ class Entry:
         method: what its ``method.yaml`` says.
         track: that it is for.
         variant: what it learned.
-        level: one of `LEVELS`.
+        verification: how far it was verified.
         seeds: of the track.
         values: of the track's score and `MEASURES`, one for each seed; None for a seed without a value.
         failed: why seeds failed.
@@ -51,7 +66,7 @@ class Entry:
     method: Mapping[str, Any]
     track: Track
     variant: Variant
-    level: str
+    verification: Verification
     seeds: tuple[int, ...]
     values: Mapping[str, tuple[float | None, ...]]
     failed: Mapping[int, str]
@@ -62,6 +77,17 @@ class Entry:
     def name(self) -> str:
         """The name of the method."""
         return str(self.method["name"])
+
+    @property
+    def level(self) -> str:
+        """How far it was verified, one of `LEVELS`."""
+        return self.verification.level
+
+    @property
+    def verified(self) -> str:
+        """The level in words, and that only scores were tested where bits were not."""
+        reran = self.level in LEVELS[3:]
+        return shown_level(self.level) + (", scores" if reran and not self.verification.bits else "")
 
     @property
     def id(self) -> str:
@@ -122,28 +148,33 @@ def entry_of(submission: Submission) -> Entry:
     """Return a submission as an entry.
 
     Raises:
-        ValueError: if it is for no track, or not of the track that it names.
+        ValueError: if it is for no track, or not of the track that it names, and for values that no metric has.
     """
     track, name = submission.track, submission.method["name"]
     require((track is not None, f"{name} is for no track: name one in {METHOD}, or submit with --track"))
     assert track is not None
     variant = track.variant_of(submission.curriculum)
-    found = submission.curriculum.fingerprint
-    require((variant is not None, f"the curriculum (fingerprint {found}) is none of track {track.id}"))
+    found, own = submission.curriculum.fingerprint, replace(track, version=track_version(submission.method))
+    other = "" if own.version == track.version else f"; it was submitted to {own.id}: use a package that has it"
+    require(
+        (variant is not None, f"the curriculum (fingerprint {found}) is none of track {track.id}{other}"),
+        (own.version <= track.version, f"the newest version of the track is {track.id}{other}"),
+    )
     assert variant is not None
     by_seed = {run.seed: run for run in submission.runs}
+    names = [by_seed[seed].run if seed in by_seed else None for seed in track.seeds]
+    evaluations = sum(frames > 0 for frames in submission.curriculum.moments)
+    bounds = bounds_of_curriculum(submission.curriculum, max(1, evaluations))
     values = {
-        metric: tuple(
-            _value(submission, by_seed[seed].run if seed in by_seed else None, metric) for seed in track.seeds
-        )
+        metric: tuple(_value(submission, run, metric, bounds.of_metric(metric)) for run in names)
         for metric in dict.fromkeys((track.score, *MEASURES))
     }
     return Entry(
         digest=submission.digest,
         method=submission.method,
-        track=track,
+        track=own if other else track,
         variant=variant,
-        level=level_of(submission),
+        verification=verification_of(submission),
         seeds=track.seeds,
         values=values,
         failed={run.seed: run.reason for run in submission.runs if not run.finished},
@@ -152,28 +183,66 @@ def entry_of(submission: Submission) -> Entry:
     )
 
 
-def _value(submission: Submission, run: str | None, metric: str) -> float | None:
-    """Return a metric of a run; None for one without."""
-    cell = {} if run is None else submission.metrics.get(run, {}).get(metric, {})
-    return float(cell["value"]) if cell.get("value") else None
-
-
-def level_of(submission: Submission) -> str:
-    """Return how far a submission was verified; a verification of other files counts for nothing.
+def _value(submission: Submission, run: str | None, metric: str, bounds: Bounds) -> float | None:
+    """Return a metric of a run; None for one without.
 
     Raises:
-        ValueError: for a ``verification.json`` that cannot be read.
+        ValueError: for what is no finite number within the bounds of the metric.
     """
+    cell = "" if run is None else submission.metrics.get(run, {}).get(metric, {}).get("value", "")
+    if not cell:
+        return None
+    value = float(cell) if NUMBER.fullmatch(cell) else math.nan
+    low, high, noisy = bounds
+    fits = math.isfinite(value) and within_bounds([value], bounds)
+    wanted = "a finite number" + ("" if noisy else f" in [{low:g}, {high:g}]")
+    require((fits, f"{METRICS}: {metric} of {run} must be {wanted}, got {cell!r:.80}; verify the submission"))
+    return value
+
+
+def verification_of(submission: Submission) -> Verification:
+    """Return how far a submission was verified; what is of other files, or no verification, counts for nothing."""
     path = submission.path / VERIFICATION
     if not path.is_file():
-        return "submitted"
+        return Verification("submitted")
     try:
-        found = json.loads(read_regular(path, MOST_BYTES))
-    except (ValueError, RecursionError):
-        found = None
-    level = found.get("level") if isinstance(found, dict) else None
-    require((level in OF_FILES, f"{path} has no level; verify the submission again"))
-    return OF_FILES[str(level)] if found.get("digest") == submission.digest else "submitted"
+        found = _plain(json.loads(read_regular(path, MOST_BYTES)))
+    except (OSError, ValueError, RecursionError) as error:
+        why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
+        return Verification("submitted", why_none=why)
+    if found["digest"] != submission.digest:
+        return Verification("submitted", why_none=f"{VERIFICATION} is of other files; verify the submission again")
+    return Verification(OF_FILES[found["level"]], found["bits"])
+
+
+def _plain(found: Any) -> dict[str, Any]:
+    """Return what a ``verification.json`` says, if its level follows from its checks.
+
+    Raises:
+        ValueError: for what is no verification.
+    """
+    given = {"bits": True, **(found if isinstance(found, dict) else {})}
+    schema, level, bits = (given.get(key) for key in ("schema", "level", "bits"))
+    checks = _checks(given.get("checks"))
+    require(
+        (type(schema) is int and schema == verify.SCHEMA, f"its schema must be {verify.SCHEMA}, got {schema!r:.80}"),
+        (isinstance(level, str) and level in OF_FILES, f"its level must be {', '.join(OF_FILES)}, got {level!r:.80}"),
+        (isinstance(bits, bool), f"its bits must be true or false, got {bits!r:.80}"),
+        (checks is not None, "its checks must be a list of checks with what, level and passed"),
+    )
+    reached = verify.level_of(checks or ())
+    require((reached == level, f"its checks give the level {reached}, not {level}"))
+    return {**given, "digest": given.get("digest")}
+
+
+def _checks(found: Any) -> list[Check] | None:
+    """Return the checks of a ``verification.json``; None for what are none."""
+    if not (isinstance(found, list) and all(isinstance(each, dict) for each in found)):
+        return None
+    checks = [Check(*(each.get(name, "") for name in Check._fields)) for each in found]
+    fit = all(each.passed is None or isinstance(each.passed, bool) for each in checks)
+    texts = [getattr(each, name) for each in checks for name in Check._fields if name != "passed"]
+    return checks if fit and all(isinstance(text, str) for text in texts) else None
 
 
 def shown_level(level: str) -> str:

@@ -62,7 +62,7 @@ def columns(line: Standing) -> list[Column]:
         Column("bytes of the agent", _count(entry.agent_bytes), entry.agent_bytes),
         Column("steps", f"{entry.frames:,}", entry.frames),
         Column("hours", _hours(compute["hours"]), compute["hours"]),
-        Column("level", shown_level(entry.level), LEVELS.index(entry.level)),
+        Column("level", entry.verified, LEVELS.index(entry.level)),
     ]
 
 
@@ -80,11 +80,13 @@ def _hours(value: float | None) -> str:
 
 
 def notes(table: Table) -> list[str]:
-    """Return what lines of a table need said: why they have no rank, and which seeds failed."""
+    """Return what lines of a table need said: no rank, a verification that does not count, and seeds that failed."""
     found = []
     for line in table.standings:
         why = line.entry.why_not_ranked
         found += [f"{line.name} has no rank: {why}."] if why else []
+        none = line.entry.verification.why_none
+        found += [f"{line.name}: {none}."] if none else []
         found += [f"{line.name}, seed {seed} failed: {reason}" for seed, reason in line.entry.failed.items()]
     return found
 
@@ -167,7 +169,7 @@ ENTRY_COLUMNS = {
     "bytes_per_task": ("sc:Integer", "bytes kept for each further task, as the authors say"),
     "agent_bytes": ("sc:Integer", "bytes of the largest agent"),
     "hours": ("sc:Float", "hours of computing of all its runs"),
-    "level": ("sc:Text", f"how far it was verified: {', '.join(map(shown_level, LEVELS))}"),
+    "level": ("sc:Text", f"how far it was verified: {', '.join(map(shown_level, LEVELS))}; scores: not by bits"),
 }
 """Columns of ``entries.csv`` with their types in Croissant and their meaning."""
 
@@ -191,7 +193,7 @@ def _entry_cells(table: Table, line: Standing) -> Iterator[Any]:
     yield from (entry.id, entry.name, table.track.id, table.variant.rung, table.variant.given)
     yield from (table.variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
     yield from (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
-    yield from (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, shown_level(entry.level))
+    yield from (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, entry.verified)
 
 
 def scores_csv(tables: Sequence[Table]) -> str:
@@ -242,7 +244,13 @@ def _json_line(line: Standing) -> dict[str, Any]:
     ranks = {"best_rank": line.best_rank, "worst_rank": line.worst_rank, "why_not_ranked": entry.why_not_ranked}
     estimates = {name: _numbers(estimate) for name, estimate in line.estimates.items()}
     values = {name: list(values) for name, values in entry.values.items()}
-    about = {"name": line.name, "digest": entry.digest, "method": dict(entry.method), "level": entry.level}
+    about: dict[str, Any] = {
+        "name": line.name,
+        "digest": entry.digest,
+        "method": dict(entry.method),
+        "level": entry.level,
+    }
+    about["bits"] = entry.verification.bits
     failed = {str(seed): reason for seed, reason in entry.failed.items()}
     return {
         **about,
@@ -286,7 +294,7 @@ def _result(table: Table, line: Standing) -> dict[str, Any]:
             for name, estimate in named.items()
         ],
         "source": {
-            "name": f"submission {line.entry.id}, {shown_level(line.entry.level)}",
+            "name": f"submission {line.entry.id}, {line.entry.verified}",
             "url": PAPER if method["code"]["repository"] == OURS else method["code"]["repository"],
         },
     }

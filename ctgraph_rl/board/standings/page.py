@@ -74,9 +74,9 @@ def write_board(
         PAGE: html(made, problems),
         "board.md": formats.markdown(made),
         "tables.tex": formats.tables_tex(made),
-        "board.json": json.dumps(formats.as_json(made), indent=1) + "\n",
+        "board.json": json.dumps(formats.as_json(made), indent=1, allow_nan=False) + "\n",
         **{name: content for name, (content, _) in data.items()},
-        "croissant.json": json.dumps(about, indent=2) + "\n",
+        "croissant.json": json.dumps(about, indent=2, allow_nan=False) + "\n",
         "model-index.yaml": formats.model_index(made),
     }
     for name, content in files.items():
