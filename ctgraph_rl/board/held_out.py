@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.board.rerun import Cell, Result, check_of_scores, job_of, score_name, score_of
-from ctgraph_rl.board.rescore import Check
+from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CURRICULUM
+from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 from ctgraph_rl.tasks.task import Task
@@ -64,7 +65,7 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
 
 
 def held_out_checks(submission: Submission, results: Sequence[tuple[Cell, Result]]) -> Iterator[Check]:
-    """Yield a check for each run that failed, and that of the scores of the others.
+    """Yield a check for each run that failed, those of the protocol of the others, and that of their scores.
 
     Args:
         submission: with the submitted scores.
@@ -72,17 +73,25 @@ def held_out_checks(submission: Submission, results: Sequence[tuple[Cell, Result
     """
     name, found = score_name(submission), []
     for cell, result in results:
+        seed, failure, value = cell.job.seeds[0], result.failure, None
         try:
-            value = None if result.log is None else score_of(result.log, cell.curriculum, name)
-            failure = result.failure
+            if result.log is not None:
+                value = score_of(result.log, cell.curriculum, name)
+                yield from _of_the_protocol(submission, cell.curriculum, seed, result.log)
         except ValueError as error:
-            value, failure = None, str(error)
+            failure = str(error)
         if failure is not None:
-            what = f"run of seed {cell.job.seeds[0]}"
-            yield Check(what, "it finishes", terminal_text(failure), None, level=HELD_OUT)
+            yield Check(f"run of seed {seed}", "it finishes", terminal_text(failure), None, level=HELD_OUT)
         found += [] if value is None else [value]
     what = f"{name} of {len(found)} runs with other seeds, images and goals"
     yield check_of_scores(submission, found, what, HELD_OUT)
+
+
+def _of_the_protocol(submission: Submission, curriculum: Curriculum, seed: int, log: RunLog) -> list[Check]:
+    """Return the checks that the log of another seed has all frames and evaluations of its curriculum."""
+    run = replace(submission.finished[0], seed=seed, run=f"seed {seed}")
+    checks = of_the_protocol(replace(submission, curriculum=curriculum), run, log)
+    return [check._replace(level=HELD_OUT) for check in checks]
 
 
 def drawn(text: str, most: int) -> int:

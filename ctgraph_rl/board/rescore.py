@@ -147,10 +147,10 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
         said = [each.get("fingerprint") for each in experts_of(log)]
         alone = [expert.of_kind("run")[0].get("fingerprint") for expert in submission.experts(run) or ()]
         yield equal("curricula of experts", said, alone, run.run)
-        yield from _of_the_protocol(submission, run, log)
+        yield from of_the_protocol(submission, run, log)
 
 
-def _of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
+def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
     """Yield checks that a log has the evaluations of the protocol, and frames to the end of the curriculum."""
     curriculum, how = submission.curriculum, submission.curriculum.evaluation
     yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)

@@ -15,22 +15,25 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
 from ctgraph_rl.board.isolate import SOCKETS, Isolation, Limits, Outcome, isolation
 from ctgraph_rl.board.rerun import RERUN, Cell, cells_of, draw, learn_again, result_of, verified, why_other_bits
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
-from ctgraph_rl.board.submission import VERIFICATION, Submission, read_submission
+from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
-from ctgraph_rl.checks import is_int, is_real, positive, require
+from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.provenance import machine, versions
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.sources import is_ours, targets
+from ctgraph_rl.packages import check_packages
 from ctgraph_rl.portable import cpu_model
 
 LEVELS = (RESCORED, RERUN, HELD_OUT)
@@ -43,6 +46,9 @@ SCHEMA = 1
 
 LEAST_SECONDS, TIMES = 600, 5
 """Time limit of a process: so many times what the submitted run took, and so much at least."""
+
+MOST_HOURS, LEAST_GB, MOST_GB = 10**5, 0.001, 10**6
+"""What the limits of a process may be."""
 
 GB = 10**9
 
@@ -78,7 +84,7 @@ class Means(NamedTuple):
 
     def limits(self, cell: Cell) -> Limits:
         """Return the limits of a process."""
-        usual = max(LEAST_SECONDS, math.ceil(TIMES * cell.seconds))
+        usual = max(LEAST_SECONDS, math.ceil(min(TIMES * cell.seconds, MOST_HOURS * 3600)))
         seconds = usual if self.hours is None else self.hours * 3600
         return Limits(seconds, round(self.memory * GB), round(self.disk * GB))
 
@@ -165,17 +171,33 @@ def _listed(groups: Iterator[Sequence[object]] | Sequence[Sequence[object]]) -> 
 
 
 def _time(seconds: float) -> str:
-    return str(timedelta(seconds=math.ceil(seconds)))
+    return str(timedelta(seconds=math.ceil(min(seconds, MOST_RUNS * MOST_HOURS * 3600))))
 
 
 def code_in_words(submission: Submission) -> str:
     """Return whose code a submission runs."""
     entry, code = submission.method["entry_point"], submission.method["code"]
-    others = (
-        dict.fromkeys(name for name in targets(submission.config) if not is_ours(name)) if entry is None else [entry]
-    )
+    named = [entry] if entry is not None else dict.fromkeys(targets(submission.config))
+    others = [name for name in named if name == entry or not is_of_this_package(name)]
     source = f"of {code['repository']} at {code['commit']}"
     return f"{', '.join(others)} {source}" if others else "of this package, as the configuration names it"
+
+
+def is_of_this_package(name: str) -> bool:
+    """Return whether a dotted name is of something that this package defines, and not of what its modules import.
+
+    Raises:
+        ValueError: if another package has the name of one of ours.
+    """
+    if not is_ours(name):
+        return False
+    check_packages()
+    try:
+        found = resolve_name(name)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    made = found.func if isinstance(found, partial) else found
+    return is_ours(str(getattr(made, "__module__", None)))
 
 
 def ask(lines: Sequence[str], yes: bool) -> None:
@@ -253,6 +275,7 @@ def write_verification(
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "level": level_of(checks),
+        "bits": not any(check.level == RERUN and not check.run for check in checks),  # false: scores were tested
         "digest": submission.digest,
         "number": None if plan is None else plan.number,
         "cells": [] if plan is None else [run.run for cell in plan.reruns for run in cell.runs],
@@ -342,8 +365,14 @@ def _check(arguments: argparse.Namespace) -> None:
         (is_int(arguments.cells, 1), f"--cells must be an integer >= 1, got {arguments.cells}"),
         (number is None or is_int(number, 0, NUMBERS - 1), f"--number must be in [0, 2**63), got {number}"),
         (code is None or code.is_dir(), f"--code must be a folder, got {code}"),
-        (hours is None or (is_real(hours, 0) and hours > 0), f"--hours must be a number > 0, got {hours}"),
-        *positive(**{"--memory": arguments.memory, "--disk": arguments.disk}),
+        (
+            hours is None or (is_real(hours, 0, MOST_HOURS) and hours > 0),
+            f"--hours must be a number > 0 and at most {MOST_HOURS:,}, got {hours}",
+        ),
+        *(
+            (is_real(value, LEAST_GB, MOST_GB), f"{option} must be in [{LEAST_GB}, {MOST_GB:,}] GB, got {value}")
+            for option, value in (("--memory", arguments.memory), ("--disk", arguments.disk))
+        ),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 from helpers.sweeping import command_line
 
 import curricula
-from ctgraph_rl.board import relearn, rerun, verify
+from ctgraph_rl.board import held_out, relearn, rerun, verify
 from ctgraph_rl.board.held_out import held_out_cells, other_curriculum, seeds_of
 from ctgraph_rl.board.isolate import Limits, Outcome
 from ctgraph_rl.board.relearn import Job, run_dir_of
@@ -104,7 +105,7 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
 
     code, written = call(monkeypatch, tiny_home, folder, "--number=3", "--yes")
 
-    assert (code, written["level"], written["number"]) == (0, "rerun", 3)
+    assert (code, written["level"], written["number"], written["bits"]) == (0, "rerun", 3, True)
     assert sorted(written["cells"]) == ["tiny-seed0", "tiny-seed1"]
     assert len(in_process) == 2
     said = capsys.readouterr()
@@ -299,6 +300,14 @@ def test_runs_of_other_numbers_and_of_more_threads_than_cores_are_refused(tiny_s
         rerun.why_other_bits(tiny_submission, tiny_submission.runs)
 
 
+def test_a_verification_that_compared_scores_says_that_it_compared_no_bits(submission):
+    checks = [Check("score", "", "", True, level="rerun"), Check("log", "", "", True, run="one", level="rerun")]
+
+    assert [
+        json.loads(verify.write_verification(submission, some).read_text())["bits"] for some in (checks, checks[1:])
+    ] == [False, True]
+
+
 def test_a_level_needs_all_checks_and_a_lower_held_out_score_takes_none_away():
     def level(*checks):
         return verify.level_of([Check("", "", "", passed, level=level) for level, passed in checks])
@@ -368,10 +377,53 @@ def test_logs_of_experts_are_compared_and_are_those_of_the_rerun(tiny_home, tiny
     assert "outside the folder of its process" in found(str(tiny_home / "runs" / "tiny-seed0")).failure
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("--memory=1e300", "--memory must be in [0.001, 1,000,000] GB, got 1e+300"),
+        ("--disk=1e-12", "--disk must be in [0.001, 1,000,000] GB, got 1e-12"),
+        ("--hours=1e300", "--hours must be a number > 0 and at most 100,000, got 1e+300"),
+    ],
+)
+def test_limits_out_of_range_are_refused_by_the_names_of_their_options(tmp_path, monkeypatch, capsys, given, said):
+    assert call(monkeypatch, tmp_path, tmp_path, given) == (2, {})
+    assert said in capsys.readouterr().err
+
+
+def test_what_our_modules_import_is_the_code_of_others(tiny_submission):
+    def said(target):
+        config = {**tiny_submission.config, "method": {"_target_": target}}
+        return verify.code_in_words(replace(tiny_submission, config=config))
+
+    assert (
+        verify.code_in_words(tiny_submission)
+        == said("curricula.ct8")
+        == "of this package, as the configuration names it"
+    )
+    for target in ("ctgraph_rl.disk.os.system", "baselines.ppo.torch.load", "baselines.nothing"):
+        assert target in said(target)
+
+
+@pytest.mark.parametrize("is_complete", [True, False])
+def test_a_held_out_log_has_the_evaluations_of_the_protocol(tiny_submission, tmp_path, monkeypatch, is_complete):
+    monkeypatch.setattr(held_out, "score_of", lambda *_: 1.0)
+    (cell,) = held_out_cells(tiny_submission, 5, 1, tmp_path)
+    measurements = tiny_submission.log(tiny_submission.runs[0]).measurements
+    last = max(place for place, each in enumerate(measurements) if each["kind"] == "evaluation")
+    kept = [each for place, each in enumerate(measurements) if is_complete or place != last]
+    log = RunLog.of_content("".join(json.dumps(each) + "\n" for each in kept).encode(), tmp_path)
+    cell = cell._replace(curriculum=tiny_submission.curriculum)
+
+    frames, evaluations, _ = held_out.held_out_checks(tiny_submission, [(cell, rerun.Result(log, "", None))])
+
+    assert (frames.passed, evaluations.passed, evaluations.level) == (True, is_complete, "held_out")
+
+
 def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
     means = verify.Means(None, None, memory=2.0, disk=1.0, paths=())
     (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
 
     assert means.limits(cell) == Limits(600, 2 * 10**9, 10**9)
     assert means.limits(cell._replace(seconds=1000.0)).seconds == 5000
+    assert means.limits(cell._replace(seconds=math.inf)).seconds == 10**5 * 3600
     assert means._replace(hours=0.5).limits(cell).seconds == 1800
