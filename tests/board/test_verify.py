@@ -13,9 +13,7 @@ from types import SimpleNamespace
 import pytest
 from helpers.sweeping import command_line
 
-import curricula
-from ctgraph_rl.board import held_out, relearn, rerun, verify
-from ctgraph_rl.board.held_out import held_out_cells, other_curriculum, seeds_of
+from ctgraph_rl.board import relearn, rerun, verify
 from ctgraph_rl.board.isolate import Limits, Outcome
 from ctgraph_rl.board.relearn import Job, run_dir_of
 from ctgraph_rl.board.rerun import cells_of, draw, result_of
@@ -208,38 +206,6 @@ def test_bits_are_promised_on_one_machine_and_versions_and_named_where_they_are_
     assert rerun.why_other_bits(portable, elsewhere) == []
 
 
-@pytest.mark.parametrize("name", ["ct8", "ct8_md", "dick2020_pair", "su_b1_4images"])
-def test_held_out_images_and_goals_keep_what_tasks_share(name):
-    curriculum = curricula.load(name)
-    other = other_curriculum(curriculum, "key")
-
-    def shared(tasks):
-        pairs = [(one, two) for one in tasks for two in tasks]
-        goals = [[a == b for a, b in zip(one.goal, two.goal, strict=False)] for one, two in pairs]
-        first = [next((place for place, same in enumerate(goal) if not same), len(goal)) for goal in goals]
-        return first, [one.images == two.images for one, two in pairs], [one == two for one, two in pairs]
-
-    assert shared(other.tasks) == shared(curriculum.tasks)
-    assert [task.graph for task in other.tasks] == [task.graph for task in curriculum.tasks]
-    assert not {task.image_seed for task in other.tasks} & ({task.image_seed for task in curriculum.tasks} - {None})
-    assert other.ends == curriculum.ends
-    assert other == other_curriculum(curriculum, "key")
-    assert other != other_curriculum(curriculum, "another key")
-
-
-def test_held_out_seeds_are_neither_submitted_nor_for_tuning(tiny_submission, tmp_path):
-    without = replace(tiny_submission, track=None)
-    for submission in (tiny_submission, without):
-        assert seeds_of(submission, 5, 20) == seeds_of(submission, 5, 20) != seeds_of(submission, 6, 20)
-        assert len(set(seeds_of(submission, 5, 20))) == 20
-        assert min(seeds_of(submission, 5, 20)) >= 10**6
-    one, two = held_out_cells(tiny_submission, 5, 2, tmp_path)
-
-    assert one.curriculum.fingerprint != two.curriculum.fingerprint
-    assert Curriculum.from_json(one.job.curriculum) == one.curriculum
-    assert dict(one.job.config) == dict(tiny_submission.config)
-
-
 def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission, tmp_path, monkeypatch):
     (tmp_path / "waiting_learner.py").write_text(ENTRY)
     monkeypatch.syspath_prepend(tmp_path)
@@ -402,21 +368,6 @@ def test_what_our_modules_import_is_the_code_of_others(tiny_submission):
     )
     for target in ("ctgraph_rl.disk.os.system", "baselines.ppo.torch.load", "baselines.nothing"):
         assert target in said(target)
-
-
-@pytest.mark.parametrize("is_complete", [True, False])
-def test_a_held_out_log_has_the_evaluations_of_the_protocol(tiny_submission, tmp_path, monkeypatch, is_complete):
-    monkeypatch.setattr(held_out, "score_of", lambda *_: 1.0)
-    (cell,) = held_out_cells(tiny_submission, 5, 1, tmp_path)
-    measurements = tiny_submission.log(tiny_submission.runs[0]).measurements
-    last = max(place for place, each in enumerate(measurements) if each["kind"] == "evaluation")
-    kept = [each for place, each in enumerate(measurements) if is_complete or place != last]
-    log = RunLog.of_content("".join(json.dumps(each) + "\n" for each in kept).encode(), tmp_path)
-    cell = cell._replace(curriculum=tiny_submission.curriculum)
-
-    frames, evaluations, _ = held_out.held_out_checks(tiny_submission, [(cell, rerun.Result(log, "", None))])
-
-    assert (frames.passed, evaluations.passed, evaluations.level) == (True, is_complete, "held_out")
 
 
 def test_limits_follow_from_what_the_submitted_run_took(tiny_submission, tmp_path):
