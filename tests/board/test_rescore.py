@@ -170,8 +170,10 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
     words = [str(submission.path), "--level", "rescored", "--config-dir", str(tiny_home / "conf")]
     monkeypatch.setattr(sys, "argv", ["verify", *words])
     verify.main()
-    first = json.loads((submission.path / "verification.json").read_text())
+    text = (submission.path / "verification.json").read_text()
+    first = json.loads(text)
 
+    assert [json.loads(line.rstrip(",")) for line in text.splitlines() if '"what"' in line] == first["checks"]
     assert (first["level"], first["digest"]) == (RESCORED, submission.digest)
     assert (first["versions"], first["machine"]) == (provenance.versions(), provenance.machine()["machine"])
     assert "all passed; level rescored" in capsys.readouterr().out
