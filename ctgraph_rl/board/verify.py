@@ -1,7 +1,8 @@
 """Verify a submission: by its own files, by runs that are trained again, and by seeds, images and goals drawn for it.
 
-rescored: its numbers are what its logs give; no code runs. rerun: drawn runs are trained again and give the same bits.
-held_out: other seeds, images and goals are learned, and the scores are no lower. A level needs those before it.
+rescored: its numbers are what its logs give; no code runs. rerun: drawn runs are trained again and give the same bits,
+or scores that are no lower where bits are not promised. held_out: other seeds, images and goals are learned, and the
+scores are no lower. A level needs those before it.
 """
 
 from __future__ import annotations
