@@ -36,6 +36,9 @@ HEAD = 1040
 ACTOR = 780
 """Bytes of the weights of its actor's head."""
 
+EMBEDDING = 29600
+"""Bytes of the embedding of a task."""
+
 ARXIV = "https://arxiv.org/abs/"
 
 
@@ -53,7 +56,6 @@ METHODS = {
     "reinforce": About("REINFORCE", "https://doi.org/10.1007/BF00992696", 0),
     "ppo_count": About("PPO with a count-based bonus", ARXIV + "1611.04717", 0),
     "lstm_ppo": About("LSTM-PPO", ARXIV + "1707.06347", 0),
-    "dqn": About("DQN", "https://doi.org/10.1038/nature14236", 0),
     "ppo-scratch": About("PPO, a network for each task", None, WEIGHTS),
     "ppo-l2": About("PPO + L2", ARXIV + "1612.00796", HEAD),
     "ppo-ewc": About("PPO + EWC", ARXIV + "1612.00796", HEAD),
@@ -64,6 +66,8 @@ METHODS = {
     "ppo-mask_ri": About("PPO + Mask RI", ARXIV + "2212.11110", WEIGHTS),
     "ppo-mask_lc": About("PPO + Mask LC", ARXIV + "2212.11110", WEIGHTS + 32),
     "ppo-mask_blc": About("PPO + Mask BLC", ARXIV + "2212.11110", WEIGHTS + 32),
+    "ppo-mask_sc": About("PPO + MaskSC", "https://github.com/DMIU-ShELL/MaskSC", WEIGHTS + 32 + EMBEDDING),
+    "ppo-mask_amsc": About("PPO + AMSC", "https://github.com/DMIU-ShELL/AMSC", WEIGHTS + 32 + EMBEDDING),
     "ppo-cka_rl": About("PPO + CKA-RL", ARXIV + "2510.19314", ACTOR),
 }
 """The beginning of the names of runs, and what is submitted of them."""
