@@ -337,8 +337,8 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Result], oth
         run: checks_of(run, submission.log(run), result, submission.experts(run) or () if run.finished else ())
         for run, result in results.items()
     }
-    logs = {run: results[run].log for run, checks in by_run.items() if run.finished and _has_other_bits(checks)}
-    differing = {run: log for run, log in logs.items() if log is not None}
+    others = [run for run, checks in by_run.items() if run.finished and _has_other_bits(checks)]
+    differing = {run: log for run in others if (log := results[run].log) is not None}
     if not other_bits or not differing:
         return [check for checks in by_run.values() for check in checks]
     name = score_name(submission)

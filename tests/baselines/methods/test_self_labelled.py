@@ -177,7 +177,7 @@ def test_known_labels_are_tried_in_turn_then_a_new_one_is_opened_while_there_is_
     trials = [(label, True) for label in (0, 1)]
     assert agent.detector.started == [(0, False), (1, False), *trials, (2, False), *trials, (2, True)]
     agent.learn(given[0])
-    assert (agent.label, agent.home, agent.num_labels) == (2, None, 3)  # no room: the label of before goes on
+    assert (agent.label, agent.home, agent.num_labels) == (2, None, 3)  # no room: the earlier label resumes
 
 
 def test_a_label_acts_with_its_own_weights_while_it_is_tried_and_learns_on_with_them(labelled):
