@@ -12,6 +12,7 @@ from statistics import fmean, pvariance
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
@@ -32,7 +33,8 @@ class ADWIN(Detector):
     A mean that has risen is that of learning. The label keeps number, mean and variance of the returns that were cut
     off. A label on trial is accepted once at least ``num_trial_episodes`` returns have been seen, and their mean
     differs from the kept one by at most ADWIN's own bound at the significance ``delta``. So a label without success is
-    accepted in any task without success. Every label starts with an empty window.
+    accepted in any task without success. Every label starts with an empty window, and an episode that began before it
+    does not count: another label acted in it.
 
     Args:
         delta: significance of a cut.
@@ -78,7 +80,7 @@ class ADWIN(Detector):
 
     def observe(self, seen: Seen) -> Verdict:
         """Give ADWIN the returns of the episodes that ended, or on trial compare them with the kept ones."""
-        ended = seen.episode_return.flatten()[seen.done.flatten()].tolist()
+        ended = self._ended(seen)
         if self.is_trial:
             self.returns.extend(ended)
             return self._accepted()
@@ -90,6 +92,16 @@ class ADWIN(Detector):
         self.window = self._new_window()
         self.returns: list[float] = []
         """In the window, or of the trial."""
+
+        self.is_whole: Tensor | None = None
+        """Whether the present episode of each row began with the label, bool [rows]; None: before the first batch."""
+
+    def _ended(self, seen: Seen) -> list[float]:
+        """Return the returns of the episodes that ended, of those that began with the label, row after row."""
+        before = torch.zeros(len(seen.done), dtype=torch.bool) if self.is_whole is None else self.is_whole
+        is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
+        self.is_whole = is_whole[:, -1].clone()
+        return seen.episode_return[seen.done & is_whole].tolist()
 
     def _falls(self, episode_return: float) -> bool:
         """Add a return to the window; return whether it was cut and its mean has fallen, and then keep the rest."""
@@ -112,16 +124,17 @@ class ADWIN(Detector):
         return self.label if abs(seen.mean - kept.mean) <= bound(kept, seen, self.delta) else None
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what verdicts depend on; 8 bytes for each return in the window."""
+        """Return what verdicts depend on; 8 bytes for each return in the window, 1 for each row."""
         kept = {label: tuple(each) for label, each in self.kept.items()}
         returns = torch.tensor(self.returns, dtype=torch.float64)
-        return {"label": self.label, "is_trial": self.is_trial, "returns": returns, "kept": kept}
+        now = {"label": self.label, "is_trial": self.is_trial, "is_whole": self.is_whole}
+        return {**now, "returns": returns, "kept": kept}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned; the window is made again of its returns."""
         self.start_label(state["label"], state["is_trial"])
         self.kept = {label: Returns(*each) for label, each in state["kept"].items()}
-        self.returns = state["returns"].tolist()
+        self.returns, self.is_whole = state["returns"].tolist(), state.get("is_whole")
         for each in () if self.is_trial else self.returns:
             self.window.update(each)
 

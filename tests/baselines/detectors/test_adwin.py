@@ -71,6 +71,21 @@ def test_a_label_on_trial_is_accepted_where_its_returns_are_back(success, accept
     assert (0 in found) is accepted
 
 
+def test_an_episode_that_another_label_began_counts_for_none():
+    detector = ADWIN(**{**DEFAULTS, "num_trial_episodes": 1})
+    detector.kept[0] = Returns(100, 1.0, 0.0)
+    begins, ends, returns = (torch.zeros(2, 4) for _ in range(3))
+    begins[0, 2] = ends[0, 1] = ends[0, 3] = ends[1, 3] = returns[0, 3] = 1
+    batch = Seen(torch.zeros(2, 4, dtype=torch.int64), returns, begins.bool(), ends.bool(), returns)
+
+    detector.start_label(0, trial=True)
+
+    assert (detector.observe(batch), detector.returns) == (0, [1.0])
+    assert detector.is_whole.tolist() == [True, False]  # the second row's first episode ends with the batch
+    detector.observe(batch._replace(is_init=torch.zeros(2, 4, dtype=torch.bool)))
+    assert detector.returns == [1.0, 0.0, 1.0]
+
+
 def test_after_a_resume_nothing_differs():
     batches = [*episodes(800, 0.9), *episodes(160, 0.1, seed=1)]
     whole, before, after = (ADWIN(**DEFAULTS) for _ in range(3))
