@@ -23,6 +23,7 @@ from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Words
 from ctgraph_rl.core.region import WARM_UP, Region
+from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
 
@@ -108,33 +109,62 @@ def _captured(tasks: Sequence[Task], device: torch.device) -> Run:
 
 def _fused(tasks: Sequence[Task], device: torch.device) -> Run:
     rows, steps, actions = _prepared(tasks, device)
-    rows.reset()
-    step = torch.compile(one_step, fullgraph=True, dynamic=False)
+    step = torch.compile(write_step, fullgraph=True, dynamic=False)
+    draws = torch.compile(dynamics.words_of, fullgraph=True, dynamic=False)
+    params, observation = in_words(rows, steps)
 
     @torch.no_grad()
     def taken(given: dict[Any, Tensor]) -> dict[Any, Tensor]:
-        state, params, uses = RowState(**given), rows.params, rows.uses
-        words = dynamics.words_of(state.tick, params, uses)
+        state, words = tuple(given.values()), draws(given["tick"], params, rows.uses)
         for t in range(NUM_STEPS):
-            outputs = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
-            state, words, shown = step(state, actions[t], words, params, uses)
-            for buffer, value in zip(outputs, shown, strict=True):
-                buffer.copy_(value)
-        return state._asdict()
+            outputs = (observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
+            state, words = step(outputs, state, actions[t], words, params, rows.uses)
+        return dict(zip(given, state, strict=True))
 
     return _replayed(Region(taken), rows, actions)
 
 
-def one_step(
-    state: RowState, action: Tensor, words: Words, params: Any, uses: Any
-) -> tuple[RowState, Words, tuple[Tensor, ...]]:
-    """Take a step of `rollout` by the tensor engine; return states, their draws, and what the step's buffers hold."""
-    state = dynamics.advance(state, action, words, params, uses, absorbing=False)
-    done, reward = dynamics.is_done(state, params.tree), state.reward
-    outcome = dynamics.arrivals(state, done, params)[0]
-    state = dynamics.begin(state, done, params, uses)
-    words = dynamics.words_of(state.tick, params, uses)
-    return state, words, (dynamics.observe(state, words, params, uses), reward, done, outcome)
+def in_words(rows: Rows, steps: Steps) -> tuple[RowParams, Tensor]:
+    """Return the rows' tasks and the buffer of observations, with images as 64-bit words if steps only copy them.
+
+    Returns:
+        The tasks, with a bank of int64 [views, bytes / 8], and the buffer, int64 [steps + 1, N, bytes / 8]; both as
+        they are for images with noise, late rotation or a reward cue, and for those that are not whole words.
+    """
+    params, uses, observation = rows.params, rows.uses, steps.observation
+    bank, buffer = params.bank.flatten(1), observation.flatten(2)
+    if uses.pixel_noise or uses.reward_cue or params.x.taps is not None or bank.shape[1] % 8:
+        return params, observation
+    return params._replace(bank=bank.view(torch.int64)), buffer.view(torch.int64)
+
+
+def write_step(
+    outputs: Sequence[Tensor], state: Sequence[Tensor], action: Tensor, words: Words, params: Any, uses: Any
+) -> tuple[tuple[Tensor, ...], Words]:
+    """Take a step of `rollout` by the tensor engine, and write what it shows into its buffers.
+
+    Compiled, it writes each observation once, where it belongs.
+
+    Args:
+        outputs: the buffers of the next observation, and of the step's reward, done and outcome.
+        state: of the rows, the fields of `RowState`; a plain tuple, as ``torch.compile`` returns no named ones.
+        action: int64 [N].
+        words: the small draws of the present tick.
+        params: the rows' tasks.
+        uses: what the rows have use for.
+
+    Returns:
+        The next states, and their draws.
+    """
+    after = dynamics.advance(RowState(*state), action, words, params, uses, absorbing=False)
+    done, reward = dynamics.is_done(after, params.tree), after.reward
+    outcome = dynamics.arrivals(after, done, params)[0]
+    after = dynamics.begin(after, done, params, uses)
+    words = dynamics.words_of(after.tick, params, uses)
+    shown = (dynamics.observe(after, words, params, uses), reward, done, outcome)
+    for buffer, value in zip(outputs, shown, strict=True):
+        buffer.copy_(value)
+    return tuple(after), words
 
 
 WAYS: dict[str, Callable[[Sequence[Task], torch.device], Run]] = {

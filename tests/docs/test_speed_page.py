@@ -89,14 +89,18 @@ def test_the_ladder_of_a_device_prints_what_it_has_measured_when_it_is_stopped(
 def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
     task, actions = benchmark.configurations()[name], torch.randint(0, 3, (20, 8))
     rows, twin = (Rows([task] * 8, kernel="off") for _ in range(2))
-    steps = rollout(rows, actions, Steps.empty(rows, 20))
+    expected, found = (rollout(rows, actions, Steps.empty(rows, 20)), Steps.empty(twin, 20))
     twin.reset()
 
-    state, words = twin.state, words_of(twin.state.tick, twin.params, twin.uses)
+    params, observation = ladder.in_words(twin, found)
+    state, words = tuple(twin.state), words_of(twin.state.tick, params, twin.uses)
     for t, action in enumerate(actions):
-        state, words, shown = ladder.one_step(state, action, words, twin.params, twin.uses)
-        expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
-        assert all(torch.equal(*pair) for pair in zip(shown, expected, strict=True))
+        outputs = (observation[t + 1], found.reward[t], found.done[t], found.outcome[t])
+        state, words = ladder.write_step(outputs, state, action, words, params, twin.uses)
+
+    assert observation.dtype == (torch.uint8 if "noise" in name else torch.int64)
+    assert torch.equal(found.observation[1:], expected.observation[1:])
+    assert all(torch.equal(getattr(found, key), getattr(expected, key)) for key in ("reward", "done", "outcome"))
 
 
 @pytest.fixture

@@ -79,12 +79,13 @@ def test_compiled_steps_have_the_bits_of_a_cpu():
     steps = rollout(rows, actions, Steps.empty(rows, 20))
     twin = Rows([task] * 256, device="cuda")
     twin.reset()
-    step = torch.compile(ladder.one_step, fullgraph=True, dynamic=False)
+    step = torch.compile(ladder.write_step, fullgraph=True, dynamic=False)
 
-    state, words = twin.state, dynamics.words_of(twin.state.tick, twin.params, twin.uses)
+    state, words = tuple(twin.state), dynamics.words_of(twin.state.tick, twin.params, twin.uses)
     for t, action in enumerate(actions.to("cuda")):
-        state, words, shown = step(state, action, words, twin.params, twin.uses)
         expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
+        shown = [torch.empty_like(each, device="cuda") for each in expected]
+        state, words = step(shown, state, action, words, twin.params, twin.uses)
         assert all(torch.equal(one.cpu(), other) for one, other in zip(shown, expected, strict=True))
 
 
