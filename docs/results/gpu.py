@@ -100,10 +100,7 @@ def section(report: Mapping[str, Any] | None) -> str:
     if report is None:
         return "Not measured: no GPU was at hand.\n"
     about, tests = report["machine"], report.get("tests", {"said": "not run"})
-    torch_version = about["versions"]["torch"]
-    text = (
-        f"Measured on {about['device']}, driver {about['driver']}, torch {torch_version}, commit {report['commit']}.\n"
-    )
+    text = f"Measured on {about['device']}, driver {about['driver']}, commit {report['commit']}.\n"
     text += f"Tests marked `cuda`: {tests['said']}.\n"
     for name, yardstick in {"environment": ladder.COPY, "learning": learning.ENVIRONMENT}.items():
         text += f"\n{ladder.table(report.get(name, []), yardstick)}\n"
