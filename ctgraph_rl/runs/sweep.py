@@ -153,7 +153,8 @@ class Sweeper(Base):
 
         What has changed since one was run is kept, unless all are run again.
 
-        Cells that choose the same files differ in values alone, so only the first of them is composed.
+        Cells that choose the same files and set the same values differ in these alone, so only the first of them is
+        composed.
 
         Raises:
             ValueError: if directories are not named after the configuration.
@@ -162,19 +163,20 @@ class Sweeper(Base):
         assert self.config is not None and self.hydra_context is not None
         subdir = OmegaConf.to_container(self.config.hydra.sweep)["subdir"]  # type: ignore[call-overload,index]
         require((subdir == SUBDIR, f"hydra.sweep.subdir must be {SUBDIR}, got {subdir}; change hydra.sweep.dir"))
-        composed: dict[Overrides, DictConfig] = {}
+        composed: dict[tuple[Overrides, Overrides], DictConfig] = {}
         found: dict[Path, Overrides] = {}
         for overrides in batch:
             values = {setting: self._value(setting) for setting in overrides}
             choices = tuple(setting for setting, value in values.items() if value is None)
-            if choices not in composed:
-                composed[choices] = self._composed(overrides, choices)
+            alike = choices, tuple(key for key, _ in filter(None, values.values()))
+            if alike not in composed:
+                composed[alike] = self._composed(overrides, choices)
             for key, value in filter(None, values.values()):
-                OmegaConf.update(composed[choices], key, value)
-            sweep = composed[choices].hydra.sweep
+                OmegaConf.update(composed[alike], key, value)
+            sweep = composed[alike].hydra.sweep
             folder = Path(sweep.dir).absolute() / sweep.subdir
             if folder not in found and self.config.overwrite is not True:
-                self._compare(composed[choices], folder)
+                self._compare(composed[alike], folder)
             found.setdefault(folder, overrides)
         return found
 

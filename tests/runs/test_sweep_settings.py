@@ -26,7 +26,7 @@ def test_a_setting_that_all_choices_of_a_swept_group_have_is_one_of_all_cells(wh
 
 def test_settings_of_a_variant_change_together(learned, monkeypatch, tmp_path, capsys):
     (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    variants = "[{agent.num_envs: 2, agent.num_steps: 3}, {agent.num_envs: 4, agent.num_steps: 1}]"
+    variants = "[{agent.num_envs: 2, agent.num_steps: 3}, {agent.num_envs: 4, agent.num_steps: 1}, {agent.num_envs: 4}]"
     own = f"# @package _global_\nhydra:\n  sweeper:\n    params: {{seed: 'range(2)'}}\n    variants: {variants}\n"
     (tmp_path / "mine" / "experiment" / "own.yaml").write_text(own)
     chosen = ("--config-dir", str(tmp_path / "mine"), "experiment=own")
@@ -34,7 +34,7 @@ def test_settings_of_a_variant_change_together(learned, monkeypatch, tmp_path, c
     code = sweep(monkeypatch, *chosen)
 
     found = [(each["agent"]["num_envs"], each["agent"]["num_steps"], each["seed"]) for each in configs(learned)]
-    assert (code, found) == (0, [(2, 3, 0), (2, 3, 1), (4, 1, 0), (4, 1, 1)])
+    assert (code, found) == (0, [(2, 3, 0), (2, 3, 1), (4, 1, 0), (4, 1, 1), (4, 32, 0), (4, 32, 1)])
     assert command_line(monkeypatch, *chosen) == 1
     said = capsys.readouterr().err
     assert "is a sweep, seed=range(2) agent.num_envs=... agent.num_steps=...: add -m" in " ".join(said.split())

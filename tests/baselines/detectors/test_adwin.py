@@ -1,17 +1,23 @@
-"""ADWIN on the return: its bound by hand, false alarms, falls and rises, trials, and River's absence."""
+"""ADWIN on the return: its bound by hand, false alarms, falls and rises, trials, a run, and River's absence."""
 
 from __future__ import annotations
 
 import io
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
+from helpers.scripted import ONE, of
+from helpers.small_agents import MINIBATCHES, TINY
+from helpers.with_methods import made
 
 from baselines.catalogue import catalogue
 from baselines.detectors.adwin import ADWIN, Returns, bound
 from baselines.detectors.seen import SUSPICION, Seen
+from ctgraph_rl import Block, RunLog, learn_curriculum
+from ctgraph_rl.runs.train import new_agent
 
 pytest.importorskip("river")
 
@@ -84,6 +90,24 @@ def test_an_episode_that_another_label_began_counts_for_none():
     assert detector.is_whole.tolist() == [True, False]  # the second row's first episode ends with the batch
     detector.observe(batch._replace(is_init=torch.zeros(2, 4, dtype=torch.bool)))
     assert detector.returns == [1.0, 0.0, 1.0]
+
+
+def test_a_run_whose_failures_begin_to_cost_is_rolled_back_and_opens_a_label(compose):
+    settings = ("clock=1", "grace_period=4", "min_window_length=2", "delta=0.5", "patience=32", "snapshot_every=32")
+    detector = made(compose, "detector", "adwin", *(f"detector.{each}" for each in settings))()
+    whole, log = detector.labelling(made(compose, "method", "mask_ri")()), RunLog()
+    curriculum = of(Block(ONE, 128), Block(replace(ONE, fail_reward=-1.0), 128), boundaries="hidden")
+    make_agent = made(compose, "agent", "ppo", *TINY, *MINIBATCHES)
+    agent = new_agent(curriculum, lambda *specs: whole.attach(make_agent(*specs), whole.prepare(curriculum)), 0)
+
+    torch.manual_seed(1)
+    learn_curriculum(curriculum, agent, 7, log)
+
+    assert log.training("acted_label").tolist() == [1, 1, 1, 1, 1, 1, 2, 2]
+    assert log.training("learned").tolist() == [1, 1, 1, 1, 0, 0, 1, 1]
+    assert log.training("alarm").tolist() == [0, 0, 0, 0, 1, 0, 0, 0]
+    assert log.training("rolled_back").tolist() == [0, 0, 0, 0, 32, 0, 0, 0]
+    assert (agent.label, detector.label) == (1, 1) and detector.kept[0].mean > -0.1
 
 
 def test_after_a_resume_nothing_differs():
