@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.catalogue import catalogue
 from baselines.networks import draw
 from baselines.optimisers import capturable
 from baselines.policy_gradient import PolicyGradient, generalized_advantages
@@ -24,12 +25,17 @@ from ctgraph_rl.benchmark.ladder import WAYS, Run, Rung
 from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
+from ctgraph_rl.packages import class_named, conf_dir
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.task import Task
 
 ENVIRONMENT = "environment alone"
 
-TASKS = {"ppo": ("CT-FO-B1", ct_fo_b1((1, 2))), "lstm_ppo": ("CT-SU-B1", ct_su_b1((1, 2)))}
+TASKS = {
+    "ppo": ("CT-FO-B1", ct_fo_b1((1, 2))),
+    "ppo_published": ("CT-FO-B1", ct_fo_b1((1, 2))),
+    "lstm_ppo": ("CT-SU-B1", ct_su_b1((1, 2))),
+}
 
 GOALS = {"ppo": 10e6, "lstm_ppo": 1e6}
 """Environment steps a second that one agent shall learn from."""
@@ -49,13 +55,13 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
 
     Args:
         device: where environment and agents live.
-        num_rows: environments of one agent.
+        num_rows: environments of one agent, of those with a goal.
         num_seeds: agents that learn as one job, each with the environments of its yaml file.
     """
     for name, (label, task) in TASKS.items():
         ways: dict[str, dict[str, bool]] = {"step by step": {"captured": False}, "captured": {}}
         ways |= {"compiled and captured": {"compile": True}} if name == "ppo" else {}
-        for n in num_rows:
+        for n in num_rows if name in GOALS else ():
             yield Rung(ENVIRONMENT, label, n, partial(WAYS["rollout, captured"], [task] * n, device))
             for way, how in ways.items():
                 yield Rung(f"{name}, {way}", label, n, partial(learning, name, task, n, device, **how), GOALS[name])
@@ -66,14 +72,18 @@ def rungs(device: torch.device, num_rows: Sequence[int], num_seeds: Sequence[int
 
 
 def settings(name: str) -> dict[str, Any]:
-    """Return the hyperparameters of an agent's yaml file."""
-    return next(entry.settings for entry in catalogue("agent") if entry.name == name)
+    """Return what an agent's yaml file says, over what the files say that it starts from."""
+    own = yaml.safe_load(Path(conf_dir(), "agent", f"{name}.yaml").read_text(encoding="utf-8"))
+    before = [settings(other) for other in own.pop("defaults", []) if other != "_self_"]
+    return {key: value for each in (*before, own) for key, value in each.items()}
 
 
 def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
     """Return an agent on the CPU, with the hyperparameters of its yaml file and changes of them."""
-    kind = next(entry.kind for entry in catalogue("agent") if entry.name == name)
-    return kind(*specs_of([task]), **{**settings(name), **changes})
+    values = {**settings(name), **changes}
+    module, _, name = values.pop("_target_").rpartition(".")
+    kind: Any = class_named(module, name)
+    return kind(*specs_of([task]), **values)
 
 
 def learning(

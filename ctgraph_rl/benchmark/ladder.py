@@ -118,7 +118,7 @@ def _fused(tasks: Sequence[Task], device: torch.device) -> Run:
         state, words = tuple(given.values()), draws(given["tick"], params, rows.uses)
         for t in range(NUM_STEPS):
             outputs = (observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
-            state, words = step(outputs, state, actions[t], words, params, rows.uses)
+            state, words = step(outputs, state, actions[t], words, params=params, uses=rows.uses)
         return dict(zip(given, state, strict=True))
 
     return _replayed(Region(taken), rows, actions)

@@ -91,7 +91,12 @@ def splitmix64(start: Tensor, count: int) -> Tensor:
     Returns:
         int64 [..., count], all 64 bits random.
     """
-    z = start.unsqueeze(-1) + _GOLDEN * torch.arange(1, count + 1, device=start.device)
+    return splitmix64_at(start.unsqueeze(-1), torch.arange(count, device=start.device))
+
+
+def splitmix64_at(start: Tensor, place: Tensor) -> Tensor:
+    """The number of `splitmix64` at a place in its sequence; int64 tensors of shapes that broadcast."""
+    z = start + _GOLDEN * (place + 1)
     z.bitwise_xor_((z >> 30).bitwise_and_(0x3FFFFFFFF)).mul_(_MIX[0])
     z.bitwise_xor_((z >> 27).bitwise_and_(0x1FFFFFFFFF)).mul_(_MIX[1])
     return z.bitwise_xor_((z >> 31).bitwise_and_(0x1FFFFFFFF))

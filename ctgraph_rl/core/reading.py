@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.core import kernel
-from ctgraph_rl.core.philox import STREAM_NOISE, draw, splitmix64
+from ctgraph_rl.core.philox import STREAM_NOISE, draw, splitmix64, splitmix64_at
 
 
 def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
@@ -26,7 +26,9 @@ def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     Returns:
         uint8 [N, 1, r, r].
     """
-    return _opaque(images, start, read_noise) if torch.compiler.is_compiling() else _added(images, start, read_noise)
+    if not torch.compiler.is_compiling():
+        return _added(images, start, read_noise)
+    return by_pixel(images, start, read_noise) if images.is_cuda else _opaque(images, start, read_noise)
 
 
 _NOISE_ROWS = 4096  # as many rows at once keep the work in the cache
@@ -55,8 +57,15 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     return add_saturating(images, noise.view_as(images))
 
 
-# Inductor of torch 2.13 writes beyond its buffers when it fuses the noise with what comes before it. As an operator of
-# its own it stays whole.
+def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
+    """`add_noise` where each pixel draws its number by itself: more arithmetic, and one kernel where it is compiled."""
+    pixel, high = torch.arange(images[0].numel(), device=images.device), (read_noise + 1).long().unsqueeze(-1)
+    bits = (splitmix64_at(start.unsqueeze(-1), pixel // 4) >> pixel % 4 * 16) & 0xFFFF
+    return add_saturating(images, (bits * high >> 16).to(torch.uint8).view_as(images))
+
+
+# Inductor of torch 2.13 writes beyond its buffers on a CPU when it fuses `noisy` with what comes before it, and in C++
+# numbers of `by_pixel` may not leave the range of int64. As an operator of its own the noise stays whole there.
 _opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
 

@@ -36,7 +36,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--minutes", type=float, default=28.0, help="of all parts; the tests have at most a third")
     parser.add_argument("--seconds", type=float, default=1.0, help="least time of a measurement")
     parser.add_argument("--rows", type=int, nargs="+", default=[65536, 262144], help="of the environment")
-    parser.add_argument("--envs", type=int, nargs="+", default=[4096, 65536], help="of one agent")
+    parser.add_argument("--envs", type=int, nargs="+", default=[256, 4096, 65536], help="of one agent")
     parser.add_argument("--together", type=int, nargs="+", default=[64, 1024], help="seeds of one job")
     options = parser.parse_args(arguments)
     if torch.cuda.is_available():

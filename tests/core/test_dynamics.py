@@ -16,7 +16,7 @@ from ctgraph_rl.core.philox import (
     randint,
     splitmix64,
 )
-from ctgraph_rl.core.reading import _NOISE_ROWS, add_noise, by_parts
+from ctgraph_rl.core.reading import _NOISE_ROWS, add_noise, by_parts, by_pixel
 from ctgraph_rl.core.tree import State, stays, transition
 from ctgraph_rl.core.tree import tree_params as make_tree
 
@@ -264,7 +264,7 @@ def test_splitmix64_equals_plain_python_for_any_start():
         assert [number % 2**64 for number in numbers] == list(islice(splitmix64_in_python(start % 2**64), 40))
 
 
-@pytest.mark.parametrize("add_noise", [add_noise, by_parts])
+@pytest.mark.parametrize("add_noise", [add_noise, by_parts, by_pixel])
 def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence(add_noise):
     images = torch.zeros(2, 1, 9, 9, dtype=torch.uint8)
     words = draw(torch.tensor(9), torch.tensor([4, 5]), torch.tensor([6, 7]), STREAM_NOISE)
@@ -280,7 +280,7 @@ def test_noise_gives_every_pixel_sixteen_bits_of_the_observations_own_sequence(a
     assert noise.flatten(1).tolist() == expected
 
 
-@pytest.mark.parametrize("add_noise", [add_noise, by_parts])
+@pytest.mark.parametrize("add_noise", [add_noise, by_parts, by_pixel])
 def test_noise_of_many_rows_is_that_of_each_part_of_them(add_noise):
     n = 2 * _NOISE_ROWS + 3
     images = torch.zeros(n, 1, 4, 4, dtype=torch.uint8)

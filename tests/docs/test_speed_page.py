@@ -96,7 +96,7 @@ def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
     state, words = tuple(twin.state), words_of(twin.state.tick, params, twin.uses)
     for t, action in enumerate(actions):
         outputs = (observation[t + 1], found.reward[t], found.done[t], found.outcome[t])
-        state, words = ladder.write_step(outputs, state, action, words, params, twin.uses)
+        state, words = ladder.write_step(outputs, state, action, words, params=params, uses=twin.uses)
 
     assert observation.dtype == (torch.uint8 if "noise" in name else torch.int64)
     assert torch.equal(found.observation[1:], expected.observation[1:])

@@ -85,7 +85,7 @@ def test_compiled_steps_have_the_bits_of_a_cpu():
     for t, action in enumerate(actions.to("cuda")):
         expected = (steps.observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
         shown = [torch.empty_like(each, device="cuda") for each in expected]
-        state, words = step(shown, state, action, words, twin.params, twin.uses)
+        state, words = step(shown, state, action, words, params=twin.params, uses=twin.uses)
         assert all(torch.equal(one.cpu(), other) for one, other in zip(shown, expected, strict=True))
 
 
