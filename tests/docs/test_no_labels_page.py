@@ -1,0 +1,134 @@
+"""docs/results/no_labels.md: made from the raw results beside it, and what it says of them holds."""
+
+from __future__ import annotations
+
+import sys
+from itertools import pairwise
+
+import pytest
+import torch
+from helpers.paths import CHECKOUT
+
+from ctgraph_rl.metrics.labels import PER, Labelling, adjusted_rand_index, detection_delay
+
+FOLDER = CHECKOUT / "docs" / "results"
+PAGE = " ".join((FOLDER / "no_labels.md").read_text(encoding="utf-8").split())
+
+RUN = ("curriculum", "stay", "detector", "method", "num_fresh", "boundaries", "seed")
+
+
+@pytest.fixture(scope="module")
+def made():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(FOLDER))
+        yield __import__("no_labels")
+        for name in ("no_labels", "pairs", "comparison", "raw"):
+            sys.modules.pop(name, None)
+
+
+def labelling(spans, num_tasks):
+    """Return the labels of a run by its spans, cut where the task changes."""
+    rows = []
+    for span in spans:
+        start, end, stay = (int(span[key]) for key in ("start", "end", "stay"))
+        cuts = [start, *(cut for cut in range(stay, end, stay) if cut > start), end]
+        for first, last in pairwise(cuts):
+            alarm = span["alarm"] == "True" and last == end
+            rows.append(
+                (int(span["label"]), first // stay % num_tasks, last - first, span["learned"] == "True", alarm, 0)
+            )
+    return Labelling(*map(torch.tensor, zip(*rows, strict=True)))
+
+
+def test_the_page_is_what_its_raw_results_make(made):
+    assert made.page() == (FOLDER / "no_labels.md").read_text(encoding="utf-8")
+
+
+def test_each_run_is_one_line_and_its_metrics_are_those_of_its_spans(made):
+    lines = made.read(made.NAME)
+    spans = made.groups(made.read(made.SPANS), *RUN)
+
+    assert len({tuple(line[key] for key in RUN) for line in lines}) == len(lines)
+    assert set(spans) == {tuple(line[key] for key in RUN) for line in lines if line["detector"]}
+    for line in (line for line in lines if line["detector"]):
+        run = labelling(spans[tuple(line[key] for key in RUN)], 2 if line["curriculum"] == "dick2020_pair" else 4)
+        delays, frames, tasks = detection_delay(run).terms, int(run.frames.sum()), len(run.task.unique())
+        found = sum(delay is not None for delay in delays)
+
+        assert frames == int(line["frames"])
+        assert line["delays"] == " ".join("-" if delay is None else f"{delay:.0f}" for delay in delays)
+        assert float(line["false_alarms"]) == pytest.approx(PER * (int(run.alarm.sum()) - found) / frames, abs=1e-6)
+        assert float(line["label_agreement"]) == pytest.approx(adjusted_rand_index(*run[:3]), abs=1e-6)
+        assert float(line["labels_per_task"]) == len(run.acted[run.learned].unique()) / tasks
+        assert float(line["frames_not_learned"]) == int(run.frames[~run.learned].sum())
+
+
+def value(lines, name):
+    """Return the mean of a metric over seeds as the page shows it."""
+    return f"{sum(map(float, (line[name] for line in lines))) / len(lines):.2f}"
+
+
+@pytest.fixture(scope="module")
+def masks(made):
+    """The runs on four goals that come twice, by learner."""
+    return made.finished()[made.MASKS, "384000"]
+
+
+def test_what_masks_end_with_and_what_labels_cost_is_computed_from_the_raw_results(made, masks):
+    end = {name: value(lines, "average_performance") for name, lines in masks.items()}
+    online = {name: value(lines, "online_return") for name, lines in masks.items()}
+    not_learned, undone = (
+        sum(float(line[key]) for line in masks["adwin"]) / sum(float(line["frames"]) for line in masks["adwin"])
+        for key in ("frames_not_learned", "frames_rolled_back")
+    )
+
+    assert {line["final_returns"] for name in ("adwin", "announced") for line in masks[name]} == {"1 1 1 1"}
+    assert "end with a return of 1 on all goals in all five seeds, as masks with announced tasks do." in PAGE
+    assert f"With SWOKS they end at {end['swoks, fresh']}, and fine-tuning ends at {end['none']}." in PAGE
+    assert f"ADWIN's online return is {online['adwin']}, that with announced tasks {online['announced']}." in PAGE
+    assert (round(not_learned, 1), f"{undone:.0%}") == (0.2, "14%")
+    assert "A fifth of the frames is not learned from, and the learning of 14 % is undone." in PAGE
+    assert [line["final_returns"] for line in masks["oracle"]] == ["1 1 1 1"] * 3 + ["1 1 -0.1 1"] + ["1 1 1 1"]
+    assert "In seed 3 this changed the greedy policy of goal 1.2 from a return of 1 to one of -0.1" in PAGE
+
+
+def test_found_changes_and_other_alarms_are_counted_from_the_spans(made, masks):
+    adwin, swoks = masks["adwin"], masks["swoks, fresh"]
+    others = {name: [float(span["return_before"]) for span in made.alarms(masks[name])] for name in masks}
+    high = {name: sum(each >= 0.9 for each in returns) for name, returns in others.items()}
+
+    found = [delay for delay in made.delays(adwin) if delay == delay]
+    spans = made.groups(made.read(made.SPANS), *RUN)
+    missed = [
+        (line, 384_000 * place)
+        for line in adwin
+        for place, delay in enumerate(line["delays"].split(), 1)
+        if delay == "-"
+    ]
+    for line, change in missed:
+        [within] = [s for s in spans[tuple(line[k] for k in RUN)] if int(s["start"]) < change < int(s["end"])]
+        assert within["learned"] == "False"
+
+    assert (len(found), len(missed), max(found)) == (31, 4, 9216)
+    assert "*ADWIN* has an alarm within 9,216 frames of 31 of the 35 changes. The other four came while labels" in PAGE
+    assert high["adwin"] == len(others["adwin"]) == 16 and "All its 16 other alarms came while the return" in PAGE
+    assert sorted(line["labels_per_task"] for line in adwin) == ["1.0"] * 4 + ["1.25"]
+    assert f"SWOKS finds {made.soon(swoks)} of 35 changes within 65,536 frames" in PAGE
+    assert f"{high['swoks, fresh']} of its {len(others['swoks, fresh'])} other alarms come while the return" in PAGE
+    second = next(span for span in spans[tuple(swoks[1][key] for key in RUN)] if int(span["end"]) > 442_368)
+    assert (second["start"], second["label"], second["learned"]) == ("442368", "1", "True")
+    assert f"label 1 was accepted {442_368 - 384_000:,} frames after the first change" in PAGE
+    assert f"of the 35 changes, none of which the images show, {made.soon(swoks)} had an alarm" in PAGE
+
+
+def test_amd_finds_the_changed_transition_and_forgets_nothing(made):
+    pair = made.finished()[made.PAIR, "51200"]
+
+    assert [
+        (line["delays"], line["false_alarms"], line["labels_per_task"], line["final_returns"]) for line in pair["amd"]
+    ] == [("14336", "0.0", "1.0", "1 1")] * 5
+    for name in ("swoks", "adwin"):
+        assert {line["delays"] for line in pair[name]} == {"6144"}  # to the end of the batch, at 57,344
+        assert {(line["frames_rolled_back"], line["final_returns"]) for line in pair[name]} == {("49152.0", "0 0")}
+    assert "one alarm in each of five seeds, 14,336 frames after the change" in PAGE
+    assert "so that all 49,152 frames that were learned from are undone" in PAGE
