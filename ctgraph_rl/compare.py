@@ -29,7 +29,7 @@ BOUND = 1e-4
 EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
 """Exit codes."""
 
-TOGETHER = "seeds trained together"
+TOGETHER, EXPERTS_TOGETHER = "seeds trained together", "seeds of experts trained together"
 
 PARTS = {
     "curriculum": ("curriculum", "version", "fingerprint", "source", "tasks", "trained"),
@@ -61,14 +61,39 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     """
     logs = [_log(path) for path in (one, other)]
     first = [log.measurements[0] for log in logs]
-    found = [list(map(without_time, log.measurements[1:])) for log in logs]
+    found = [list(map(_measured, log.measurements[1:])) for log in logs]
     code, verdict = _verdict(found, bound)
     weights = _weights(one, other)
     if code == EQUAL and weights.startswith("different"):
         code, verdict = DIFFERENT, "different: all measurements are equal, the agents' weights are not"
     torn = [path for path, log in zip((one, other), logs, strict=True) if log.torn_lines]
     notes = [f"note: the last line of {path / LOG} is torn and not compared" for path in torn]
-    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *notes])
+    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *_groups_of_experts(*logs), *notes])
+
+
+def _measured(line: Line) -> Line:
+    """Return what was measured, without the time and the seeds that experts were trained with."""
+    line = without_time(line)
+    if line["kind"] != "experts" or not isinstance(line.get("experts"), list):
+        return line
+    alone = [{**each, "together": None} if isinstance(each, dict) else each for each in line["experts"]]
+    return {**line, "experts": alone}
+
+
+def _groups_of_experts(*logs: RunLog) -> list[str]:
+    """Return a line on the seeds that single-task experts were trained with, if there are groups."""
+    one, other = (
+        {
+            f"task {each.get('task')}": each.get("together")
+            for line in log.of_kind("experts")
+            for each in line.get("experts", ())
+            if isinstance(each, dict)
+        }
+        for log in logs
+    )
+    if not any((*one.values(), *other.values())):
+        return []
+    return [f"{EXPERTS_TOGETHER}: {'equal' if one == other else 'different, ' + _changes(one, other)}"]
 
 
 def _log(path: Path) -> RunLog:

@@ -23,8 +23,8 @@ from ctgraph_rl.report import results
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.runs.config import write_configuration
 from ctgraph_rl.runs.experts import find_or_train
-from ctgraph_rl.runs.job import marked_if_it_fails
 from ctgraph_rl.runs.load import load
+from ctgraph_rl.runs.status import marked_if_it_fails
 from ctgraph_rl.runs.trackers import Tracker, csv_logger
 
 WRITING = {
@@ -170,13 +170,14 @@ def new_tracker(run_dir: Path) -> None:
 
 
 def experts_of(run_dir: Path) -> None:
-    find_or_train(curricula.load("ct2_interfering"), lambda *_: None, run_dir.parent, {}, print)
+    find_or_train(curricula.load("ct2_interfering"), lambda *_: {}, run_dir.parent, {0: {}}, print)
 
 
 def expert_dir(folder: Path) -> str:
     """The name that an expert's directory has."""
     made: list[Path] = []
-    find_or_train(curricula.load("ct2_interfering"), lambda _, path: made.append(path), folder / "x", {}, print)
+    learn = lambda _, run_dirs: made.extend(run_dirs.values()) or {}  # noqa: E731
+    find_or_train(curricula.load("ct2_interfering"), learn, folder / "x", {0: {}}, print)
     return f"../{made[0].name}"
 
 

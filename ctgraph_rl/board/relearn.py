@@ -20,7 +20,7 @@ from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import run_job
 from ctgraph_rl.runs.settings import with_added
-from ctgraph_rl.runs.together import run_as_one
+from ctgraph_rl.runs.together import learn_experts, run_as_one
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -33,6 +33,7 @@ class Job(NamedTuple):
     num_threads: int
     entry_point: str | None  # module:function of a learner that is not ours
     curriculum: str | None  # file of what it learns; None: what the configuration says
+    experts: Sequence[tuple[int, Sequence[int]]] = ()  # learned first: task from 1, and seeds whose experts are a batch
 
     def write(self, path: Path) -> None:
         """Write the job to a file."""
@@ -63,6 +64,8 @@ def learn_again(job: Job, folder: Path) -> None:
     runs = [(configuration(_settings(job, seed)), run_dir) for seed, run_dir in zip(job.seeds, run_dirs, strict=True)]
     for run_dir in run_dirs:
         run_dir.mkdir(exist_ok=True)
+    for task, seeds in job.experts:
+        learn_experts([configuration(_settings(job, seed)) for seed in seeds], task)
     if job.together:
         run_as_one(runs)
     else:

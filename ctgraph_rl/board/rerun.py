@@ -1,7 +1,8 @@
 """Level *rerun* of a verification: drawn runs are trained again, in processes of their own, and compared bit by bit.
 
 No one knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
-the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group.
+the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group,
+and so are single-task experts.
 """
 
 from __future__ import annotations
@@ -126,8 +127,20 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
 def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> Cell:
     """Return what is learned again for the seeds of a group, or for one that was alone."""
     runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
-    job = job_of(submission, seeds, runs[0])
+    job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
     return Cell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))
+
+
+def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
+    """Return the tasks of the single-task experts of finished runs, from 1, each with the seeds that were one batch."""
+    found: dict[tuple[int, tuple[int, ...]], None] = {}
+    for run in runs:
+        for each in experts_of(submission.log(run)) if run.finished else ():
+            seeds = each.get("together", [run.seed])
+            known = isinstance(seeds, list) and all(is_int(seed, 0) for seed in seeds)
+            require((known, f"the log of {run.run} has an expert with odd seeds, {seeds!r:.80}: restore it"))
+            found[each["task"], tuple(seeds)] = None
+    return tuple(found)
 
 
 def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, curriculum: Path | None = None) -> Job:

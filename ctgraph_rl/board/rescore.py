@@ -144,9 +144,10 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
-        said = [each.get("fingerprint") for each in experts_of(log)]
-        alone = [expert.of_kind("run")[0].get("fingerprint") for expert in submission.experts(run) or ()]
-        yield equal("curricula of experts", said, alone, run.run)
+        said, alone = experts_of(log), [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
+        for what, key in [("curricula", "fingerprint"), *([("groups", "together")] if said else [])]:
+            expected, found = ([each.get(key) for each in some] for some in (said, alone))
+            yield equal(f"{what} of experts", expected, found, run.run)
         yield from of_the_protocol(submission, run, log)
 
 

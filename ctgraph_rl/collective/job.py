@@ -23,7 +23,8 @@ from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.runs import config, together
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished, marked_if_it_fails
+from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished
+from ctgraph_rl.runs.status import marked_if_it_fails
 from ctgraph_rl.runs.train import RunDirectory
 
 Runs = Sequence[tuple[Any, Path]]

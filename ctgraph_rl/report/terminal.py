@@ -233,7 +233,10 @@ def group_size(run: Run) -> int:
 
 
 def code_notes(runs: Sequence[Run]) -> list[str]:
-    """Return sentences on runs of an older numbers version, of unknown source, and of groups where others are not."""
+    """Return sentences on runs of an older numbers version, of unknown source, and of groups where others are not.
+
+    Groups are those of runs, and those of the single-task experts that they are compared with.
+    """
     older = [run for run in runs if run.code["numbers version"] < NUMBERS]
     unknown = [run for run in runs if None in run.code.values()]
     versions = ", ".join(sorted({str(run.code["numbers version"]) for run in older}))
@@ -243,6 +246,10 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
     for size in sorted({*sizes} - {1}) if len({*sizes}) > 1 else ():
         of_size = [run for run in runs if group_size(run) == size]
         found.append((of_size, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
+    experts = [run.history.experts_together for run in runs if run.history is not None]
+    if {True, False} <= {each for of_run in experts for each in of_run}:
+        some = [run for run in runs if run.history is not None and any(run.history.experts_together)]
+        found.append((some, "compared with experts of seeds trained together; those differ from others by rounding"))
     return [f"{len(some)} of {len(runs)} runs are {what}" for some, what in found if some]
 
 

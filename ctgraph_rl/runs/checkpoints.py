@@ -117,6 +117,12 @@ class Checkpoints:
         require_no_link(self.folder)
         return sorted((file for file in self.folder.glob("*.pt") if file.stem.isdecimal()), key=_frames, reverse=True)
 
+    @property
+    def newest_frames(self) -> int | None:
+        """Frames after which the newest was made; None without one."""
+        files = self.files()
+        return _frames(files[0]) if files else None
+
     def newest(self) -> State | None:
         """Return the newest sound checkpoint, None without one; warn of a broken one and skip it.
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,12 +20,18 @@ from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
 from ctgraph_rl.tasks.task import Task
 
-Learn = Callable[[Curriculum, Path], None]
-"""Learns a curriculum into a directory, or resumes what was begun there."""
+RunDirs = Mapping[int, Path]
+"""The directory of each seed."""
 
+Failures = dict[int, FloatingPointError]
+"""The error of each seed that failed."""
+
+Learn = Callable[[Curriculum, RunDirs], Failures]
+"""Lets seeds learn a curriculum as one batch, or resumes what they began as one."""
 
 EXPERT = "single-task expert"
 """The name of their curricula."""
@@ -39,8 +46,10 @@ class Expert(NamedTuple):
 
     @property
     def about(self) -> dict[str, Any]:
-        """Plain values for the log."""
-        return {"task": self.task, "fingerprint": self.fingerprint, "run": str(self.run_dir)}
+        """Plain values for the log; ``together`` where it was trained in a group of seeds."""
+        together = begun_with(self.run_dir)
+        group = {"together": together} if together else {}
+        return {"task": self.task, "fingerprint": self.fingerprint, "run": str(self.run_dir), **group}
 
     @property
     def log(self) -> RunLog:
@@ -82,45 +91,99 @@ def find_or_train(
     curriculum: Curriculum,
     learn: Learn,
     folder: Path,
-    settings: Mapping[str, Any],
+    settings: Mapping[int, Mapping[str, Any]],
     tell: Callable[[str], object],
+    *,
     waiting: Callable[[], object] = lambda: None,
-) -> list[Expert]:
-    """Return the experts of all tasks of a curriculum; those that the folder lacks are trained first.
+    only: int | None = None,
+) -> tuple[dict[int, list[Expert]], Failures]:
+    """Return each seed's experts of all tasks of a curriculum; those that the folder lacks are trained first.
+
+    The experts of a task are trained as one batch, those of all seeds that have not begun theirs.
 
     Args:
         curriculum: has the tasks.
-        learn: trains one, or resumes its training.
+        learn: trains the experts of a task, or resumes their training.
         folder: where experts are kept, each under a hash of its curriculum's fingerprint and the settings.
-        settings: all else that an expert's numbers depend on: agent, seed, versions.
+        settings: for each seed all else that its experts' numbers depend on: agent, seed, versions.
         tell: is given a line about each expert.
         waiting: called every half second while another process trains one that is needed here.
+        only: the position of the one task whose experts are needed, from 1; None: all.
+
+    Returns:
+        The experts of each seed, and the error of each seed with an expert that failed, which then has none.
 
     Raises:
         ValueError: before any training, for a block with several tasks.
     """
-    alone = [expert_curriculum(curriculum, task) for task in curriculum.tasks]
-    names = [directory_name(each, settings) for each in alone]
-    experts = [
-        Expert(i, each.fingerprint, folder / name) for i, (each, name) in enumerate(zip(alone, names, strict=True), 1)
+    alone = {i: expert_curriculum(curriculum, task) for i, task in enumerate(curriculum.tasks, 1)}
+    wanted = [*alone] if only is None else [only]
+    found = {
+        seed: [Expert(i, alone[i].fingerprint, folder / directory_name(alone[i], own)) for i in wanted]
+        for seed, own in settings.items()
+    }
+    failed: Failures = {}
+    for place, i in enumerate(wanted):
+        what = f"expert {i} of {len(alone)}, {curriculum.labels[i - 1]}"
+        run_dirs = {seed: experts[place].run_dir for seed, experts in found.items() if seed not in failed}
+        left = _left(run_dirs, what, tell)
+        errors = _train(alone[i], learn, left, waiting)
+        failed |= {seed: FloatingPointError(f"{what}: {error}") for seed, error in errors.items()}
+    return {seed: experts for seed, experts in found.items() if seed not in failed}, failed
+
+
+def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[int, Path]:
+    """Return those that are not trained, and tell of each."""
+    left = {seed: run_dir for seed, run_dir in run_dirs.items() if not _is_trained(run_dir)}
+    for seed, run_dir in run_dirs.items():
+        of_seed = f" of seed {seed}" if len(run_dirs) > 1 else ""
+        tell(f"{what}{of_seed}: {'learns into' if seed in left else 'found in'} {run_dir}")
+        if seed not in left:
+            shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was stopped at its very end
+    return left
+
+
+def _train(curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Callable[[], object]) -> Failures:
+    """Train into directories, or resume what was begun there; wait while other processes train into them."""
+    failed: Failures = {}
+    with ExitStack() as stack:
+        for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
+            stack.enter_context(locked(made_folder(run_dir), waiting))
+        left = {seed: run_dir for seed, run_dir in run_dirs.items() if not _is_trained(run_dir)}
+        for group in _groups(curriculum, left):
+            failed |= learn(curriculum, group)
+    return failed
+
+
+def _groups(curriculum: Curriculum, run_dirs: RunDirs) -> list[RunDirs]:
+    """Divide seeds into those that are trained as one batch: those that were begun so, and all that begin.
+
+    Where a group was begun of which some are not here, the others begin again, unless they have learned all.
+    """
+    begun: dict[tuple[int, ...], dict[int, int]] = {}
+    for seed, run_dir in run_dirs.items():
+        frames = Checkpoints(run_dir / CHECKPOINTS).newest_frames
+        if frames is not None:
+            begun.setdefault(tuple(begun_with(run_dir)) or (seed,), {})[seed] = frames
+    resumed: list[RunDirs] = [
+        {seed: run_dirs[seed] for seed in group if seed in frames}
+        for group, frames in begun.items()
+        if {*frames} == {*group} or {*frames.values()} == {curriculum.num_frames}
     ]
-    for expert, each, label in zip(experts, alone, curriculum.labels, strict=True):
-        found = _is_trained(expert.run_dir)
-        state = "found in" if found else "learns into"
-        tell(f"expert {expert.task} of {len(experts)}, {label}: {state} {expert.run_dir}")
-        if found:
-            shutil.rmtree(expert.run_dir / CHECKPOINTS, ignore_errors=True)  # if it was stopped at its very end
-        else:
-            _train(each, learn, expert.run_dir, waiting)
-    return experts
+    new = {seed: run_dir for seed, run_dir in run_dirs.items() if not any(seed in group for group in resumed)}
+    for run_dir in new.values():
+        shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)
+    return [*resumed, new] if new else resumed
 
 
-def _train(curriculum: Curriculum, learn: Learn, run_dir: Path, waiting: Callable[[], object]) -> None:
-    """Train into the directory, or resume what was begun there; wait while another process trains into it."""
-    made_folder(run_dir)
-    with locked(run_dir, waiting):
-        if not _is_trained(run_dir):
-            learn(curriculum, run_dir)
+def is_of_group(run_dir: Path) -> bool:
+    """Return whether a run was stopped that was begun in a group of seeds, and can only be resumed as one."""
+    return bool(begun_with(run_dir)) and Checkpoints(run_dir / CHECKPOINTS).newest_frames is not None
+
+
+def begun_with(run_dir: Path) -> list[int]:
+    """Return the seeds with which a run was begun as one batch; none if it was begun alone, or not at all."""
+    return list((RunLog.begun(run_dir / LOG) or {}).get("together", ()))
 
 
 def _is_trained(run_dir: Path) -> bool:

@@ -79,12 +79,18 @@ def _acts(number: int) -> bool:
 
 def _is_being_ended() -> bool:
     """Return whether SLURM already ends this process's job: for good, as by ``scancel``, which a requeue would undo."""
-    command = ["scontrol", "show", "job", os.environ.get("SLURM_JOB_ID", "")]
+    command = ["scontrol", "show", "job", _job()]
     try:
         shown = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout
     except (OSError, subprocess.TimeoutExpired):
         return False
     return "JobState=COMPLETING" in shown or "JobState=CANCELLED" in shown
+
+
+def _job() -> str:
+    """Return SLURM's name for the job of this process; in an array one task's number would name all its tasks."""
+    names = [os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")]
+    return "_".join(names) if all(names) else os.environ.get("SLURM_JOB_ID", "")
 
 
 def _requeuing() -> int:

@@ -19,19 +19,19 @@ from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
-from ctgraph_rl.disk import is_writable, write_whole
+from ctgraph_rl.disk import is_writable
 from ctgraph_rl.log.damage import damaged
-from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, FAILURE, LOG, METRICS, locked
+from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.sums import RESULTS
 from ctgraph_rl.portable import hold
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.runs.experts import Expert, expert_curriculum, find_or_train
+from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, expert_curriculum, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
-from ctgraph_rl.runs.status import holds_results
+from ctgraph_rl.runs.status import holds_results, marked_if_it_fails
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -73,24 +73,26 @@ class Job:
         prepare_torch(cfg)
         make_method, make_alone = method_of(cfg), config.target(cfg, "agent")
         curriculum = curriculum_of(cfg, make_method())
-        if cfg.experts:
-            _check_experts(curriculum, make_alone, cfg.seed)
+        for task in curriculum.tasks if cfg.experts else ():  # what an agent cannot learn alone is refused first
+            new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
         agent = new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, device)
         return cls(cfg, curriculum, agent, make_alone, device=device, interrupt=interrupt)
 
     def learn(self, run_dir: Path) -> None:
         """Learn into a directory; the single-task experts first, where the configuration asks for them."""
         with self.prepared(run_dir) as where:
-            more = {"experts": where.experts, "listeners": where.listeners}
-            self._train(self.curriculum, self.agent, run_dir, where.config, **more)
+            self._train(self.curriculum, self.agent, where)
 
     @contextmanager
-    def prepared(self, run_dir: Path, together: Sequence[int] = ()) -> Iterator[RunDirectory]:
+    def prepared(
+        self, run_dir: Path, together: Sequence[int] = (), experts: Sequence[Expert] | None = None
+    ) -> Iterator[RunDirectory]:
         """Prepare a directory: results that are replaced are removed, experts are found or trained, trackers opened.
 
         Args:
             run_dir: the directory.
             together: the seeds of the group that the run is trained in, if it is not alone.
+            experts: of each task, if they were trained before.
         """
         cfg, saved = self.cfg, self._checkpoints(run_dir)
         with self._tracking(run_dir) as listeners:
@@ -98,8 +100,9 @@ class Job:
                 saved.clear()
                 remove_results(run_dir)
             config.write_configuration(cfg, run_dir / ".hydra")
-            with torch.random.fork_rng():
-                experts = self._experts() if cfg.experts else None
+            if cfg.experts and experts is None:
+                with torch.random.fork_rng():
+                    experts = self._experts()
             of_run: dict[str, Any] = {"together": together, "experts": experts, "listeners": listeners}
             yield RunDirectory(run_dir, config.plain(cfg), saved, **of_run, console=self._console)
 
@@ -108,25 +111,42 @@ class Job:
         """Where progress shows: a sweep shows none of its runs."""
         return Console(quiet=True) if config.in_sweep() else None
 
+    @property
+    def _of_experts(self) -> dict[str, Any]:
+        """The settings that the run shares with its experts."""
+        return {key: value for key, value in config.plain(self.cfg).items() if key in OF_AN_EXPERT}
+
+    @property
+    def decides_experts(self) -> dict[str, Any]:
+        """All that the numbers of the run's experts depend on, beside their curriculum."""
+        settings = self._of_experts
+        now = _code(self.curriculum, settings)
+        changed = {name: now[name] for name, as_ever in (("sources", {}), ("numbers", 1)) if now[name] != as_ever}
+        return {**as_before(settings), "versions": versions(), **changed}
+
+    def expert(self, alone: Curriculum, run_dir: Path, together: Sequence[int] = ()) -> tuple[Agent, RunDirectory]:
+        """Build an agent that learns a task alone, as `new_agent` does, and prepare its directory."""
+        agent, saved = new_agent(alone, self.make_alone, self.cfg.seed, self.device), self._checkpoints(run_dir)
+        return agent, RunDirectory(run_dir, self._of_experts, saved, together, console=self._console)
+
+    def learn_alone(self, alone: Curriculum, run_dirs: RunDirs) -> Failures:
+        """Let an agent learn a task alone, or resume what was begun so; what a group of seeds began begins again."""
+        agent, where = self.expert(alone, run_dirs[self.cfg.seed])
+        if is_of_group(where.run_dir):
+            where.checkpoints.clear()
+        self._train(alone, agent, where)
+        return {}
+
     def _experts(self) -> list[Expert]:
         """Return the experts of the curriculum, found or trained with the run's own agent, seed and threads."""
-        settings = {key: value for key, value in config.plain(self.cfg).items() if key in OF_AN_EXPERT}
+        folder, keys = Path(self.cfg.experts_dir), {self.cfg.seed: self.decides_experts}
+        found, _ = find_or_train(self.curriculum, self.learn_alone, folder, keys, print, waiting=self.interrupt.check)
+        return found[self.cfg.seed]
 
-        def learn_alone(alone: Curriculum, run_dir: Path) -> None:
-            agent = new_agent(alone, self.make_alone, self.cfg.seed, self.device)
-            self._train(alone, agent, run_dir, settings)
-
-        folder, key = Path(self.cfg.experts_dir), {**as_before(settings), "versions": versions()}
-        now = _code(self.curriculum, settings)
-        key |= {name: now[name] for name, as_ever in (("sources", {}), ("numbers", 1)) if now[name] != as_ever}
-        return find_or_train(self.curriculum, learn_alone, folder, key, print, waiting=self.interrupt.check)
-
-    def _train(
-        self, curriculum: Curriculum, agent: Agent, run_dir: Path, settings: Mapping[str, Any], **more: Any
-    ) -> None:
+    def _train(self, curriculum: Curriculum, agent: Agent, where: RunDirectory) -> None:
         """Train into a directory, with checkpoints."""
-        how = {"config": settings, "checkpoints": self._checkpoints(run_dir), "console": self._console, **more}
-        train(curriculum, agent, run_dir, self.cfg.seed, self.device, **how)
+        of_run = {name: getattr(where, name) for name in ("config", "checkpoints", "experts", "listeners", "console")}
+        train(curriculum, agent, where.run_dir, self.cfg.seed, self.device, **of_run)
 
     def _checkpoints(self, run_dir: Path) -> Checkpoints:
         strict = self.cfg.resume == "strict"
@@ -352,21 +372,6 @@ def first_line(run_dir: Path) -> Mapping[str, Any] | None:
     raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
 
 
-@contextmanager
-def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
-    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
-    mark = run_dir / FAILURE
-    failed_before = mark.exists()
-    mark.unlink(missing_ok=True)
-    try:
-        yield
-    except Exception as error:
-        if failed_before or (run_dir / LOG).exists() or config.in_sweep():
-            with suppress(OSError):
-                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
-        raise
-
-
 def curriculum_of(cfg: DictConfig, method: Method) -> Curriculum:
     """Return what a configuration lets an agent with a method learn.
 
@@ -391,9 +396,3 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     return replace(
         curriculum, evaluation=replace(curriculum.evaluation, **evaluation), protocol=replace(how, **protocol)
     )
-
-
-def _check_experts(curriculum: Curriculum, make_alone: MakeAgent, seed: int) -> None:
-    """Refuse a curriculum whose tasks the agent cannot learn alone."""
-    for task in curriculum.tasks:
-        new_agent(expert_curriculum(curriculum, task), make_alone, seed)

@@ -54,6 +54,7 @@ class History(NamedTuple):
     training: Mapping[int, Curve]  # by block, of finished episodes
     spans: tuple[Span, ...]  # of labels that the learner gave tasks itself
     seconds: float
+    experts_together: tuple[bool, ...]  # for each single-task expert of the log, whether a group of seeds trained it
 
 
 @dataclass(frozen=True)
@@ -275,6 +276,7 @@ def _history(log: RunLog) -> History:
         training=training,
         spans=label_spans(log),
         seconds=seconds,
+        experts_together=tuple("together" in each for line in log.of_kind("experts") for each in line["experts"]),
     )
 
 

@@ -8,7 +8,8 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
@@ -17,10 +18,11 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from ctgraph_rl.disk import read_regular, read_text
+from ctgraph_rl.disk import read_regular, read_text, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_BYTES_OF_A_REASON
 from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
+from ctgraph_rl.runs import config
 
 DONE, STALE, FAILED, IN_USE, MISSING = "done", "stale", "failed", "in use", "missing"
 
@@ -59,6 +61,21 @@ NOTHING = Outcome()
 def holds_results(folder: Path) -> bool:
     """Return whether a run directory holds results or a checkpoint, which a change of code would make stale."""
     return (folder / METRICS).exists() or any((folder / CHECKPOINTS).glob("*.pt"))
+
+
+@contextmanager
+def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
+    """Leave the reason in ``failed.txt`` where a run that began or failed before, or a cell, ends by an error."""
+    mark = run_dir / FAILURE
+    failed_before = mark.exists()
+    mark.unlink(missing_ok=True)
+    try:
+        yield
+    except Exception as error:
+        if failed_before or (run_dir / LOG).exists() or config.in_sweep():
+            with suppress(OSError):
+                write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
+        raise
 
 
 def _content(path: Path) -> bytes:

@@ -8,18 +8,22 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
+from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.together import why_not_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, locked
 from ctgraph_rl.packages import agents_together, why_agents_learn_alone
 from ctgraph_rl.runs import config
+from ctgraph_rl.runs.experts import Expert, Failures, RunDirs, find_or_train, is_of_group
 from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job, is_finished, marked_if_it_fails, run_job
-from ctgraph_rl.runs.train import train_together
+from ctgraph_rl.runs.job import Job, is_finished, run_job
+from ctgraph_rl.runs.status import marked_if_it_fails
+from ctgraph_rl.runs.train import RunDirectory, train_together
+from ctgraph_rl.tasks.curriculum import Curriculum
 
 Run = tuple[Any, Path]
 """A composed configuration and its directory."""
@@ -99,28 +103,100 @@ def run_as_one(runs: Sequence[Run]) -> None:
         raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
 
 
-def _marked(runs: Sequence[Run]) -> dict[int, FloatingPointError]:
+def _marked(runs: Sequence[Run]) -> Failures:
     """Run all as one batch; leave in the directory of each that fails, or of all, why."""
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
         for _, run_dir in runs:
             stack.enter_context(marked_if_it_fails(run_dir))
         failed = _learn(runs, interrupt)
-    for number, error in failed.items():
-        with suppress(FloatingPointError), marked_if_it_fails(runs[number][1]):
-            raise error
+    for cfg, run_dir in runs:
+        if cfg.seed in failed:
+            with suppress(FloatingPointError), marked_if_it_fails(run_dir):
+                raise failed[cfg.seed]
     return failed
 
 
-def _learn(runs: Sequence[Run], interrupt: Interrupt) -> dict[int, FloatingPointError]:
-    """Build the objects of all runs, and let them learn; return the errors of those that failed."""
-    jobs, generators = [], []
+def _learn(runs: Sequence[Run], interrupt: Interrupt) -> Failures:
+    """Build the objects of all runs, and let them learn; return the error of each seed that failed.
+
+    A seed with a single-task expert that failed does not begin.
+    """
+    jobs, generators = {}, {}
     for cfg, _ in runs:
-        jobs.append(Job.of(cfg, interrupt))
-        generators.append(torch.Generator().set_state(torch.get_rng_state()))
-    seeds = [cfg.seed for cfg, _ in runs]
+        jobs[cfg.seed] = Job.of(cfg, interrupt)
+        generators[cfg.seed] = _generator()
+    first = jobs[runs[0][0].seed]
+    experts, failed = train_experts([*jobs.values()]) if first.cfg.experts else ({}, {})
+    begin = {cfg.seed: run_dir for cfg, run_dir in runs if cfg.seed not in failed}
     with ExitStack() as stack:
-        given = zip(jobs, runs, strict=True)
-        directories = [stack.enter_context(job.prepared(run_dir, seeds)) for job, (_, run_dir) in given]
-        group = agents_together([job.agent for job in jobs], generators)
-        return train_together(jobs[0].curriculum, group, seeds, jobs[0].device, directories)
+        members = []
+        for seed, run_dir in begin.items():
+            directory = stack.enter_context(jobs[seed].prepared(run_dir, [*begin], experts.get(seed)))
+            members.append(Member(jobs[seed].agent, directory, generators[seed]))
+        return failed | _as_one(first, first.curriculum, members)
+
+
+class Member(NamedTuple):
+    """A run of a group."""
+
+    agent: Agent
+    directory: RunDirectory
+    generator: torch.Generator
+    """What the agent draws from: torch's global one, as the agent's construction left it."""
+
+
+def _generator() -> torch.Generator:
+    """Return a generator that continues as torch's global one."""
+    return torch.Generator().set_state(torch.get_rng_state())
+
+
+def _as_one(job: Job, curriculum: Curriculum, members: Sequence[Member]) -> Failures:
+    """Let the runs of a group learn a curriculum; return the error of each seed that failed."""
+    if not members:
+        return {}
+    agents, directories, generators = zip(*members, strict=True)
+    seeds = directories[0].together
+    failed = train_together(curriculum, agents_together(agents, generators), seeds, job.device, directories)
+    return {seeds[number]: error for number, error in failed.items()}
+
+
+def train_experts(jobs: Sequence[Job], only: int | None = None) -> tuple[dict[int, list[Expert]], Failures]:
+    """Find or train the single-task experts of several seeds, those of a task as one batch.
+
+    Args:
+        jobs: of each seed.
+        only: the position of the one task whose experts are needed, from 1; None: all.
+
+    Returns:
+        The experts of each seed, and the error of each seed with an expert that failed, which then has none.
+    """
+    first, by_seed = jobs[0], {job.cfg.seed: job for job in jobs}
+
+    def learn(alone: Curriculum, run_dirs: RunDirs) -> Failures:
+        [(seed, run_dir), *others] = run_dirs.items()
+        if not others and not is_of_group(run_dir):
+            try:
+                return by_seed[seed].learn_alone(alone, run_dirs)
+            except FloatingPointError as error:
+                return {seed: error}
+        members = [
+            Member(*by_seed[seed].expert(alone, run_dir, [*run_dirs]), _generator())
+            for seed, run_dir in run_dirs.items()
+        ]
+        return _as_one(first, alone, members)
+
+    folder, deciding = Path(first.cfg.experts_dir), {seed: job.decides_experts for seed, job in by_seed.items()}
+    how: dict[str, Any] = {"waiting": first.interrupt.check, "only": only}
+    return find_or_train(first.curriculum, learn, folder, deciding, print, **how)
+
+
+def learn_experts(configs: Sequence[Any], task: int) -> None:
+    """Find or train the single-task experts of seeds for one task, from 1, as one batch.
+
+    Args:
+        configs: the configuration of each seed.
+        task: position of the task in the curriculum.
+    """
+    with Interrupt() as interrupt:
+        train_experts([Job.of(cfg, interrupt) for cfg in configs], only=task)

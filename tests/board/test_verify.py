@@ -170,6 +170,21 @@ def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submissi
     assert (cell.job.seeds, cell.job.together, cell.runs) == ((0, 1), True, runs)
 
 
+@pytest.mark.slow
+def test_experts_are_trained_again_in_the_groups_of_seeds_in_which_they_were(tiny_submission, tmp_path, monkeypatch):
+    said = [{"task": 1, "together": [0, 1]}, {"task": 2}]
+    monkeypatch.setattr(rerun, "experts_of", lambda log: said)
+    (cell,) = cells_of(tiny_submission, tiny_submission.runs[:1], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    cell.job._replace(config={**cell.job.config, "experts": True}).write(tmp_path / "job.json")
+
+    relearn.learn_again(Job.read(tmp_path / "job.json"), tmp_path)
+
+    [found] = RunLog.read(tmp_path / "seed0" / "run.jsonl").of_kind("experts")
+    assert [expert.get("together") for expert in found["experts"]] == [[0, 1], None, None, None]
+    assert len(list(Path("runs/experts").iterdir())) == 5
+
+
 @pytest.mark.parametrize(
     ("found", "passed"), [([0.8, 0.9], True), ([0.1, 0.2], False), ([0.1], None)], ids=["equal", "lower", "too few"]
 )

@@ -356,7 +356,7 @@ def test_an_own_agent_that_changed_gets_new_experts_and_ours_keeps_its_own(mine,
     keys = []
 
     def find(*arguments, **_):
-        keys.append(arguments[3])
+        keys.extend(arguments[3].values())
         raise KeyboardInterrupt
 
     monkeypatch.setattr(job, "find_or_train", find)

@@ -178,6 +178,15 @@ def test_parts_of_other_types_are_different(pair, said):
     assert said(*pair)[1][1] == "weights: different in 2 of 2 parts: weight, steps"
 
 
+def test_seeds_that_experts_were_trained_with_are_named_and_are_no_measurement(pair, said):
+    change(pair[0], 1, kind="experts", experts=[{"task": 1, "run": "x", "together": [0, 1]}])
+    change(pair[1], 1, kind="experts", experts=[{"task": 1, "run": "x"}])
+
+    code, lines, _ = said(*pair)
+
+    assert code == 0 and lines[-1] == "seeds of experts trained together: different, task 1 [0, 1] and None"
+
+
 def test_an_odd_list_of_experts_is_compared_as_it_is(pair, said):
     change(pair[0], 1, experts=[1])
 

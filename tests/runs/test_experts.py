@@ -18,6 +18,7 @@ from ctgraph_rl.runs import job
 from ctgraph_rl.runs.experts import directory_name, expert_curriculum, find_or_train
 
 SETTINGS = {"agent": {"gamma": 0.9}, "seed": 0}
+ONE_SEED = {0: SETTINGS}
 
 
 def curriculum(*blocks: Block, **changes) -> Curriculum:
@@ -27,9 +28,11 @@ def curriculum(*blocks: Block, **changes) -> Curriculum:
 def write_result(trained: list):
     """Stands for learning: keeps what is learned and writes a result."""
 
-    def learn(alone, run_dir):
-        trained.append(alone)
-        finish(run_dir)
+    def learn(alone, run_dirs):
+        for run_dir in run_dirs.values():
+            trained.append(alone)
+            finish(run_dir)
+        return {}
 
     return learn
 
@@ -65,8 +68,8 @@ def test_an_expert_of_tasks_that_share_a_block_is_refused():
 def test_no_expert_is_trained_twice(tmp_path):
     trained, told = [], []
 
-    first = find_or_train(curriculum(), write_result(trained), tmp_path, SETTINGS, told.append)
-    again = find_or_train(curriculum(Block(TWO, 24)), write_result(trained), tmp_path, SETTINGS, told.append)
+    first = find_or_train(curriculum(), write_result(trained), tmp_path, ONE_SEED, told.append)[0][0]
+    again = find_or_train(curriculum(Block(TWO, 24)), write_result(trained), tmp_path, ONE_SEED, told.append)[0][0]
 
     assert [alone.tasks for alone in trained] == [(ONE,), (TWO,)]
     assert again[0].run_dir == first[1].run_dir
@@ -80,10 +83,10 @@ def test_no_expert_is_trained_twice(tmp_path):
 )
 def test_another_seed_evaluation_or_budget_is_another_expert(tmp_path, change):
     trained = []
-    find_or_train(curriculum(Block(ONE, 24)), write_result(trained), tmp_path, SETTINGS, print)
+    find_or_train(curriculum(Block(ONE, 24)), write_result(trained), tmp_path, ONE_SEED, print)
 
     other = curriculum(Block(ONE, change.get("num_frames", 24)), evaluation=change.get("evaluation", Evaluation()))
-    find_or_train(other, write_result(trained), tmp_path, change.get("settings", SETTINGS), print)
+    find_or_train(other, write_result(trained), tmp_path, {0: change.get("settings", SETTINGS)}, print)
 
     assert len(trained) == 2
 
@@ -91,18 +94,21 @@ def test_another_seed_evaluation_or_budget_is_another_expert(tmp_path, change):
 def test_an_expert_that_was_stopped_is_gone_on_with(tmp_path):
     begun = []
 
-    def stop(alone, run_dir):
+    def stop(alone, run_dirs):
+        [run_dir] = run_dirs.values()
         begun.append(run_dir)
         (run_dir / "run.jsonl").write_text("half")
         raise KeyboardInterrupt
 
-    def go_on(alone, run_dir):
+    def go_on(alone, run_dirs):
+        [run_dir] = run_dirs.values()
         assert (run_dir / "run.jsonl").read_text() == "half"
         (run_dir / "metrics.json").write_text("{}")
+        return {}
 
     with pytest.raises(KeyboardInterrupt):
-        find_or_train(curriculum(Block(ONE, 12)), stop, tmp_path, SETTINGS, print)
-    (expert,) = find_or_train(curriculum(Block(ONE, 12)), go_on, tmp_path, SETTINGS, print)
+        find_or_train(curriculum(Block(ONE, 12)), stop, tmp_path, ONE_SEED, print)
+    [expert] = find_or_train(curriculum(Block(ONE, 12)), go_on, tmp_path, ONE_SEED, print)[0][0]
 
     assert begun == [expert.run_dir]
     assert sorted(path.name for path in expert.run_dir.iterdir()) == ["metrics.json", "run.jsonl"]
@@ -148,8 +154,9 @@ def test_an_expert_that_another_process_trains_is_waited_for_and_not_trained_aga
                 other.close()
 
         learn = lambda *_: pytest.fail("trained twice")  # noqa: E731
-        (expert,) = find_or_train(curriculum(Block(ONE, 12)), learn, tmp_path, SETTINGS, print, waiting)
+        found, _ = find_or_train(curriculum(Block(ONE, 12)), learn, tmp_path, ONE_SEED, print, waiting=waiting)
 
+    [expert] = found[0]
     assert len(waited) == 3
     assert (expert.run_dir / "metrics.json").read_text() == '{"theirs": 1}'
 
@@ -166,9 +173,9 @@ def test_an_expert_is_kept_by_agent_seed_device_threads_and_versions(compose, mo
     with pytest.raises(KeyboardInterrupt):
         job.learn(cfg, tmp_path)
 
-    agent = {**asked[0].pop("agent")}
+    agent = {**asked[0][3].pop("agent")}
     assert (agent["_target_"], agent["gamma"]) == (cfg.agent._target_, 0.5)
-    assert asked == [{"seed": 3, "device": "cpu", "num_threads": 1, "versions": versions()}]
+    assert asked == [{3: {"seed": 3, "device": "cpu", "num_threads": 1, "versions": versions()}}]
 
 
 def test_experts_that_cannot_be_are_refused_before_anything_is_written(compose, tmp_path):

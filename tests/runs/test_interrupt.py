@@ -128,3 +128,24 @@ def test_in_a_thread_signals_act_as_before():
 
     assert asked == [False]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(("states", "is_requeued"), [({"7_1": "RUNNING"}, True), ({"7_1": "COMPLETING"}, False)])
+def test_a_task_of_an_array_goes_back_into_the_queue_whatever_the_state_of_the_others(
+    tmp_path, monkeypatch, states, is_requeued
+):
+    """The number of the last task to start is that of the whole array, and shows all of its tasks."""
+    states = {"7": f"COMPLETING, {states['7_1']}", **states}
+    shown = "".join(f"    {job}) echo JobState={state} ;;\n" for job, state in states.items())
+    (tmp_path / "scontrol").write_text(f'#!/bin/sh\ncase "$3" in\n{shown}esac\n')
+    (tmp_path / "scontrol").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for name, value in {"JOB_ID": "7", "ARRAY_JOB_ID": "7", "ARRAY_TASK_ID": "1"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    requeued = []
+
+    with handled(signal.SIGUSR2, lambda *_: requeued.append(1)), pytest.raises(SystemExit), Interrupt() as interrupt:
+        send(signal.SIGTERM)
+        interrupt.exit()
+
+    assert bool(requeued) == is_requeued

@@ -9,7 +9,7 @@ import pytest
 from helpers.sweeping import UNLUCKY, command_line, configs, sweep
 
 from ctgraph_rl import run as run_module
-from ctgraph_rl.runs import config, job
+from ctgraph_rl.runs import config, status
 
 
 @pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
@@ -166,10 +166,10 @@ def test_a_cell_that_cannot_be_started_again_stays_failed(learned, monkeypatch, 
 def test_a_mark_stays_where_a_run_alone_is_refused_again(monkeypatch, tmp_path):
     (tmp_path / "failed.txt").write_text("ValueError: before\n")
 
-    with pytest.raises(ValueError), job.marked_if_it_fails(tmp_path):
+    with pytest.raises(ValueError), status.marked_if_it_fails(tmp_path):
         raise ValueError("again")
     assert (tmp_path / "failed.txt").read_text() == "ValueError: again\n"
-    with job.marked_if_it_fails(tmp_path):
+    with status.marked_if_it_fails(tmp_path):
         pass
 
     assert not (tmp_path / "failed.txt").exists()

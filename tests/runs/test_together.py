@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,16 +13,25 @@ from helpers.sweeping import command_line, sweep
 
 from baselines.together import Group
 from ctgraph_rl import RunLog
-from ctgraph_rl.compare import compare
+from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes
-from ctgraph_rl.runs import checkpoints, train
+from ctgraph_rl.runs import checkpoints, config, train
+from ctgraph_rl.runs.experts import find_or_train
+from ctgraph_rl.runs.interrupt import Interrupt
+from ctgraph_rl.runs.job import Job
 from ctgraph_rl.runs.load import load
-from ctgraph_rl.runs.read import find_runs
+from ctgraph_rl.runs.read import find_runs, read_run
+from ctgraph_rl.runs.together import run_as_one, train_experts
 
 TINY = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
 PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
 SEEDS = "seed=0,1,2"
+EXPERTS = (
+    *("curriculum=ct2_interfering", "curriculum.num_frames=192", "evaluation.num_episodes=2", "agent.hidden_size=8"),
+    *(*PPO[len(TINY) :], "experts=true"),
+)
+"""Two tasks."""
 
 
 @pytest.fixture(autouse=True)
@@ -31,6 +41,12 @@ def here(tmp_path, monkeypatch):
 
 def runs(folder: str = "runs") -> list[Path]:
     return sorted(path.parent for path in Path(folder).rglob("run.jsonl") if "experts" not in path.parts)
+
+
+def experts(folder: str) -> list[Path]:
+    """By task and seed."""
+    found = [path.parent for path in Path(folder).rglob("run.jsonl")]
+    return sorted(found, key=lambda path: (first_line(path)["tasks"], first_line(path)["config"]["seed"]))
 
 
 def content(run_dir: Path) -> tuple:
@@ -186,3 +202,101 @@ def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
 
     assert message in capsys.readouterr().err
     assert not runs()
+
+
+def jobs(*seeds: int, folder: str = "experts") -> list[Job]:
+    """Runs of one task, whose experts are trained in turn."""
+    made = []
+    for seed in seeds:
+        cfg = config.composed([*EXPERTS, f"seed={seed}", f"experts_dir={folder}"])
+        made.append(Job.of(cfg, Interrupt()))
+    return made
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> list[Path]:
+    """The experts of the first task, trained as a group without a stop."""
+    folder = tmp_path_factory.mktemp("whole")
+    train_experts(jobs(0, 1, 2, folder=str(folder)), only=1)
+    return experts(str(folder))
+
+
+def groups(folder: str = "experts") -> list[list[int] | None]:
+    return [first_line(expert).get("together") for expert in experts(folder)]
+
+
+def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_rounding(monkeypatch):
+    assert sweep(monkeypatch, "seed=0,1", "together=true", *EXPERTS) == 0
+    train_experts(jobs(0))
+
+    assert groups("runs/experts") == 4 * [[0, 1]] and groups() == [None, None]
+    for one, other in zip(experts("runs/experts")[::2], experts("experts"), strict=True):
+        assert one.name == other.name
+        assert {path.name for path in one.iterdir()} == {path.name for path in other.iterdir()}
+        assert first_line(one)["config"] == first_line(other)["config"]
+        assert compare(one, other).code == ROUNDING
+    [said] = RunLog.read(runs()[0] / "run.jsonl").of_kind("experts")
+    assert [expert["together"] for expert in said["experts"]] == [[0, 1], [0, 1]]
+    shutil.copytree(runs()[0], "other")
+    log = Path("other", "run.jsonl")
+    log.write_text(log.read_text().replace(', "together": [0, 1]}', "}"))
+    note = "1 of 2 runs are compared with experts of seeds trained together; those differ from others by rounding"
+    assert note in code_notes([read_run(runs()[0]), read_run(Path("other"))]) and not code_notes([read_run(runs()[0])])
+
+
+def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatch, whole):
+    places = ((train, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), (train.RunDirectory, "finish", 1))
+
+    for module, name, count in places:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            stop_after(patch, count, module, name)
+            train_experts(jobs(0, 1, 2), only=1)
+    assert [(expert / "metrics.json").exists() for expert in experts("experts")] == [True, False, False]
+    train_experts(jobs(0, 1, 2), only=1)
+
+    assert all((expert / "restarts.jsonl").exists() for expert in experts("experts"))
+    assert all(same(one, other) for one, other in zip(experts("experts"), whole, strict=True))
+
+
+def test_experts_of_a_stopped_group_begin_again_where_one_is_needed_alone(monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        stop_after(patch, 1)
+        train_experts(jobs(0, 1, 2), only=1)
+    [alone] = jobs(1)
+    find_or_train(alone.curriculum, alone.learn_alone, Path("experts"), {1: alone.decides_experts}, print, only=1)
+
+    assert groups() == [[0, 1, 2], None, [0, 1, 2]]
+    train_experts(jobs(0, 1, 2), only=1)
+    assert groups() == [[0, 2], None, [0, 2]]
+
+
+@pytest.mark.slow
+def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch, whole):
+    start, begun = Group.start_task, []
+
+    def spoiled(group, task=None):
+        start(group, task)
+        begun.append(len(group.agents))
+        if len(begun) == 1:
+            group.learners[1].weights[0].data.fill_(torch.nan)
+
+    def run() -> None:
+        made = [(job.cfg, Path(f"seed{job.cfg.seed}")) for job in jobs(0, 1, 2)]
+        for _, folder in made:
+            folder.mkdir(exist_ok=True)
+        run_as_one(made)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Group, "start_task", spoiled)
+        with pytest.raises(
+            RuntimeError, match=r"^FloatingPointError: expert 1 of 2, .*: seed 1: loss_objective is nan"
+        ):
+            run()
+
+    assert begun[:3] == [3, 2, 2]
+    assert groups() == [*3 * [[0, 1, 2]], *2 * [[0, 2]]]
+    assert all(same(experts("experts")[number], whole[number]) for number in (0, 2))
+    assert [(Path(f"seed{seed}") / "metrics.json").exists() for seed in (0, 1, 2)] == [True, False, True]
+    assert not list(Path("seed1").glob("run.jsonl"))
+    run()
+    assert groups() == [[0, 1, 2], None, [0, 1, 2], [0, 2], None, [0, 2]]

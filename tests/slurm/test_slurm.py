@@ -25,12 +25,18 @@ pytestmark = pytest.mark.slurm
 
 SHORT = ("agent=lstm_ppo", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
 SLOW = (*SHORT, "agent._target_=slow.SlowLSTMPPO", "curriculum.num_frames=8192")
+GROUPS = (
+    *("agent=ppo", "agent._target_=slow.SlowPPO", *SHORT[1:], "agent.num_epochs=1", "agent.gamma=0.9,0.99"),
+    *("curriculum.num_frames=8192", "evaluation.num_episodes=2", "seed=0,1", "together=true"),
+)
+"""Two groups of two seeds."""
 
 AGENT = '''
 import time
 from pathlib import Path
 
 from baselines.lstm_ppo import LSTMPPO
+from baselines.ppo import PPO
 
 
 class SlowLSTMPPO(LSTMPPO):
@@ -39,6 +45,14 @@ class SlowLSTMPPO(LSTMPPO):
     def learn(self, *arguments):
         time.sleep(3 * Path("slow").exists())
         return super().learn(*arguments)
+
+
+class SlowPPO(PPO):
+    """Likewise, alone and in a group of seeds."""
+
+    def after_batch(self, *arguments):
+        time.sleep(Path("slow").exists())
+        return super().after_batch(*arguments)
 '''
 
 
@@ -109,7 +123,7 @@ def results(run_dir: Path) -> tuple[object, ...]:
 
 def waiting(slurm: Callable[..., str]) -> list[str]:
     """Jobs that were put into the queue again, and wait there for two minutes."""
-    jobs = [line.split() for line in slurm("squeue", "-h", "-o", "%A %r").splitlines()]
+    jobs = [line.split() for line in slurm("squeue", "-h", "-r", "-o", "%i %r").splitlines()]
     return [job for job, reason in jobs if reason == "BeginTime"]
 
 
@@ -120,18 +134,20 @@ def start_again(slurm: Callable[..., str], jobs: list[str]) -> None:
         slurm("scontrol", "update", f"JobId={job}", "StartTime=now", "TimeLimit=30")
 
 
-def ends_after_one_requeue(slurm, head: subprocess.Popen, folder: Path) -> Path:
-    """Let the requeued cell of a sweep run to its end; its directory."""
-    wait_for(lambda: waiting(slurm))
-    [job] = waiting(slurm)
+def end_after_one_requeue(slurm, heads: list[subprocess.Popen], folder: Path, num_jobs: int) -> dict[str, Path]:
+    """Let the requeued jobs of sweeps run to their ends; the directories of the runs that were stopped, by name."""
+    wait_for(lambda: len(waiting(slurm)) == num_jobs)
+    jobs = waiting(slurm)
     (folder / "slow").unlink()
-    start_again(slurm, [job])
-    shown, _ = head.communicate(timeout=240)
-    assert head.returncode == 0, shown
-    assert re.search(r"Restarts=(\d+)", slurm("scontrol", "show", "job", job)).group(1) == "1"
-    [restarts] = folder.glob("runs/*/*/restarts.jsonl")
-    assert len(restarts.read_text().splitlines()) == 1
-    return restarts.parent
+    start_again(slurm, jobs)
+    for head in heads:
+        shown, _ = head.communicate(timeout=240)
+        assert head.returncode == 0, shown
+    shown = "".join(slurm("scontrol", "show", "job", job) for job in jobs)
+    assert set(re.findall(r"Restarts=(\d+)", shown)) == {"1"}
+    stopped = list(folder.glob("runs/*/*/restarts.jsonl"))
+    assert {len(restarts.read_text().splitlines()) for restarts in stopped} == {1}
+    return {restarts.parent.name: restarts.parent for restarts in stopped}
 
 
 def test_six_cells_are_one_array_and_a_second_start_submits_none(slurm, sweep, tmp_path):
@@ -154,21 +170,33 @@ def test_a_cell_at_its_time_limit_goes_back_into_the_queue_and_ends_bit_equal(sl
     # SLURM may send the signal a minute earlier: 30 to 90 seconds after the start
     head = sweep(*SLOW, "hydra.launcher.timeout_min=2", "hydra.launcher.signal_delay_s=30")
 
-    run_dir = ends_after_one_requeue(slurm, head, tmp_path)
+    [run_dir] = end_after_one_requeue(slurm, [head], tmp_path, 1).values()
     assert "SIGUSR2: saving" in next(tmp_path.glob("runs/.slurm/*log.out")).read_text()
     assert results(run_dir) == results(uninterrupted)
 
 
-def test_a_preempted_cell_goes_back_into_the_queue_and_ends_bit_equal(slurm, sweep, tmp_path, uninterrupted):
+def test_a_preempted_cell_and_groups_of_an_array_go_back_into_the_queue_and_end_bit_equal(
+    slurm, sweep, tmp_path, uninterrupted
+):
     (tmp_path / "slow").touch()
+    (whole := tmp_path / "whole").mkdir()
+    (whole / "slow.py").write_text(AGENT)
+    command = [sys.executable, "-m", "ctgraph_rl.run", "-m", *GROUPS]
+    groups = subprocess.Popen(command, cwd=whole, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
-    head = sweep(*SLOW, "hydra.launcher.partition=low")
-    wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/*.pt")))
+    heads = [sweep(*settings, "hydra.launcher.partition=low") for settings in (SLOW, GROUPS)]
+    wait_for(lambda: len({path.parent for path in tmp_path.glob("runs/*/*/checkpoints/*.pt")}) == 5)
     slurm("sbatch", "--partition=high", "--exclusive", "--output=/dev/null", "--wrap=sleep 1")
 
-    run_dir = ends_after_one_requeue(slurm, head, tmp_path)
-    assert "SIGTERM: saving" in next(tmp_path.glob("runs/.slurm/*log.out")).read_text()
-    assert results(run_dir) == results(uninterrupted)
+    stopped = end_after_one_requeue(slurm, heads, tmp_path, 3)
+    logs = [path.read_text() for path in tmp_path.glob("runs/.slurm/*log.out")]
+    assert len(logs) == 3 and all("SIGTERM: saving" in log for log in logs)
+    assert groups.wait(timeout=240) == 0
+    expected = {path.parent.name: path.parent for path in whole.glob("runs/*/*/metrics.json")}
+    [alone] = stopped.keys() - expected.keys()
+    assert results(stopped[alone]) == results(uninterrupted)
+    assert len(expected) == 4
+    assert all(results(stopped[name]) == results(expected[name]) for name in expected)
 
 
 def test_a_cancelled_cell_saves_and_stays_cancelled(slurm, sweep, tmp_path):
