@@ -35,7 +35,7 @@ LEARNERS = {
     "announced": "boundaries and ids announced",
     "oracle": "oracle",
     "amd": "AMD",
-    "swoks": "SWOKS, as published",
+    "swoks": "SWOKS, published trials",
     "swoks, fresh": "SWOKS, fresh trials",
     "adwin": "ADWIN",
     "none": "fine-tuning",
@@ -380,7 +380,7 @@ def draw_strips(path: Path) -> None:
     side.set(xlim=(0, 1))
     side.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
     side.tick_params(axis="both", length=0, labelsize=7)
-    side.set_xlabel("average performance", fontsize=7)
+    side.set_xlabel("average\nperformance", fontsize=7)
     save_figure(figure, path)
 
 
