@@ -145,6 +145,10 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
         f"1,024 seeds of the main job would take {minutes:.1f} minutes",
     ):
         assert sentence in " ".join(page.split())
+    published = learned["ppo_published, 1,024 seeds as one job", 4_096]
+    study = f"learn from {published / 1e6:.2f} million frames a second ([speed](../explanation/speed.md#gpus)): "
+    study += f"{14_336e6 / published / 3600:.0f} hours for F"
+    assert study in " ".join((CHECKOUT / "docs" / "how-to" / "sweeps.md").read_text(encoding="utf-8").split())
     assert f"on an H100 {su:.1f} billion" in " ".join((CHECKOUT / "README.md").read_text(encoding="utf-8").split())
 
 
