@@ -14,6 +14,7 @@ import json
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from statistics import mean
 from string import Template
 from typing import Any
 
@@ -24,6 +25,9 @@ SEEDS = 5
 
 SOON = 65_536
 """Frames after a change within which an alarm is counted as one of that change on the page: eight batches."""
+
+HIGH = 0.9
+"""The return of the batch before an alarm from which on little was left to learn."""
 
 FOUND = ("detector", "method", "num_fresh", "boundaries")
 """The columns that tell the learners of a curriculum apart."""
@@ -178,18 +182,34 @@ def soon(lines: Raw) -> int:
     return sum(each <= SOON for each in delays(lines))
 
 
-def other_alarms(lines: Raw) -> float:
-    """Return the alarms that are not the first one within `SOON` frames of a change, per 100,000 frames."""
-    frames = sum(values(lines, "frames"))
-    late = sum(each > SOON for each in delays(lines))
-    false = sum(float(line["false_alarms"]) * float(line["frames"]) / 100_000 for line in lines)
-    return 100_000 * (round(false) + late) / frames
+def alarms(lines: Raw) -> Raw:
+    """Return the spans of some runs that end with an alarm which is not the first one soon after a change."""
+    own = {tuple(line[key] for key in ("curriculum", "stay", *FOUND, "seed")) for line in lines}
+    found = []
+    for run, spans in groups(read(SPANS), "curriculum", "stay", *FOUND, "seed").items():
+        seen = set()
+        for span in spans if run in own else ():
+            change, after = divmod(int(span["end"]), int(span["stay"]))
+            first = change > 0 and change not in seen
+            if span["alarm"] == "True":
+                seen.add(change)
+                if not (first and after <= SOON):
+                    found.append(span)
+    return found
+
+
+def other_alarms(lines: Raw) -> str:
+    """Return the alarms of `alarms` per 100,000 frames, and how many of them came at a high return."""
+    found = alarms(lines)
+    rate = 100_000 * len(found) / sum(values(lines, "frames"))
+    high = sum(float(span["return_before"]) >= HIGH for span in found)
+    return f"{rate:.2f}; {high} of {len(found)}" if found else "0"
 
 
 def span_of(numbers: list[float], form: str) -> str:
     """Return the mean over seeds, and the lowest and the highest of them where they differ."""
-    mean, low, high = (format(each, form) for each in (sum(numbers) / len(numbers), min(numbers), max(numbers)))
-    return mean if low == high else f"{mean} ({low} to {high})"
+    middle, low, high = (format(each, form) for each in (mean(numbers), min(numbers), max(numbers)))
+    return middle if low == high else f"{middle} ({low} to {high})"
 
 
 def returns(lines: Raw, name: str) -> str:
@@ -211,7 +231,7 @@ def row(name: str, lines: Raw) -> list[str]:
         *cells,
         mean_of(values(lines, "label_agreement"), (-0.5, 1)),
         f"{soon(lines)} of {len(delays(lines))}",
-        f"{other_alarms(lines):.2f}",
+        other_alarms(lines),
         span_of(values(lines, "labels_per_task"), ".2f"),
         "; ".join(f"{sum(each) / len(each):.0%}" for each in shares),
     ]
@@ -223,7 +243,7 @@ HEAD = (
     "online return",
     "adjusted Rand index",
     "changes found soon",
-    "other alarms",
+    "other alarms; at a return of 0.9",
     "labels per task",
     "not learned from; undone",
 )
@@ -247,11 +267,16 @@ def images() -> str:
     return table(["", *(f"`{name}`" for name in IMAGES)], [cells for cells in rows if any(cells[1:])])
 
 
+def on_images(name: str) -> Raw:
+    """Return the lines of a learner on the image sets of all configurations that have all its seeds."""
+    return [line for place in IMAGES for line in finished().get((place, "204800"), {}).get(name, [])]
+
+
 def image_labels() -> str:
     """Return the table of the labels on the image sets, of all configurations together."""
     rows = []
     for name in PLANNED[IMAGES[0], "204800"]:
-        lines = [line for place in IMAGES for line in finished().get((place, "204800"), {}).get(name, [])]
+        lines = on_images(name)
         if lines and lines[0]["detector"]:
             cells = row(name, lines)[4:]
             shown = [span_of(values(lines, key), ".2f") for key in ("online_return", "label_agreement")]
@@ -299,28 +324,10 @@ def not_run() -> str:
     return "\n".join(["No number is on this page of:", "", *lines]) if lines else "Everything that was planned has run."
 
 
-def alarms(lines: Raw) -> Raw:
-    """Return the spans of some runs that end with an alarm which is not the first one soon after a change."""
-    own = {tuple(line[key] for key in ("curriculum", "stay", *FOUND, "seed")) for line in lines}
-    found = []
-    for run, spans in groups(read(SPANS), "curriculum", "stay", *FOUND, "seed").items():
-        seen = set()
-        for span in spans if run in own else ():
-            change, after = divmod(int(span["end"]), int(span["stay"]))
-            first = change > 0 and change not in seen
-            if span["alarm"] == "True":
-                seen.add(change)
-                if not (first and after <= SOON):
-                    found.append(span)
-    return found
-
-
 def numbers() -> dict[str, str]:
-    """Return the numbers within the text of the page."""
-    lines = finished().get((MASKS, "384000"), {}).get("swoks, fresh", [])
-    others = alarms(lines)
-    high = [span for span in others if float(span["return_before"]) >= 0.9]
-    return {"other_alarms": str(len(others)), "high_alarms": str(len(high))}
+    """Return the numbers within the text of the page that follow from several tables."""
+    names = {"swoks_online": "swoks, fresh", "adwin_online": "adwin", "oracle_online": "oracle"}
+    return {key: f"{mean(values(on_images(name), 'online_return')):.2f}" for key, name in names.items()}
 
 
 def page() -> str:
