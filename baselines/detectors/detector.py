@@ -40,7 +40,7 @@ class Detector:
     def __init__(self, max_labels: int | None, patience: int, snapshot_every: int | None) -> None:
         labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)
         require(
-            (labels, f"max_labels must be an integer >= 1, got {max_labels!r}"),
+            (labels, f"max_labels must be an integer >= 1, got {'null' if max_labels is None else repr(max_labels)}"),
             *at_least_one(patience=patience),
             *(() if snapshot_every is None else at_least_one(snapshot_every=snapshot_every)),
         )

@@ -36,7 +36,7 @@ MASKS, PAIR = "swoks_2x4", "dick2020_pair"
 IMAGES = ("fo_b1_4images", "su_b1_4images", "co_b1_4images", "posr_b1_4images")
 
 LEARNERS = {
-    "announced": "boundaries and ids announced",
+    "announced": "announced",
     "oracle": "oracle",
     "amd": "AMD",
     "swoks": "SWOKS, published trials",
@@ -233,7 +233,7 @@ def row(name: str, lines: Raw) -> list[str]:
         f"{soon(lines)} of {len(delays(lines))}",
         other_alarms(lines),
         span_of(values(lines, "labels_per_task"), ".2f"),
-        "; ".join(f"{sum(each) / len(each):.0%}" for each in shares),
+        "; ".join(f"{100 * mean(each):.0f} %" for each in shares),
     ]
 
 
@@ -327,7 +327,10 @@ def not_run() -> str:
 def numbers() -> dict[str, str]:
     """Return the numbers within the text of the page that follow from several tables."""
     names = {"swoks_online": "swoks, fresh", "adwin_online": "adwin", "oracle_online": "oracle"}
-    return {key: f"{mean(values(on_images(name), 'online_return')):.2f}" for key, name in names.items()}
+    online = {key: f"{mean(values(on_images(name), 'online_return')):.2f}" for key, name in names.items()}
+    found = {key.replace("online", "found"): str(soon(on_images(name))) for key, name in names.items()}
+    ends = {name: mean(values(on_images(name), "average_performance")) for name in ("announced", "oracle")}
+    return {**online, **found, "announced_less": f"{ends['announced'] - ends['oracle']:.2f}"}
 
 
 def page() -> str:

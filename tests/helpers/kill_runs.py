@@ -203,7 +203,7 @@ def equal(one: Any, other: Any) -> bool:
     """Whether nested plain values and tensors are equal bit by bit."""
     if isinstance(one, torch.Tensor):
         same_kind = isinstance(other, torch.Tensor) and (one.dtype, one.shape) == (other.dtype, other.shape)
-        return same_kind and torch.equal(one.contiguous().view(-1).view(torch.uint8), other.view(-1).view(torch.uint8))
+        return same_kind and torch.equal(*(each.reshape(-1).view(torch.uint8) for each in (one, other)))
     if isinstance(one, dict):
         same_keys = isinstance(other, dict) and list(one) == list(other)
         return same_keys and all(equal(one[key], other[key]) for key in one)
