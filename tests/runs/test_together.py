@@ -245,13 +245,14 @@ def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_roundi
 
 
 def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatch, whole):
-    places = ((train, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), (train.RunDirectory, "finish", 1))
+    finish = (train.RunDirectory, "finish", 1)
+    places = ((train, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), finish, finish)
 
     for module, name, count in places:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             stop_after(patch, count, module, name)
             train_experts(jobs(0, 1, 2), only=1)
-    assert [(expert / "metrics.json").exists() for expert in experts("experts")] == [True, False, False]
+    assert [(expert / "metrics.json").exists() for expert in experts("experts")] == [True, True, False]
     train_experts(jobs(0, 1, 2), only=1)
 
     assert all((expert / "restarts.jsonl").exists() for expert in experts("experts"))
