@@ -191,13 +191,13 @@ def not_run() -> str:
     return "\n".join(lines)
 
 
-HARDEST = ("0.9", "False", "500")
-"""Waiting probability, unique decisions and wait images of the graph that the published claim is about."""
+HARDEST, UNIQUE = ("0.9", "False", "500"), ("0.9", "True", "500")
+"""Waiting probability, unique decisions and wait images of the graphs that the published claim can be about."""
 
 
-def count(agent: str, guide: str = "204800") -> str:
-    """Return in how many seeds an agent solves the hardest graph, as ``4 of 5``; ``not run`` where it was not."""
-    of = {condition[2:6]: each for condition, each in graphs().items()}.get((*HARDEST, guide), {})
+def count(agent: str, graph: tuple[str, ...] = HARDEST, guide: str = "204800") -> str:
+    """Return in how many seeds an agent solves a graph, as ``4 of 5``; ``not run`` where it was not."""
+    of = {condition[2:6]: each for condition, each in graphs().items()}.get((*graph, guide), {})
     return f"{sum(solved(of[agent]))} of {len(of[agent])}" if agent in of else "not run"
 
 
@@ -206,7 +206,7 @@ def counts() -> dict[str, str]:
     found = {}
     for name in AGENTS:
         key = re.sub("[^a-z0-9]+", "_", name.removeprefix("lstm_ppo-"))
-        found |= {key: count(name), f"find_{key}": count(name, "0")}
+        found |= {key: count(name), f"find_{key}": count(name, guide="0"), f"unique_{key}": count(name, UNIQUE)}
     to_find = {condition[2:6]: each for condition, each in graphs().items()}[*HARDEST, "0"]
     none = [name for name, lines in to_find.items() if all(float(line["greedy_return"]) == 0 for line in lines)]
     runs = [line for each in graphs().values() for lines in each.values() for line in lines if line["frames_to_90"]]

@@ -21,16 +21,25 @@ def cells():
             sys.modules.pop(name, None)
 
 
-@pytest.fixture(scope="module")
-def hardest():
-    """Greedy returns on the graph of the claims, by agent and whether first rewards were given."""
+def returns(unique: str) -> dict[tuple[str, bool], list[float]]:
+    """Greedy returns on a graph of the claims, by agent and whether first rewards were given."""
     found: dict[tuple[str, bool], list[float]] = {}
     with open(FOLDER / "memory_cells.csv", newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             graph = (line["depth"], line["wait_prob"], line["unique_decisions"], line["num_wait_images"])
-            if graph == ("2", "0.9", "False", "500"):
+            if graph == ("2", "0.9", unique, "500"):
                 found.setdefault((line["agent"], line["guide_frames"] != "0"), []).append(float(line["greedy_return"]))
     return {key: values for key, values in found.items() if len(values) == 5}
+
+
+@pytest.fixture(scope="module")
+def hardest():
+    return returns("False")
+
+
+@pytest.fixture(scope="module")
+def told_apart():
+    return {name: values for (name, given), values in returns("True").items() if given}
 
 
 def test_the_page_is_what_its_raw_results_make(cells):
@@ -50,8 +59,11 @@ def test_each_run_is_one_line_with_the_share_of_the_gap_or_its_reason(cells):
             assert float(line["memory_gap_closed"]) == pytest.approx(share, abs=1e-6)
 
 
-def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(hardest):
-    solved = {key: f"{sum(value >= 0.9 for value in values)} of 5" for key, values in hardest.items()}
+def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(hardest, told_apart):
+    solved, unique = (
+        {key: f"{sum(value >= 0.9 for value in values)} of 5" for key, values in found.items()}
+        for found in (hardest, told_apart)
+    )
     cell, one, six = "lstm_ppo", "dqn, 1 step", "dqn, 6 steps"
 
     of = {name: solved[name, True] for name, given in solved if given}
@@ -63,10 +75,12 @@ def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(har
     rows = {"DQN, 1 step": one, "QRDQN+LSTM": "qrdqn_lstm", "AMRL-Avg": f"{cell}-amrl_avg", "MOHQA": "mohqa"}
     for row, name in rows.items():
         given, to_find = (solved.get((name, guided), "not run") for guided in (True, False))
-        assert f"| {row} | {given} | {to_find} |" in PAGE
+        assert f"| {row} | {given} | {to_find} | {unique.get(name, 'not run')} |" in PAGE
+    assert f"Backpropamine, which solves the graph in {of[f'{cell}-backpropamine']}" in PAGE
+    assert f"PPO without one solves the graph in {unique[f'{cell}-none']} seeds" in PAGE
 
 
-def test_what_the_page_says_in_words_of_the_claims_holds(hardest):
+def test_what_the_page_says_in_words_of_the_claims_holds(hardest, told_apart):
     best = {key: max(values) for key, values in hardest.items()}
     to_find = [value for (_, given), value in best.items() if not given]
 
@@ -74,4 +88,9 @@ def test_what_the_page_says_in_words_of_the_claims_holds(hardest):
     assert "the claim holds here of every agent that was run, an LSTM and a GRU among them" in PAGE
     assert all(best[name, True] < 0.9 for name in ("a2c", "reinforce", "dqn, 1 step", "dqn, 6 steps", "lstm_ppo-none"))
     assert all(sum(value >= 0.9 for value in hardest[f"lstm_ppo-amrl_{kind}", True]) >= 4 for kind in ("max", "avg"))
-    assert "With first rewards given it does not hold of AMRL" in PAGE
+    assert sum(value >= 0.9 for value in hardest["lstm_ppo-backpropamine", True]) >= 3
+    assert "With first rewards given it does not hold of AMRL, nor of Backpropamine" in PAGE
+    assert all(sum(value >= 0.9 for value in told_apart[name]) <= 1 for name in ("a2c", "reinforce", "dqn, 1 step"))
+    assert all(min(told_apart[name]) >= 0.9 for name in ("dqn, 6 steps", "qrdqn_lstm"))
+    assert "The claim then still holds of A2C, REINFORCE and DQN with one step" in PAGE
+    assert "It does not hold of DQN with six steps and of QRDQN+LSTM" in PAGE
