@@ -77,6 +77,10 @@ def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(har
         given, to_find = (solved.get((name, guided), "not run") for guided in (True, False))
         assert f"| {row} | {given} | {to_find} | {unique.get(name, 'not run')} |" in PAGE
     assert f"Backpropamine, which solves the graph in {of[f'{cell}-backpropamine']}" in PAGE
+    assert (
+        f"It did not show here: MOHQA solves that graph in {unique['mohqa']} seeds" in PAGE
+        and unique["mohqa"] == "0 of 5"
+    )
     assert f"PPO without one solves the graph in {unique[f'{cell}-none']} seeds" in PAGE
 
 
