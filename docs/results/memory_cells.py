@@ -222,10 +222,10 @@ def page() -> str:
 
 
 def draw(path: Path) -> None:
-    """Draw the greedy return of every seed on the hardest graph and on that without waiting, with first rewards."""
+    """Draw the greedy return of every seed with first rewards given, on graphs that more than one agent has learned."""
     from ctgraph_rl.visualize.style import new_figure, save_figure
 
-    of = {condition: each for condition, each in graphs().items() if condition[5] != "0"}
+    of = {condition: each for condition, each in graphs().items() if condition[5] != "0" and len(each) > 1}
     figure = new_figure(3.2 + 2.4 * (len(of) - 1), 3.4)
     panels = figure.subplots(1, len(of), sharey=True, squeeze=False)[0]
     names = [name for name in AGENTS if any(name in each for each in of.values())]
