@@ -81,8 +81,8 @@ def settings(name: str) -> dict[str, Any]:
 def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
     """Return an agent on the CPU, with the hyperparameters of its yaml file and changes of them."""
     values = {**settings(name), **changes}
-    module, _, name = values.pop("_target_").rpartition(".")
-    kind: Any = class_named(module, name)
+    module, _, of_class = values.pop("_target_").rpartition(".")
+    kind: Any = class_named(module, of_class)
     return kind(*specs_of([task]), **values)
 
 

@@ -137,7 +137,7 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
     for sentence in (
         f"Fused steps reach {su:.1f} billion observations a second (SU) and {co:.1f} billion (CO), "
         f"{su / copied:.2f} and {co / copied:.2f} of a copy",
-        f"of a microsecond each: {plain_su:.2f} and {plain_co:.2f} billion.",
+        f"two microseconds: {plain_su:.2f} (SU) and {plain_co:.2f} billion (CO).",
         f"each pixel: {noisy:.1f} billion, fused, and {plain_noisy:.2f} without",
         f"PPO learns from {ppo:.0f} million steps a second at 65,536 environments, and from {compiled:.0f} million "
         f"compiled; LSTM-PPO from {lstm:.1f} million.",
