@@ -69,6 +69,19 @@ def test_clusters_are_those_of_dbscan():
     assert found.tolist() == [[1, 1, 1, 1, 1, -1, -1, 7, 7, 7]]
 
 
+@pytest.mark.parametrize(("found", "left"), [(0, 10), (1, 0)])
+def test_steps_in_no_window_yet_are_forgotten_at_a_doubt_and_by_a_new_label(found, left, monkeypatch):
+    detector = amd(window=30)
+    monkeypatch.setattr(detector, "_label_of", lambda windows: found)
+
+    assert detector.observe(independent(1, [0.5, 0.3, 0.2], 0)) is None
+    assert (detector.is_doubted, len(detector.pending)) == (found == 1, left)
+
+    detector.pending = torch.zeros(7, 3, dtype=torch.int64)
+    detector.start_label(1, trial=False)
+    assert (detector.is_doubted, len(detector.pending)) == (False, 0)
+
+
 def test_counts_hold_what_occurred_alone():
     counts = Counts()
     counts.add(torch.tensor([7, 2, 7]))
