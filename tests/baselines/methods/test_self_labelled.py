@@ -258,11 +258,12 @@ def test_features_and_observation_ids_are_there_for_other_agents(compose, agent)
 
 
 def test_each_task_is_evaluated_with_the_label_that_acted_in_most_of_its_frames(compose, monkeypatch):
-    asked: list[int | None] = []
-    policy_for_label = SelfLabelledAgent.policy_for_label
-    monkeypatch.setattr(
-        SelfLabelledAgent, "policy_for_label", lambda self, label: asked.append(label) or policy_for_label(self, label)
-    )
+    asked, played = list[int | None](), list[int]()
+    for name, to in (("policy_for_label", asked), ("policy_for", played)):
+        kept = getattr(SelfLabelledAgent, name)
+        monkeypatch.setattr(
+            SelfLabelledAgent, name, lambda self, label, to=to, kept=kept: to.append(label) or kept(self, label)
+        )
     evaluation = Evaluation(2, every=112)
     curriculum = of(Block(ONE, 96), Block(TWO, 96), evaluation=evaluation, boundaries="hidden")
 
@@ -270,6 +271,7 @@ def test_each_task_is_evaluated_with_the_label_that_acted_in_most_of_its_frames(
 
     before, first, within, last = [None, None], [1, None], [1, 0], [1, 2]  # within: the second task's first batch acts
     assert asked == [*before, *first, *within, *last]
+    assert played == [0, 0, 1, 2, 1, 0, 1, 2]  # a task without a label has the next one that would be opened
 
 
 def test_an_alarm_counts_once_where_a_batch_goes_over_a_boundary(compose):
