@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import sys
 
 import pytest
 from helpers.paths import CHECKOUT
+from omegaconf import OmegaConf
 
 FOLDER = CHECKOUT / "docs" / "results"
 PAGE = " ".join((FOLDER / "memory.md").read_text(encoding="utf-8").split())
@@ -17,7 +19,7 @@ def cells():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(FOLDER))
         yield __import__("memory_cells")
-        for name in ("memory_cells", "raw"):
+        for name in ("memory_cells", "memory_ladder", "memory_runs", "raw"):
             sys.modules.pop(name, None)
 
 
@@ -26,8 +28,8 @@ def returns(unique: str) -> dict[tuple[str, bool], list[float]]:
     found: dict[tuple[str, bool], list[float]] = {}
     with open(FOLDER / "memory_cells.csv", newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            graph = (line["depth"], line["wait_prob"], line["unique_decisions"], line["num_wait_images"])
-            if graph == ("2", "0.9", unique, "500"):
+            graph = (line["wait_prob"], line["unique_decisions"], line["num_wait_images"], line["read_noise"])
+            if graph == ("0.9", unique, "500", "0"):
                 found.setdefault((line["agent"], line["guide_frames"] != "0"), []).append(float(line["greedy_return"]))
     return {key: values for key, values in found.items() if len(values) == 5}
 
@@ -39,7 +41,7 @@ def hardest():
 
 @pytest.fixture(scope="module")
 def told_apart():
-    return {name: values for (name, given), values in returns("True").items() if given}
+    return returns("True")
 
 
 def test_the_page_is_what_its_raw_results_make(cells):
@@ -47,10 +49,13 @@ def test_the_page_is_what_its_raw_results_make(cells):
 
 
 def test_each_run_is_one_line_with_the_share_of_the_gap_or_its_reason(cells):
-    lines = cells.read(cells.NAME)
+    ladder = cells.memory_ladder
+    conditions = {cells.NAME: cells.Condition._fields, ladder.NAME: ("depth", "expected_length", *cells.SETTINGS)}
+    lines = {name: cells.read(name) for name in conditions}
 
-    assert len({tuple(line[key] for key in ("agent", "seed", *cells.CONDITION)) for line in lines}) == len(lines)
-    for line in lines:
+    for name, of in lines.items():
+        assert len({tuple(line[key] for key in ("agent", "seed", *conditions[name])) for line in of}) == len(of)
+    for line in itertools.chain(*lines.values()):
         best, ceiling = float(line["optimum"]), float(line["ceiling_without_memory"])
         share = (float(line["greedy_return"]) - ceiling) / (best - ceiling) if best > ceiling else None
         if share is None:
@@ -74,14 +79,14 @@ def test_seeds_that_solve_the_hardest_graph_are_counted_from_the_raw_results(har
     assert f"and in {of[six]} with six. QRDQN+LSTM does in {of['qrdqn_lstm']}." in PAGE
     rows = {"DQN, 1 step": one, "QRDQN+LSTM": "qrdqn_lstm", "AMRL-Avg": f"{cell}-amrl_avg", "MOHQA": "mohqa"}
     for row, name in rows.items():
-        given, to_find = (solved.get((name, guided), "not run") for guided in (True, False))
-        assert f"| {row} | {given} | {to_find} | {unique.get(name, 'not run')} |" in PAGE
+        cells = [of.get((name, guided), "not run") for of in (solved, unique) for guided in (True, False)]
+        assert f"| {row} | {' | '.join(cells)} |" in PAGE
     assert f"Backpropamine, which solves the graph in {of[f'{cell}-backpropamine']}" in PAGE
     assert (
-        f"It did not show here: MOHQA solves that graph in {unique['mohqa']} seeds" in PAGE
-        and unique["mohqa"] == "0 of 5"
+        f"It did not show here: MOHQA solves that graph in {unique['mohqa', True]} seeds" in PAGE
+        and unique["mohqa", True] == "0 of 5"
     )
-    assert f"PPO without one solves the graph in {unique[f'{cell}-none']} seeds" in PAGE
+    assert f"PPO without one solves the graph in {unique[f'{cell}-none', True]} seeds" in PAGE
 
 
 def test_what_the_page_says_in_words_of_the_claims_holds(hardest, told_apart):
@@ -94,7 +99,47 @@ def test_what_the_page_says_in_words_of_the_claims_holds(hardest, told_apart):
     assert all(sum(value >= 0.9 for value in hardest[f"lstm_ppo-amrl_{kind}", True]) >= 4 for kind in ("max", "avg"))
     assert sum(value >= 0.9 for value in hardest["lstm_ppo-backpropamine", True]) >= 3
     assert "With first rewards given it does not hold of AMRL, nor of Backpropamine" in PAGE
-    assert all(sum(value >= 0.9 for value in told_apart[name]) <= 1 for name in ("a2c", "reinforce", "dqn, 1 step"))
-    assert all(min(told_apart[name]) >= 0.9 for name in ("dqn, 6 steps", "qrdqn_lstm"))
+    assert all(
+        sum(value >= 0.9 for value in told_apart[name, True]) <= 1 for name in ("a2c", "reinforce", "dqn, 1 step")
+    )
+    assert all(min(told_apart[name, True]) >= 0.9 for name in ("dqn, 6 steps", "qrdqn_lstm"))
     assert "The claim then still holds of A2C, REINFORCE and DQN with one step" in PAGE
     assert "It does not hold of DQN with six steps and of QRDQN+LSTM" in PAGE
+
+
+def ladder_lines() -> tuple[list[dict[str, str]], list[dict[str, str]]]:
+    """Lines of the search and of the ladder."""
+    with open(FOLDER / "memory_ladder.csv", newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    return [line for line in lines if int(line["seed"]) >= 100], [line for line in lines if int(line["seed"]) < 100]
+
+
+SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
+
+
+def setting(line: dict[str, str]) -> tuple[float, ...]:
+    return tuple(float(line[key]) for key in SETTINGS)
+
+
+def test_each_memory_has_the_setting_of_the_ladder_that_did_best_in_a_search_over_all_settings(cells):
+    found, ladder = ladder_lines()
+    scores: dict[str, dict[tuple[float, ...], list[float]]] = {}
+    for line in found:
+        assert (line["depth"], line["expected_length"], line["frames"]) == ("2", "100", "409600")
+        both = float(line["greedy_return"]) + float(line["sampled_return"])
+        scores.setdefault(line["agent"], {}).setdefault(setting(line), []).append(both / 2)
+    variants = OmegaConf.load(CHECKOUT / "conf/experiment/memory_ladder.yaml").hydra.sweeper.variants
+    given = {"lstm_ppo" if v.cell == "lstm" else f"lstm_ppo-{v.cell}": v for v in variants}
+
+    for agent, of in scores.items():
+        assert len(of) == 8 and all(len(values) == 2 for values in of.values())
+        best = max(sum(values) for values in of.values())
+        assert sum(of[tuple(float(given[agent][f"agent.{key}"]) for key in SETTINGS)]) == pytest.approx(best)
+        row = PAGE.split("## By the length")[1].split(f"| {cells.AGENTS[agent]} |")[1].split("|")[:8]
+        assert [float(each.strip(" *")) for each in row] == pytest.approx([sum(of[key]) / 2 for key in of], abs=0.0051)
+        assert [place for place, each in enumerate(row) if "**" in each] == [
+            next(place for place, values in enumerate(of.values()) if sum(values) == best)
+        ]
+    assert all(
+        setting(line) == tuple(float(given[line["agent"]][f"agent.{key}"]) for key in SETTINGS) for line in ladder
+    )

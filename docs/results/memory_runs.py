@@ -1,0 +1,100 @@
+"""Raw results of the experiments with memories, and what `memory_cells` and `memory_ladder` say of each run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from raw import Raw, machine_of, mean_of
+
+SEEDS = 5
+
+TAIL = 40_960
+"""The last frames of a run, over whose training episodes the return of the acting policy is taken."""
+
+AGENTS = {
+    "lstm_ppo": "LSTM",
+    "lstm_ppo-gru": "GRU",
+    "lstm_ppo-min_gru": "minGRU",
+    "lstm_ppo-amrl_max": "AMRL-Max",
+    "lstm_ppo-amrl_avg": "AMRL-Avg",
+    "lstm_ppo-backpropamine": "Backpropamine",
+    "lstm_ppo-frames": "frame stacking",
+    "lstm_ppo-none": "no memory",
+    "a2c": "A2C",
+    "reinforce": "REINFORCE",
+    "dqn, 1 step": "DQN, 1 step",
+    "dqn, 6 steps": "DQN, 6 steps",
+    "qrdqn_lstm": "QRDQN+LSTM",
+    "mohqa": "MOHQA",
+}
+"""Names of agents with their cells, in the order of the page; PPO where no other algorithm is named."""
+
+CELLS = [name for name in AGENTS if name.startswith("lstm_ppo")]
+
+SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
+"""What differs between runs on the ladder: the environments, the steps of a sequence, learning rate, entropy bonus."""
+
+
+def measured(run: Path) -> dict[str, Any]:
+    """Return the line of a finished run: its condition, its final returns, and how soon it was near the optimum."""
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+
+    log = RunLog.read(run / LOG)
+    about, metrics = log.of_kind("run")[0], json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    evaluations, training = log.of_kind("evaluation"), log.of_kind("training")
+    frames, best = training[-1]["frames"], metrics["optimal_performance"]["value"]
+    last = [line for line in training if line["frames"] > frames - TAIL and line["episodes"]]
+    episodes = sum(line["episodes"] for line in last)
+    reached = (line["frames"] for line in evaluations if best is not None and line["return_mean"] >= 0.9 * best)
+    gap = metrics["memory_gap_closed"]
+    return {
+        "agent": agent_of(run, about["config"]),
+        "seed": about["config"]["seed"],
+        **condition(about["config"]),
+        "frames": frames,
+        "greedy_return": evaluations[-1]["return_mean"],
+        "sampled_return": round(sum(line["return_mean"] * line["episodes"] for line in last) / episodes, 6),
+        "frames_to_90": next(reached, ""),
+        "memory_gap_closed": gap["value"] if gap["value"] is not None else gap["undefined"],
+        "optimum": best,
+        "ceiling_without_memory": metrics["memoryless_ceiling"]["value"],
+        **machine_of(about),
+    }
+
+
+def agent_of(run: Path, config: dict[str, Any]) -> str:
+    """Return the key of `AGENTS` for a run."""
+    name = run.name.split("-seed")[0]
+    steps = config["agent"].get("n_steps")
+    return f"{name}, {steps} step{'s' * (steps > 1)}" if name == "dqn" else name
+
+
+def condition(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns that tell conditions apart: those of the ladder if a run is of it, else those of a graph."""
+    curriculum = config["curriculum"]
+    if curriculum["expected_length"]:
+        graph = {key: curriculum[key] for key in ("depth", "expected_length")}
+        return graph | {key: config["agent"][key] for key in SETTINGS}
+    graph = {key: curriculum[key] for key in ("wait_prob", "unique_decisions", "num_wait_images")}
+    return graph | {"guide_frames": config["protocol"]["guide_frames"] or 0, "read_noise": curriculum["read_noise"]}
+
+
+def returns(lines: Raw) -> list[float]:
+    """Return the greedy return of each seed."""
+    return [float(line["greedy_return"]) for line in lines]
+
+
+def solved(lines: Raw) -> list[bool]:
+    """Return for each seed whether its greedy return is at least 0.9."""
+    return [value >= 0.9 for value in returns(lines)]
+
+
+def cell(lines: Raw | None) -> str:
+    """Return how many seeds solve the task, and the mean greedy return and that of acting in training."""
+    if not lines:
+        return ""
+    means = (mean_of([float(line[key]) for line in lines], (0, 1)) for key in ("greedy_return", "sampled_return"))
+    return f"{sum(solved(lines))} of {len(lines)}; {'; '.join(means)}"
