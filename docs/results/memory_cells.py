@@ -159,13 +159,21 @@ def count(agent: str, condition: Condition) -> str:
     return f"{sum(solved(of[agent]))} of {len(of[agent])}" if agent in of else "not run"
 
 
+def of_rung(agent: str, rung: tuple[str, str] = ("2", "100")) -> str:
+    """Return in how many seeds an agent solves a graph of the ladder, as `count` does."""
+    lines = memory_ladder.finished().get(rung, {}).get(agent, [])
+    return f"{sum(solved(lines))} of {len(lines)}" if lines else "not run"
+
+
 def counts() -> dict[str, str]:
     """Return the numbers within the text of the page."""
     found = {}
     for name in AGENTS:
         key = re.sub("[^a-z0-9]+", "_", name.removeprefix("lstm_ppo-"))
-        found |= {key: count(name, HARDEST), f"unique_{key}": count(name, UNIQUE)}
+        found |= {key: count(name, HARDEST), f"unique_{key}": count(name, UNIQUE), f"ladder_{key}": of_rung(name)}
         found |= {f"find_{key}": count(name, TO_FIND[0]), f"find_unique_{key}": count(name, TO_FIND[1])}
+    of_search = solved(memory_ladder.searched()["lstm_ppo"][memory_ladder.best("lstm_ppo")])
+    found["search_lstm_ppo"] = f"{sum(of_search)} of {len(of_search)}"
     to_find = columns(TO_FIND[:1])[TO_FIND[0]]
     none = [name for name, lines in to_find.items() if not any(returns(lines))]
     runs = [line for each in columns(GIVEN).values() for lines in each.values() for line in lines]
@@ -222,6 +230,7 @@ def draw(path: Path) -> None:
         axes.tick_params(labelsize=7)
     for axes in [*panels[1, :4], panels[0, 4]]:
         axes.set_xlabel("greedy return", fontsize=8)
+        axes.tick_params(labelbottom=True)
     for axes in panels[:, 0]:
         axes.set_yticks(range(len(names)), [AGENTS[name] for name in names], fontsize=7)
     save_figure(figure, path)

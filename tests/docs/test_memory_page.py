@@ -160,3 +160,25 @@ def test_each_memory_has_the_setting_of_the_ladder_that_did_best_in_a_search_ove
     assert all(
         setting(line) == tuple(float(given[line["agent"]][f"agent.{key}"]) for key in SETTINGS) for line in ladder
     )
+
+
+def test_what_the_page_says_in_words_of_the_ladder_holds(cells):
+    ladder = ladder_lines()[1]
+    solved = {
+        (name, length): sum(float(line["greedy_return"]) >= 0.9 for line in lines)
+        for (name, length), lines in cells.groups(
+            [line for line in ladder if line["depth"] == "2"], "agent", "expected_length"
+        ).items()
+        if len(lines) == 5
+    }
+    names = {"AMRL-Avg": "amrl_avg", "a GRU": "gru", "AMRL-Max": "amrl_max", "minGRU": "min_gru"}
+
+    for words, name in names.items():
+        assert f"{words} in {solved[f'lstm_ppo-{name}', '100']} of 5" in PAGE
+    assert f"an LSTM in {solved['lstm_ppo', '100']} of 5. With 300 steps no cell solves any graph" in PAGE
+    assert not any(float(line["greedy_return"]) >= 0.9 for line in ladder if line["expected_length"] == "300")
+    best = setting(next(line for line in ladder if line["agent"] == "lstm_ppo"))
+    of_search = [line for line in ladder_lines()[0] if line["agent"] == "lstm_ppo" and setting(line) == best]
+    found = sum(float(line["greedy_return"]) >= 0.9 for line in of_search)
+    assert f"in {found} of 2 seeds of the search, and in {solved['lstm_ppo', '100']} of 5 of the ladder" in PAGE
+    assert {line["frames"] for line in ladder} == {"409600"}
