@@ -84,7 +84,7 @@ def collect(folders: list[Path]) -> None:
 
 def finished() -> dict[Condition, dict[str, Raw]]:
     """Return the lines of each condition and agent with all seeds, agents in the order of the page."""
-    found = {}
+    found: dict[Condition, dict[str, Raw]] = {}
     for condition, lines in groups(read(NAME), *Condition._fields).items():
         of = {agent: each for (agent,), each in groups(lines, "agent").items() if len(each) >= SEEDS}
         found[Condition(*condition)] = {agent: of[agent] for agent in AGENTS if agent in of}
@@ -167,7 +167,7 @@ def of_rung(agent: str, rung: tuple[str, str] = ("2", "100")) -> str:
 
 def counts() -> dict[str, str]:
     """Return the numbers within the text of the page."""
-    found = {}
+    found: dict[str, str] = {}
     for name in AGENTS:
         key = re.sub("[^a-z0-9]+", "_", name.removeprefix("lstm_ppo-"))
         found |= {key: count(name, HARDEST), f"unique_{key}": count(name, UNIQUE), f"ladder_{key}": of_rung(name)}
