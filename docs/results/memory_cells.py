@@ -17,7 +17,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 import memory_ladder
-from memory_runs import AGENTS, SEEDS, SETTINGS, cell, measured, returns, solved
+from memory_runs import AGENTS, SEEDS, SETTINGS, cell, count, measured, returns, solved
 from raw import HERE, Raw, groups, machines, mean_of, read, table, write
 
 NAME = "memory_cells"
@@ -153,38 +153,20 @@ def not_run() -> str:
     return "\n".join(lines) or "- nothing that was planned."
 
 
-def count(agent: str, condition: Condition) -> str:
-    """Return in how many seeds an agent solves a graph, as ``4 of 5``; ``not run`` where it was not."""
-    of = finished().get(condition, {})
-    return f"{sum(solved(of[agent]))} of {len(of[agent])}" if agent in of else "not run"
-
-
-def of_rung(agent: str, rung: tuple[str, str] = ("2", "100")) -> str:
-    """Return in how many seeds an agent solves a graph of the ladder, as `count` does."""
-    lines = memory_ladder.finished().get(rung, {}).get(agent, [])
-    return f"{sum(solved(lines))} of {len(lines)}" if lines else "not run"
-
-
 def counts() -> dict[str, str]:
     """Return the numbers within the text of the page."""
-    found: dict[str, str] = {}
-    for name in AGENTS:
-        key = re.sub("[^a-z0-9]+", "_", name.removeprefix("lstm_ppo-"))
-        found |= {key: count(name, HARDEST), f"unique_{key}": count(name, UNIQUE), f"ladder_{key}": of_rung(name)}
-        found |= {f"find_{key}": count(name, TO_FIND[0]), f"find_unique_{key}": count(name, TO_FIND[1])}
-    of_search = solved(memory_ladder.searched()["lstm_ppo"][memory_ladder.best("lstm_ppo")])
-    found["search_lstm_ppo"] = f"{sum(of_search)} of {len(of_search)}"
-    to_find = columns(TO_FIND[:1])[TO_FIND[0]]
+    of, rung = finished(), memory_ladder.finished().get(("2", "100"), {})
+    places = {"": of.get(HARDEST, {}), "unique_": of.get(UNIQUE, {}), "ladder_": rung}
+    places |= {"find_": of.get(TO_FIND[0], {}), "find_unique_": of.get(TO_FIND[1], {})}
+    keys = {name: re.sub("[^a-z0-9]+", "_", name.removeprefix("lstm_ppo-")) for name in AGENTS}
+    found = {place + keys[name]: count(each.get(name)) for place, each in places.items() for name in AGENTS}
+    found["search_lstm_ppo"] = count(memory_ladder.searched()["lstm_ppo"][memory_ladder.best("lstm_ppo")])
+    to_find = places["find_"]
     none = [name for name, lines in to_find.items() if not any(returns(lines))]
     runs = [line for each in columns(GIVEN).values() for lines in each.values() for line in lines]
     reached = [line for line in runs if line["frames_to_90"]]
-    lost = [line for line in reached if float(line["greedy_return"]) < 0.9]
-    return {
-        **found,
-        "found_none": str(len(none)),
-        "found_of": str(len(to_find)),
-        "lost": f"{len(lost)} of {len(reached)}",
-    }
+    lost = f"{len(reached) - sum(solved(reached))} of {len(reached)}"
+    return {**found, "found_none": str(len(none)), "found_of": str(len(to_find)), "lost": lost}
 
 
 def page() -> str:

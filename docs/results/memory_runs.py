@@ -57,7 +57,7 @@ def measured(run: Path) -> dict[str, Any]:
         "frames": frames,
         "greedy_return": evaluations[-1]["return_mean"],
         "sampled_return": round(sum(line["return_mean"] * line["episodes"] for line in last) / episodes, 6),
-        "frames_to_90": next(reached, ""),
+        **({"frames_to_90": next(reached, "")} if len(evaluations) > 1 else {}),
         "memory_gap_closed": gap["value"] if gap["value"] is not None else gap["undefined"],
         "optimum": best,
         "ceiling_without_memory": metrics["memoryless_ceiling"]["value"],
@@ -92,9 +92,14 @@ def solved(lines: Raw) -> list[bool]:
     return [value >= 0.9 for value in returns(lines)]
 
 
+def count(lines: Raw | None) -> str:
+    """Return how many seeds solve the task, as ``4 of 5``."""
+    return f"{sum(solved(lines))} of {len(lines)}" if lines else "not run"
+
+
 def cell(lines: Raw | None) -> str:
     """Return how many seeds solve the task, and the mean greedy return and that of acting in training."""
     if not lines:
         return ""
     means = (mean_of([float(line[key]) for line in lines], (0, 1)) for key in ("greedy_return", "sampled_return"))
-    return f"{sum(solved(lines))} of {len(lines)}; {'; '.join(means)}"
+    return f"{count(lines)}; {'; '.join(means)}"

@@ -183,3 +183,5 @@ def test_what_the_page_says_in_words_of_the_ladder_holds(cells):
     found = sum(float(line["greedy_return"]) >= 0.9 for line in of_search)
     assert f"in {found} of 2 seeds of the search, and in {solved['lstm_ppo', '100']} of 5 of the ladder" in PAGE
     assert {line["frames"] for line in ladder} == {"409600"}
+    in_search = [line["num_steps"] for line in ladder_lines()[0] if float(line["greedy_return"]) >= 0.9]
+    assert in_search.count("128") > 2 * in_search.count("32") and "more often where gradients reach back 128" in PAGE
