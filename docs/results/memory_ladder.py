@@ -1,4 +1,4 @@
-"""How long memories last: the tables and the figure of a graph whose episodes get longer, for `memory_cells`.
+"""The search and the ladder: tables and sentences of graphs whose episodes get longer, for `memory_cells`.
 
 memory_ladder.csv has the runs of two experiments. ``memory_search`` tries some values of `SETTINGS` for each cell on
 one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the setting that did best there.
@@ -6,10 +6,7 @@ one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the se
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-from memory_runs import AGENTS, CELLS, SEEDS, SETTINGS, cell, solved
+from memory_runs import AGENTS, CELLS, SEEDS, SETTINGS, count, mean, ranking, solved
 from raw import Raw, groups, read, table
 
 NAME = "memory_ladder"
@@ -20,16 +17,23 @@ SEARCHED = ("100", "101")
 RUNGS = [(depth, length) for depth in "234" for length in (("6" if depth == "2" else "10"), "30", "100", "300")]
 """Depth and expected length of the ladder's graphs; 10 is the shortest at depth 4."""
 
+LOW = 0.2
+"""A search whose best score is below this has found no setting that learns."""
+
 
 def searched() -> dict[str, dict[tuple[str, ...], Raw]]:
-    """Return the lines of the search by agent and setting, settings in the order of the file."""
+    """Return the lines of the search by agent and setting, settings in the order of the file, of finished settings."""
     lines = [line for line in read(NAME) if line["seed"] in SEARCHED]
-    return {agent: groups(own, *SETTINGS) for (agent,), own in groups(lines, "agent").items()}
+    of = {agent: groups(own, *SETTINGS) for (agent,), own in groups(lines, "agent").items()}
+    return {
+        agent: {setting: own for setting, own in each.items() if len(own) == len(SEARCHED)}
+        for agent, each in of.items()
+    }
 
 
 def score(lines: Raw) -> float:
     """Return what the search maximises: the mean over seeds of the greedy return and of that of acting in training."""
-    return sum(float(line["greedy_return"]) + float(line["sampled_return"]) for line in lines) / (2 * len(lines))
+    return (mean(lines, "greedy_return") + mean(lines, "training_return")) / 2
 
 
 def best(agent: str) -> tuple[str, ...]:
@@ -46,19 +50,18 @@ def search_table() -> str:
     for name in (name for name in CELLS if name in of):
         scores = {setting: f"{score(lines):.2f}" for setting, lines in of[name].items()}
         scores[best(name)] = f"**{scores[best(name)]}**"
-        rows.append([AGENTS[name], *(scores.get(setting, "") for setting in settings)])
-    heads = [f"{steps} steps, {rate}, {entropy}" for _, steps, rate, entropy in settings]
-    return table(["", *heads], rows)
+        rows.append([AGENTS[name], *(scores.get(setting, "not run") for setting in settings)])
+    return table(["", *(f"{steps} / {rate} / {entropy}" for _, steps, rate, entropy in settings)], rows)
 
 
 def finished() -> dict[tuple[str, str], dict[str, Raw]]:
-    """Return the lines of each rung and cell with all seeds."""
+    """Return the lines of each rung and cell with all seeds, which have one setting."""
     found: dict[tuple[str, str], dict[str, Raw]] = {}
     lines = [line for line in read(NAME) if line["seed"] not in SEARCHED]
-    for (depth, length, agent), own in groups(lines, "depth", "expected_length", "agent").items():
-        if len(own) >= SEEDS:
+    for (depth, length, agent, *_), own in groups(lines, "depth", "expected_length", "agent", *SETTINGS).items():
+        if len(own) == SEEDS:
             found.setdefault((depth, length), {})[agent] = own
-    return found
+    return {rung: {agent: of[agent] for agent in CELLS if agent in of} for rung, of in found.items()}
 
 
 def wanted() -> list[tuple[str, list[str], dict[str, Raw]]]:
@@ -67,47 +70,42 @@ def wanted() -> list[tuple[str, list[str], dict[str, Raw]]]:
     return [(f"depth {depth}, {length} steps", CELLS, of.get((depth, length), {})) for depth, length in RUNGS]
 
 
-def ladder_table() -> str:
-    """Return a line for each depth and cell, a column for each expected length."""
-    of, rows = finished(), []
-    for depth in "234":
-        lengths = [length for each, length in RUNGS if each == depth]
-        for name in CELLS:
-            cells = [cell(of.get((depth, length), {}).get(name)) for length in lengths]
-            if any(cells):
-                rows.append([depth, AGENTS[name], *cells])
-    return table(["depth", "", "6 steps (depth 2) or 10", "30 steps", "100 steps", "300 steps"], rows)
-
-
-def draw(path: Path) -> None:
-    """Draw how many seeds solve each rung, a panel for each depth."""
-    from ctgraph_rl.visualize.style import new_figure, save_figure
-
-    of = finished()
-    names = [name for name in CELLS if any(name in each for each in of.values())]
-    figure = new_figure(7.2, 0.9 + 0.24 * len(names))
-    panels = figure.subplots(1, 3, sharey=True)
-    for axes, depth in zip(panels, "234", strict=True):
-        lengths = [length for each, length in RUNGS if each == depth]
-        for row, name in enumerate(names):
-            for column, length in enumerate(lengths):
-                _square(axes, (column, row), of.get((depth, length), {}).get(name))
-        axes.set(xlim=(-0.5, len(lengths) - 0.5), ylim=(len(names) - 0.5, -0.5))
-        axes.set_title(f"depth {depth}", fontsize=8)
-        axes.set_xticks(range(len(lengths)), lengths, fontsize=7)
-        axes.set_xlabel("steps of an episode in the mean", fontsize=7)
-        axes.tick_params(length=0)
-    panels[0].set_yticks(range(len(names)), [AGENTS[name] for name in names], fontsize=7)
-    save_figure(figure, path)
-
-
-def _square(axes: Any, place: tuple[int, int], lines: Raw | None) -> None:
-    """Draw the number of seeds that solve a rung on a grey that darkens with it."""
-    column, row = place
+def entry(lines: Raw | None) -> str:
+    """Return the seeds that solve the task, the greedy and the training return, and the training length."""
     if not lines:
-        axes.text(column, row, "not run", ha="center", va="center", fontsize=5, color="0.5")
-        return
-    number = sum(solved(lines))
-    share = number / len(lines)
-    axes.fill_between([column - 0.48, column + 0.48], row - 0.46, row + 0.46, color=str(1 - 0.8 * share), linewidth=0)
-    axes.text(column, row, str(number), ha="center", va="center", fontsize=7, color="1" if share > 0.5 else "0")
+        return "not run"
+    numbers = (mean(lines, key) for key in ("greedy_return", "training_return", "training_length"))
+    return "{}; {:.2f}; {:.2f}; {:.0f}".format(sum(solved(lines)), *numbers)
+
+
+def ladder_table(depth: str) -> str:
+    """Return a line for each cell, a column for each expected length at a depth."""
+    of = finished()
+    lengths = [length for each, length in RUNGS if each == depth]
+    rows = [[AGENTS[name], *(entry(of.get((depth, length), {}).get(name)) for length in lengths)] for name in CELLS]
+    ceilings = (line["ceiling_without_memory"] for line in read(NAME) if line["depth"] == depth)
+    value = f"*{float(next(ceilings)):.2f}*"
+    rows.append(["*best policy without memory*", *[value] * len(lengths)])
+    return table(["", *(f"{length} steps, {int(length) / (int(depth) + 1):.0f} apart" for length in lengths)], rows)
+
+
+def texts() -> dict[str, str]:
+    """Return the numbers and lists of the ladder within the text of the page."""
+    from ctgraph_rl.report.intervals import scipy
+
+    of, search = finished(), searched()
+    found = {f"ladder_{depth}_{length}": ranking(of.get((depth, length), {})) for depth, length in RUNGS}
+    low = [AGENTS[name] for name in CELLS if name in search and score(search[name][best(name)]) < LOW]
+    runs = [line for each in search.values() for lines in each.values() for line in lines]
+    by_steps = [[line for line in runs if line["num_steps"] == steps] for steps in ("128", "32")]
+    pairs = [[sum(solved(lines)), len(lines) - sum(solved(lines))] for lines in by_steps]
+    found["search_low"] = ", ".join(low)
+    found["search_steps"] = " and ".join(
+        f"{good} of {good + bad} with {steps}" for (good, bad), steps in zip(pairs, ("128", "32"), strict=True)
+    )
+    found["search_p"] = f"{scipy('stats').fisher_exact(pairs).pvalue:.2f}"
+    found["search_lstm"] = count(search["lstm_ppo"][best("lstm_ppo")])
+    found["ladder_lstm"] = count(of.get(("2", "100"), {}).get("lstm_ppo"))
+    longest = [lines for (_, length), each in of.items() if length == "300" for lines in each.values()]
+    stopped = [line for lines in longest for line in lines if float(line["training_length"]) < 10]
+    return found | {"stopped": f"{len(stopped)} of {sum(map(len, longest))}"}

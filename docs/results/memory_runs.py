@@ -1,17 +1,21 @@
-"""Raw results of the experiments with memories, and what `memory_cells` and `memory_ladder` say of each run."""
+"""Raw results of the experiments with memory cells, and what `memory_cells` and `memory_ladder` say of each run."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from raw import Raw, machine_of, mean_of
+from raw import Raw, machine_of
 
 SEEDS = 5
 
 TAIL = 40_960
-"""The last frames of a run, over whose training episodes the return of the acting policy is taken."""
+"""The last frames of a run, over whose training episodes the training return and the training length are means."""
+
+SOLVED = 0.9
+"""The least greedy return of a seed that solves a task; the optimum is 1."""
 
 AGENTS = {
     "lstm_ppo": "LSTM",
@@ -21,11 +25,11 @@ AGENTS = {
     "lstm_ppo-amrl_avg": "AMRL-Avg",
     "lstm_ppo-backpropamine": "Backpropamine",
     "lstm_ppo-frames": "frame stacking",
-    "lstm_ppo-none": "no memory",
+    "lstm_ppo-none": "PPO (no memory)",
     "a2c": "A2C",
     "reinforce": "REINFORCE",
-    "dqn, 1 step": "DQN, 1 step",
-    "dqn, 6 steps": "DQN, 6 steps",
+    "dqn, 1 step": "DQN (1 step)",
+    "dqn, 6 steps": "DQN (6 steps)",
     "qrdqn_lstm": "QRDQN+LSTM",
     "mohqa": "MOHQA",
 }
@@ -47,8 +51,7 @@ def measured(run: Path) -> dict[str, Any]:
     evaluations, training = log.of_kind("evaluation"), log.of_kind("training")
     frames, best = training[-1]["frames"], metrics["optimal_performance"]["value"]
     last = [line for line in training if line["frames"] > frames - TAIL and line["episodes"]]
-    episodes = sum(line["episodes"] for line in last)
-    reached = (line["frames"] for line in evaluations if best is not None and line["return_mean"] >= 0.9 * best)
+    reached = (line["frames"] for line in evaluations if best is not None and line["return_mean"] >= SOLVED * best)
     gap = metrics["memory_gap_closed"]
     return {
         "agent": agent_of(run, about["config"]),
@@ -56,13 +59,18 @@ def measured(run: Path) -> dict[str, Any]:
         **condition(about["config"]),
         "frames": frames,
         "greedy_return": evaluations[-1]["return_mean"],
-        "sampled_return": round(sum(line["return_mean"] * line["episodes"] for line in last) / episodes, 6),
+        **{f"training_{name}": round(_mean_over(last, f"{name}_mean"), 6) for name in ("return", "length")},
         **({"frames_to_90": next(reached, "")} if len(evaluations) > 1 else {}),
         "memory_gap_closed": gap["value"] if gap["value"] is not None else gap["undefined"],
         "optimum": best,
         "ceiling_without_memory": metrics["memoryless_ceiling"]["value"],
         **machine_of(about),
     }
+
+
+def _mean_over(lines: list[dict[str, Any]], key: str) -> float:
+    """Return a mean over the episodes of some lines of a log."""
+    return sum(line[key] * line["episodes"] for line in lines) / sum(line["episodes"] for line in lines)
 
 
 def agent_of(run: Path, config: dict[str, Any]) -> str:
@@ -88,18 +96,34 @@ def returns(lines: Raw) -> list[float]:
 
 
 def solved(lines: Raw) -> list[bool]:
-    """Return for each seed whether its greedy return is at least 0.9."""
-    return [value >= 0.9 for value in returns(lines)]
+    """Return for each seed whether it solves the task after training."""
+    return [value >= SOLVED for value in returns(lines)]
+
+
+def solved_once(lines: Raw) -> list[bool]:
+    """Return for each seed whether it solves the task at any evaluation."""
+    return [bool(line["frames_to_90"]) for line in lines]
+
+
+def mean(lines: Raw, key: str) -> float:
+    """Return the mean of a column over seeds."""
+    return sum(float(line[key]) for line in lines) / len(lines)
 
 
 def count(lines: Raw | None) -> str:
-    """Return how many seeds solve the task, as ``4 of 5``."""
+    """Return how many seeds solve the task after training, as ``4 of 5``."""
     return f"{sum(solved(lines))} of {len(lines)}" if lines else "not run"
 
 
-def cell(lines: Raw | None) -> str:
-    """Return how many seeds solve the task, and the mean greedy return and that of acting in training."""
-    if not lines:
-        return ""
-    means = (mean_of([float(line[key]) for line in lines], (0, 1)) for key in ("greedy_return", "sampled_return"))
-    return f"{count(lines)}; {'; '.join(means)}"
+def ranking(of: Mapping[str, Raw]) -> str:
+    """Return the agents by how many seeds solve the task after training, as ``4 of 5: LSTM, GRU; 0 of 5: A2C``."""
+    by_count: dict[int, list[str]] = {}
+    for name, lines in of.items():
+        by_count.setdefault(sum(solved(lines)), []).append(AGENTS[name])
+    last = min(by_count, default=0)
+    if len(by_count) == 1:
+        return f"{last} of {SEEDS} with all {len(of)} agents"
+    parts = [f"{number} of {SEEDS}: {', '.join(by_count[number])}" for number in sorted(by_count, reverse=True)]
+    if len(by_count[last]) > 4:
+        parts[-1] = f"{last} of {SEEDS}: the other {len(by_count[last])}"
+    return "; ".join(parts)
