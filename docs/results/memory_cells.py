@@ -53,7 +53,8 @@ def texts() -> dict[str, str]:
     found = {place: ranking(of.get(condition, {})) for place, condition in places.items()}
     found |= {f"mohqa_{place}": count(of.get(condition, {}).get("mohqa")) for place, condition in places.items()}
     found["differ"], found["alike"] = memory_graphs.distinguishable()
-    return found | memory_ladder.texts() | {"lost": memory_graphs.lost(), "intervals": memory_graphs.intervals()}
+    found |= {"lost": memory_graphs.lost(), "with_noise": memory_graphs.with_noise()}
+    return found | memory_ladder.texts() | {"intervals": memory_graphs.intervals()}
 
 
 def page() -> str:

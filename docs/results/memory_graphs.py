@@ -70,6 +70,14 @@ def noise_table() -> str:
     return table(["", "", "without noise", f"noise up to {NOISE}"], rows)
 
 
+def with_noise() -> str:
+    """Return how many of all runs with noise solve the task after training, and of those without."""
+    of = finished()
+    pairs = [(of[noisy._replace(read_noise="0")][name], lines) for noisy in NOISY for name, lines in of[noisy].items()]
+    plain, noise = ([line for lines in each for line in lines] for each in zip(*pairs, strict=True))
+    return f"{count(noise)} runs with noise and {count(plain)} without"
+
+
 def totals() -> dict[str, Raw]:
     """Return the lines of each agent on all graphs with first rewards given, of those that ran on all."""
     each = columns(GIVEN).values()
