@@ -15,8 +15,8 @@ from string import Template
 import memory_figures
 import memory_graphs
 import memory_ladder
-from memory_conditions import GIVEN, NAME, NOISY, SHARED, TO_FIND, UNIQUE, Condition, finished
-from memory_runs import AGENTS, SETTINGS, count, measured, ranking
+from memory_conditions import GIVEN, NAME, NOISY, NOISY_AGENTS, SHARED, TO_FIND, UNIQUE, Condition, finished
+from memory_runs import AGENTS, SETTINGS, count, measured, ranking, solved_once
 from raw import HERE, machines, write
 
 
@@ -24,26 +24,26 @@ def collect(folders: list[Path]) -> None:
     """Write the raw results of the finished runs under some folders."""
     paths = [path for folder in folders for path in folder.rglob("metrics.json") if "experts" not in path.parts]
     lines, order = [measured(path.parent) for path in paths], list(AGENTS)
-    for name, keys in ((NAME, Condition._fields), (memory_ladder.NAME, ("depth", "expected_length", *SETTINGS))):
-        own = [
-            (*(float(line[key]) for key in keys), order.index(line["agent"]), line["seed"], line)
-            for line in lines
-            if keys[0] in line
-        ]
-        write(name, [line for *_, line in sorted(own, key=lambda each: each[:-1])])
+    on_ladder = [line for line in lines if "expected_length" in line]
+    on_graphs = [line for line in lines if "expected_length" not in line]
+    for name, own, keys in (
+        (NAME, on_graphs, Condition._fields),
+        (memory_ladder.NAME, on_ladder, ("depth", "expected_length", *SETTINGS)),
+    ):
+        place = [(*(float(line[key]) for key in keys), order.index(line["agent"]), line["seed"]) for line in own]
+        write(name, [own[i] for i in sorted(range(len(own)), key=place.__getitem__)])
 
 
 def not_run() -> str:
     """Return a list of what the page has no number of, or that it has all."""
     of, lines = finished(), []
-    of_noise = [name for name in AGENTS if name in ("lstm_ppo", "lstm_ppo-gru")]
     wanted = [(str(condition), list(AGENTS), of.get(condition, {})) for condition in [*GIVEN, *TO_FIND]]
-    wanted += [(str(condition), of_noise, of.get(condition, {})) for condition in NOISY]
+    wanted += [(str(condition), list(NOISY_AGENTS), of.get(condition, {})) for condition in NOISY]
     for what, agents, each in [*wanted, *memory_ladder.wanted()]:
         missing = [AGENTS[name] for name in agents if name not in each]
         if missing:
             lines.append(f"- {what}: {'all' if len(missing) == len(agents) else ', '.join(missing)}.")
-    return "\n".join(["No number is on this page of:\n", *lines]) if lines else "All runs that were planned are here."
+    return "\n".join(["Not run yet:\n", *lines]) if lines else "All runs that were planned are on this page."
 
 
 def texts() -> dict[str, str]:
@@ -52,7 +52,10 @@ def texts() -> dict[str, str]:
     places = {"shared": SHARED, "unique": UNIQUE, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
     found = {place: ranking(of.get(condition, {})) for place, condition in places.items()}
     found |= {f"mohqa_{place}": count(of.get(condition, {}).get("mohqa")) for place, condition in places.items()}
-    found["differ"], found["alike"] = memory_graphs.distinguishable()
+    one_step = {place: of[places[place]]["dqn, 1 step"] for place in ("unique", "find_unique")}
+    found |= {f"dqn_{place}": count(lines) for place, lines in one_step.items()}
+    found |= {f"dqn_{place}_once": str(sum(solved_once(lines))) for place, lines in one_step.items()}
+    found["lower"], found["alike"] = memory_graphs.distinguishable()
     found |= {"lost": memory_graphs.lost(), "with_noise": memory_graphs.with_noise()}
     return found | memory_ladder.texts() | {"intervals": memory_graphs.intervals()}
 

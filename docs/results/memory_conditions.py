@@ -60,6 +60,7 @@ TO_FIND = [Condition("0.9", unique, "500", "0") for unique in ("False", "True")]
 NOISY = [
     Condition(wait_prob, "False", images, GUIDED, NOISE) for wait_prob in ("0.5", "0.9") for images in ("100", "500")
 ]
+NOISY_AGENTS = ("lstm_ppo", "lstm_ppo-gru")
 SHARED, UNIQUE = Condition("0.9", "False", "500"), Condition("0.9", "True", "500")
 """The graphs that the published claim can be about, with first rewards given."""
 

@@ -4,10 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from memory_conditions import GIVEN, NOISE, NOISY, SHARED, TO_FIND, UNIQUE, Condition, columns, finished
+from memory_conditions import (
+    GIVEN,
+    NOISE,
+    NOISY,
+    NOISY_AGENTS,
+    SHARED,
+    TO_FIND,
+    UNIQUE,
+    Condition,
+    columns,
+    finished,
+)
 from memory_runs import AGENTS, count, mean, returns, solved, solved_once
 from raw import Raw, interval_of, shown, table
+
+if TYPE_CHECKING:
+    from ctgraph_rl.report.statistics import Comparison
 
 RIVALS = ("dqn, 1 step", "dqn, 6 steps", "qrdqn_lstm", "reinforce", "a2c", "lstm_ppo-amrl_max", "lstm_ppo-amrl_avg")
 RIVALS += ("lstm_ppo-backpropamine",)
@@ -56,8 +71,8 @@ def median_frames(lines: Raw | None) -> str:
     from ctgraph_rl.report import statistics
 
     times = [float(line["frames_to_90"] or math.inf) for line in lines]
-    median, reached = statistics.median_time(times).value or 0.0, sum(map(math.isfinite, times))
-    return f"{median / 1000:.0f} ({reached})" if math.isfinite(median) else f"never ({reached})"
+    median, reached = statistics.median_time(times).value, sum(map(math.isfinite, times))
+    return f"never ({reached})" if median is None or math.isinf(median) else f"{median / 1000:.0f} ({reached})"
 
 
 def noise_table() -> str:
@@ -65,16 +80,19 @@ def noise_table() -> str:
     of, rows = finished(), []
     for noisy in NOISY:
         plain = of.get(noisy._replace(read_noise="0"), {})
-        for name, lines in of.get(noisy, {}).items():
-            rows.append([f"p = {noisy.wait_prob}, {noisy.graph}", AGENTS[name], entry(plain.get(name)), entry(lines)])
+        for name in NOISY_AGENTS:
+            entries = (entry(each.get(name)) for each in (plain, of.get(noisy, {})))
+            rows.append([f"p = {noisy.wait_prob}, {noisy.graph}", AGENTS[name], *entries])
     return table(["", "", "without noise", f"noise up to {NOISE}"], rows)
 
 
 def with_noise() -> str:
     """Return how many of all runs with noise solve the task after training, and of those without."""
     of = finished()
-    pairs = [(of[noisy._replace(read_noise="0")][name], lines) for noisy in NOISY for name, lines in of[noisy].items()]
-    plain, noise = ([line for lines in each for line in lines] for each in zip(*pairs, strict=True))
+    noise, plain = (
+        [line for noisy in NOISY for name in NOISY_AGENTS for line in of[noisy._replace(read_noise=level)][name]]
+        for level in (NOISE, "0")
+    )
     return f"{count(noise)} runs with noise and {count(plain)} without"
 
 
@@ -84,10 +102,20 @@ def totals() -> dict[str, Raw]:
     return {name: [line for of in each for line in of[name]] for name in AGENTS if all(name in of for of in each)}
 
 
+def compared(of: Mapping[str, Raw]) -> dict[str, tuple[Comparison, float]]:
+    """Return the paired comparison of each agent's greedy returns with the LSTM's, and its p-value after Holm."""
+    from ctgraph_rl.report import statistics
+
+    base, others = returns(of["lstm_ppo"]), [name for name in of if name != "lstm_ppo"]
+    found = [statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in others]
+    corrected = statistics.holm([each.p_value for each in found])
+    return {name: (each, p) for name, each, p in zip(others, found, corrected, strict=True) if p is not None}
+
+
 def total_table() -> str:
     """Return a line for each agent: how many of all runs solve the task, and the difference from the LSTM."""
     of = totals()
-    p_values, rows = differences(of), []
+    comparisons, rows = compared(of), []
     for name in sorted(of, key=lambda name: -sum(solved(of[name]))):
         lines = of[name]
         row = [
@@ -96,7 +124,10 @@ def total_table() -> str:
             f"{sum(solved_once(lines))}",
             f"{mean(lines, 'greedy_return'):.2f}",
         ]
-        rows.append([*row, *p_values.get(name, ("", ""))])
+        if name in comparisons:
+            comparison, p = comparisons[name]
+            row += [shown(comparison.difference), f"{p:.3f}"]
+        rows.append([*row, "", ""][:6])
     number = len(next(iter(of.values())))
     heads = [
         f"solved after training, of {number}",
@@ -108,33 +139,30 @@ def total_table() -> str:
     return table(["", *heads], rows)
 
 
-def differences(of: Mapping[str, Raw]) -> dict[str, tuple[str, str]]:
-    """Return the paired difference of each agent's greedy return from the LSTM's, and its p-value after Holm."""
-    from ctgraph_rl.report import statistics
-
-    base, others = returns(of["lstm_ppo"]), [name for name in of if name != "lstm_ppo"]
-    found = [statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in others]
-    corrected = statistics.holm([each.p_value for each in found])
-    shown_p = [f"{p:.3f}" if p >= 0.001 else "< 0.001" for p in (each or 0.0 for each in corrected)]
-    return {name: (shown(each.difference), p) for name, each, p in zip(others, found, shown_p, strict=True)}
-
-
 def distinguishable() -> tuple[str, str]:
-    """Return the agents that differ from the LSTM over all graphs, p <= 0.05 after Holm, and those that do not."""
-    p_values = {name: p for name, (_, p) in differences(totals()).items()}
-    fewer = [AGENTS[name] for name, p in p_values.items() if p.startswith("<") or float(p) <= 0.05]
-    return listed(fewer), listed([AGENTS[name] for name in p_values if AGENTS[name] not in fewer])
+    """Return the agents whose returns are lower than the LSTM's, p <= 0.05 after Holm, and those not distinguishable.
+
+    Raises:
+        ValueError: for an agent with higher returns, of which the page has no word.
+    """
+    lower, alike = [], []
+    for name, (comparison, p) in compared(totals()).items():
+        if p <= 0.05 and (comparison.difference.value or 0) > 0:
+            raise ValueError(f"{name} has higher returns than the LSTM: the page says otherwise")
+        (lower if p <= 0.05 else alike).append(AGENTS[name])
+    return listed(lower), listed(alike)
 
 
 def lost() -> str:
-    """Return how many of the runs that solved the task at an evaluation did not after training, by agent."""
+    """Return how many runs that solved the task at an evaluation did not after training, by agent; without noise."""
     each = columns([*GIVEN, *TO_FIND]).values()
     runs = {name: [line for of in each for line in of.get(name, [])] for name in AGENTS}
     once = {name: [line for line in lines if line["frames_to_90"]] for name, lines in runs.items()}
     gone = {name: len(lines) - sum(solved(lines)) for name, lines in once.items()}
     worst = sorted((name for name in once if gone[name]), key=lambda name: -gone[name] / len(once[name]))
     parts = [f"{AGENTS[name]} {gone[name]} of {len(once[name])}" for name in worst]
-    return f"{sum(gone.values())} of {sum(map(len, once.values()))} runs: {', '.join(parts)}"
+    whole = f"Of {sum(map(len, once.values()))} runs that solved the task at an evaluation, {sum(gone.values())}"
+    return f"{whole} did not after training: {', '.join(parts)}"
 
 
 def claim_table() -> str:

@@ -51,7 +51,7 @@ def measured(run: Path) -> dict[str, Any]:
     evaluations, training = log.of_kind("evaluation"), log.of_kind("training")
     frames, best = training[-1]["frames"], metrics["optimal_performance"]["value"]
     last = [line for line in training if line["frames"] > frames - TAIL and line["episodes"]]
-    reached = (line["frames"] for line in evaluations if best is not None and line["return_mean"] >= SOLVED * best)
+    reached = (line["frames"] for line in evaluations if line["return_mean"] >= SOLVED * best)
     gap = metrics["memory_gap_closed"]
     return {
         "agent": agent_of(run, about["config"]),
@@ -77,7 +77,9 @@ def agent_of(run: Path, config: dict[str, Any]) -> str:
     """Return the key of `AGENTS` for a run."""
     name = run.name.split("-seed")[0]
     steps = config["agent"].get("n_steps")
-    return f"{name}, {steps} step{'s' * (steps > 1)}" if name == "dqn" else name
+    if name != "dqn":
+        return name
+    return "dqn, 1 step" if steps == 1 else f"dqn, {steps} steps"
 
 
 def condition(config: dict[str, Any]) -> dict[str, Any]:

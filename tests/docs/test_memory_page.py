@@ -5,14 +5,17 @@ from __future__ import annotations
 import csv
 import itertools
 import re
+import shlex
 import sys
 from collections import defaultdict
 
 import pytest
 from helpers.paths import CHECKOUT
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.report import statistics
 from ctgraph_rl.runs import config
 from ctgraph_rl.tasks.values import random_frames_to_goal
 from curricula import co_hard
@@ -21,6 +24,7 @@ FOLDER = CHECKOUT / "docs" / "results"
 PAGE = " ".join((FOLDER / "memory.md").read_text(encoding="utf-8").split())
 CONF = CHECKOUT / "conf" / "experiment"
 RIVALS = ("DQN (1 step)", "DQN (6 steps)", "QRDQN+LSTM", "REINFORCE", "A2C", "AMRL-Max", "AMRL-Avg", "Backpropamine")
+GRAPH = ("wait_prob", "unique_decisions", "num_wait_images", "seed")
 SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
 
 Lines = list[dict[str, str]]
@@ -72,10 +76,19 @@ def named(part: str) -> list[str]:
     return re.split(", | and ", part.strip(" ."))
 
 
-def ranked(part: str) -> dict[str, int]:
-    """The number of seeds of each agent that a list such as ``4 of 5: LSTM, GRU; 0 of 5: A2C`` names."""
-    groups = [group.split(" of 5: ") for group in part.strip(" .").split("; ")]
-    return {name: int(found) for found, of in groups for name in named(of) if not name.startswith("the other")}
+def says(part: str, of: dict[str, Lines]) -> bool:
+    """Whether a list such as ``4 of 5: LSTM, GRU; 0 of 5: the other 7`` has every agent with its number of seeds."""
+    numbers = {name: number(lines) for name, lines in of.items()}
+    every = re.fullmatch(r"(\d) of 5 with all (\d+) agents", part.strip(" ."))
+    if every:
+        return set(numbers.values()) == {int(every[1])} and len(numbers) == int(every[2])
+    for group in part.strip(" .").split("; "):
+        found, names = group.split(" of 5: ")
+        own = {name for name in numbers if numbers[name] == int(found)}
+        if names != f"the other {len(own)}" and set(named(names)) != own:
+            return False
+        numbers = {name: each for name, each in numbers.items() if name not in own}
+    return not numbers
 
 
 def test_the_page_is_what_its_raw_results_make(cells):
@@ -120,56 +133,120 @@ def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
     unique, unique_to_find = (on_hardest(True, given, names) for given in (True, False))
     recurrent = ("LSTM", "GRU", "minGRU", "AMRL-Max", "AMRL-Avg", "Backpropamine")
 
-    assert all(number(shared[name]) >= 3 for name in recurrent) and "recurrent agents solve the hardest graph" in PAGE
-    listed = ranked(PAGE.split("shared decisions after training: ")[1].split(" - **")[0])
-    assert set(recurrent) <= set(listed) and listed.items() <= {name: number(of) for name, of in shared.items()}.items()
+    assert all(number(shared[name]) >= 3 for name in recurrent)
+    assert "all six recurrent PPO agents solve the hardest graph" in PAGE
+    assert says(PAGE.split("shared decisions after training: ")[1].split(" - **")[0], shared)
+    assert says(PAGE.split("solve the graph with shared decisions: ")[1].split(". With unique")[0], to_find)
+    assert says(PAGE.split(". With unique decisions: ")[1].split(" - **")[0], unique_to_find)
     assert sum(map(number, to_find.values())) + sum(map(number, unique_to_find.values())) <= 2
     assert "Where agents must find the first reward themselves, nearly all fail" in PAGE
-    rewards = 409_600 / random_frames_to_goal(co_hard(wait_prob=0.9).tasks[0])
-    assert 1.5 < rewards < 2.5 and "409,600 frames hold about two rewards under random actions" in PAGE
+    task = co_hard(wait_prob=0.9).tasks[0]
+    assert 1.5 < 409_600 / random_frames_to_goal(task) < 2.5 and "frames hold about two rewards under random" in PAGE
+    assert f"meets a reward once in {1 / task.graph.reward_prob_random:,.0f} episodes" in PAGE
     assert all(number(unique[name]) >= 4 and number(shared[name]) >= 4 for name in ("AMRL-Max", "AMRL-Avg"))
     assert "AMRL solves both graphs once first rewards are given" in PAGE
-    assert all(number(each.get(name, [])) <= 1 for each in (to_find, unique_to_find) for name in RIVALS)
-    assert "that rivals of MOHQA do poorly on such graphs holds where first rewards must be found" in PAGE
-    assert min(number(each["Backpropamine"]) for each in (shared, unique)) > 1
-    assert "With first rewards given, it does not hold for AMRL and Backpropamine" in PAGE
-    assert all(at_any_evaluation(each["DQN (1 step)"]) >= 3 for each in (unique, unique_to_find))
-    assert all(number(each["DQN (1 step)"]) <= 1 for each in (unique, unique_to_find))
-    assert "solves the graph with unique decisions early and loses it again, even without first rewards" in PAGE
-    assert number(unique["PPO (no memory)"]) >= 3 and "PPO without memory is a further rival that solves" in PAGE
-    mohqa = [f"{number(of['MOHQA'])} of 5" if "MOHQA" in of else "not run" for of in (unique, unique_to_find)]
-    assert f"graph in {mohqa[0]} seeds with unique decisions and first rewards given, and in {mohqa[1]} without" in PAGE
+    assert all(number(each[name]) <= 1 for each in (to_find, unique_to_find) for name in (*RIVALS, "MOHQA"))
+    assert "agrees with these results where first rewards must be found, but MOHQA does poorly there, too" in PAGE
+    solvers = {name for name in RIVALS if number(shared[name]) > 1}
+    assert solvers == {"AMRL-Max", "AMRL-Avg", "Backpropamine"} < {name for name in RIVALS if number(unique[name]) > 1}
+    assert {name for name in RIVALS if number(unique[name]) > 1} - solvers == {"QRDQN+LSTM", "DQN (6 steps)"}
+    assert "does not hold for AMRL and Backpropamine, and with unique decisions also not for QRDQN+LSTM and DQN" in PAGE
+    assert at_any_evaluation(shared["QRDQN+LSTM"]) > 1 < at_any_evaluation(unique["DQN (1 step)"])
+    one = [each["DQN (1 step)"] for each in (unique, unique_to_find)]
+    once, after = ([f"{count(lines)}" for lines in one] for count in (at_any_evaluation, number))
+    assert f"in {once[0]} of 5 seeds with first rewards given and in {once[1]} without, and after" in PAGE
+    assert f"after training in {after[0]} of 5 and {after[1]} of 5." in PAGE
+    assert number(unique["PPO (no memory)"]) >= 3 and "which the claim does not name, solves that graph, too" in PAGE
+    given, found = (f"{number(of['MOHQA'])} of 5" for of in (unique, unique_to_find))
+    assert f"graph with unique decisions in: {given} (first rewards given), {found} (to be found)" in PAGE
 
 
 def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     table = PAGE.split("## Over all graphs")[1].split("## By graph")[0]
     lines = read("memory_cells", "guide_frames", "read_noise", "agent")
-    given = {names[key[-1]]: of for key, of in lines.items() if key[:-1] == ("204800", "0") and len(of) == 45}
+    given = {names[key[-1]]: of for key, of in lines.items() if key[:-1] == ("204800", "0")}
+    paired = {
+        name: [float(line["greedy_return"]) for line in sorted(of, key=lambda line: [line[key] for key in GRAPH])]
+        for name, of in given.items()
+    }
+    others = [name for name in given if name != "LSTM"]
+    found = [statistics.compare(paired[name], paired["LSTM"], bounds=(0, 1)) for name in others]
+    p_values = dict(zip(others, statistics.holm([each.p_value for each in found]), strict=True))
 
+    assert set(given) == set(names.values()) and {len(of) for of in given.values()} == {45}
     for name, of in given.items():
         assert f"| {name} | {number(of)} | {at_any_evaluation(of)} | " in table
-    differ = named(PAGE.split("Fewer runs are solved by")[1].split("([table]")[0])
-    alike = named(PAGE.split("is not distinguishable from")[1].split(". Fewer")[0])
-    assert sorted([*differ, *alike, "LSTM"]) == sorted(given)
-    assert max(number(given[name]) for name in differ) < number(given["LSTM"])
+    lower = named(PAGE.split("Returns are lower with")[1].split("([table]")[0])
+    alike = named(PAGE.split("is not distinguishable from")[1].split(". Returns")[0])
+    assert sorted(lower) == sorted(name for name in others if p_values[name] <= 0.05)
+    assert sorted(alike) == sorted(name for name in others if p_values[name] > 0.05)
+    assert all(sum(paired[name]) < sum(paired["LSTM"]) for name in lower)
+
+
+def line_of(cell: dict[str, str]) -> tuple[str, ...]:
+    """The agent, the seed and the condition of a cell of a sweep, as the raw results have them."""
+    name = cell["agent"] if cell.get("cell", "lstm") == "lstm" else f"{cell['agent']}-{cell['cell']}"
+    if name == "dqn":
+        name = {"1": "dqn, 1 step", "6": "dqn, 6 steps"}[cell["agent.n_steps"]]
+    ladder = ("curriculum.depth", "curriculum.expected_length", *(f"agent.{key}" for key in SETTINGS))
+    graph = ("wait_prob", "unique_decisions", "num_wait_images", "guide_frames", "read_noise")
+    places = {"guide_frames": "protocol.guide_frames"}
+    keys = ladder if "curriculum.depth" in cell else [places.get(key, f"curriculum.{key}") for key in graph]
+    return name, cell["seed"], *(cell[key].replace("true", "True").replace("false", "False") for key in keys)
+
+
+def runs_of(command: str) -> set[tuple[str, ...]]:
+    """What `line_of` returns for each run of a command of the page."""
+    name, *arguments = shlex.split(command.split("experiment=")[1])
+    experiment = OmegaConf.load(CONF / f"{name}.yaml")
+    parser = OverridesParser.create()
+    variants = [argument for argument in arguments if argument.startswith("hydra.sweeper.variants=")]
+    given = dict(argument.split("=") for argument in arguments if argument not in variants)
+    fixed = {"protocol.guide_frames": experiment.protocol.guide_frames, "curriculum.read_noise": 0}
+    found = set()
+    for variant in parser.parse_override(variants[0]).value() if variants else experiment.hydra.sweeper.variants:
+        of = {**fixed, **experiment.hydra.sweeper.params, **variant, **given}
+        parsed = {key: parser.parse_override(f"{key}={value}") for key, value in of.items()}
+        choices = (
+            [(key, value) for value in (each.sweep_string_iterator() if each.is_sweep_override() else [str(of[key])])]
+            for key, each in parsed.items()
+        )
+        found |= {line_of(dict(cell)) for cell in itertools.product(*choices)}
+    return found
+
+
+def test_the_commands_of_the_page_make_its_runs(cells):
+    text = (FOLDER / "memory.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    commands = [line for line in text.splitlines() if line.startswith("ctgraph-rl -m experiment=")]
+    conditions = {"memory_cells": cells.Condition._fields, "memory_ladder": ("depth", "expected_length", *SETTINGS)}
+    recorded = (set(read(name, "agent", "seed", *keys)) for name, keys in conditions.items())
+
+    assert set().union(*map(runs_of, commands)) == set().union(*recorded)
 
 
 def test_agents_have_the_weights_and_take_the_gradient_steps_that_the_page_says(compose):
     env = CTGraphEnv([co_hard().tasks[0]])
     words = {"a2c": "A2C", "reinforce": "REINFORCE", "dqn": "DQN, targets of 1 or 6 steps", "mohqa": "MOHQA"}
-    words |= {"qrdqn_lstm": "QRDQN+LSTM", "lstm_ppo": "PPO with each cell"}
-    weights, steps = defaultdict(set), defaultdict(set)
+    words |= {"qrdqn_lstm": "QRDQN+LSTM, targets of 6 steps", "lstm_ppo": "PPO with each cell"}
+    weights, settings = defaultdict(set), defaultdict(set)
     for variant in OmegaConf.load(CONF / "memory_cells.yaml").hydra.sweeper.variants:
         cfg = compose(*(f"{key}={value}" for key, value in variant.items()))
         agent = config.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
         updates = cfg.agent.get("num_updates", cfg.agent.get("num_epochs", 1) * cfg.agent.get("num_minibatches", 1))
         weights[variant.agent].add(sum(each.numel() for each in agent.weights))
-        steps[variant.agent].add(409_600 // (cfg.agent.num_envs * cfg.agent.num_steps) * updates)
+        size = cfg.agent.num_envs * cfg.agent.num_steps
+        batch = f"{cfg.agent.num_envs} x {cfg.agent.num_steps}"
+        exploration = "none" if variant.agent == "reinforce" else f"entropy bonus {cfg.agent.get('entropy_coeff')}"
+        if "eps_end" in cfg.agent:
+            steps = f"{cfg.agent.annealing_num_steps:,}"
+            exploration = f"epsilon from {cfg.agent.eps_init:g} to {cfg.agent.eps_end} over {steps} frames"
+        own = f"{cfg.agent.learning_rate}", batch, f"{409_600 // size * updates:,}", f"{cfg.agent.gamma}", exploration
+        settings[variant.agent].add(own)
 
     for name, row in words.items():
         cells = [each.strip() for each in PAGE.split(f"| {row} |")[1].split("|")]
         assert cells[0] == " to ".join(f"{each:,}" for each in sorted({min(weights[name]), max(weights[name])}))
-        assert {int(cells[2].replace(",", ""))} == steps[name]
+        assert {(cells[1], cells[2], cells[4], cells[5], cells[6])} == settings[name]
 
 
 def ladder_lines() -> tuple[Lines, Lines]:
@@ -192,7 +269,7 @@ def test_each_memory_has_the_setting_of_the_ladder_that_did_best_in_a_search_ove
     variants = OmegaConf.load(CONF / "memory_ladder.yaml").hydra.sweeper.variants
     given = {"lstm_ppo" if v.cell == "lstm" else f"lstm_ppo-{v.cell}": v for v in variants}
 
-    low = named(PAGE.split("No setting scores 0.2 for:")[1].split(". An entropy")[0])
+    low = named(PAGE.split("No setting scores 0.2 for:")[1].split(". The choice")[0])
 
     assert set(given) == set(scores)
     for agent, of in scores.items():
@@ -220,15 +297,21 @@ def test_what_the_page_says_in_words_of_the_ladder_holds(names):
         of[line["depth"], line["expected_length"]].setdefault(names[line["agent"]], []).append(line)
 
     assert {line["frames"] for line in ladder} == {"409600"}
-    listed = ranked(PAGE.split("expected length of 100 steps: ")[1].split(". With 300")[0])
-    assert listed.items() <= {name: number(lines) for name, lines in of["2", "100"].items()}.items() and listed
-    assert sum(number(lines) for lines in of["2", "300"].values()) == 0 and "With 300 steps: 0 of 5 with all" in PAGE
+    assert says(PAGE.split("expected length of 100 steps: ")[1].split(". With 300")[0], of["2", "100"])
+    assert says(PAGE.split("With 300 steps: ")[1].split(". With 300")[0], of["2", "300"])
+    longest = [line for (_, length), each in of.items() if length == "300" for lines in each.values() for line in lines]
+    assert number(longest) == 0 and "Episodes of 300 steps are not solved" in PAGE
     best = setting(next(line for line in ladder if line["agent"] == "lstm_ppo"))
     found = number([line for line in search if line["agent"] == "lstm_ppo" and setting(line) == best])
     assert f"in {found} of 2 seeds of the search and in {number(of['2', '100']['LSTM'])} of 5 of the ladder" in PAGE
-    longest = [line for (_, length), each in of.items() if length == "300" for lines in each.values() for line in lines]
-    stopped = [line for line in longest if float(line["training_length"]) < 10]
-    assert f"{len(stopped)} of {len(longest)} runs end with training episodes shorter than 10 steps" in PAGE
-    assert len(stopped) > 0.8 * len(longest) and "Most agents stop waiting when no policy acts for them" in PAGE
-    assert "PPO without memory earns nothing at depth 2 either" in PAGE
-    assert all(float(line["training_return"]) < 0.05 for line in of["2", "300"]["PPO (no memory)"])
+    short = [line for line in longest if float(line["training_length"]) < 10]
+    assert f"{len(short)} of {len(longest)} runs end with training episodes of fewer than 10 steps and without" in PAGE
+    assert len(short) > 0.9 * len(longest) and "nearly all agents leave wait states at once" in PAGE
+    assert {float(line["training_return"]) for line in short} == {0.0}
+    assert all(float(line["training_return"]) < 0.005 for line in of["2", "300"]["PPO (no memory)"])
+    at_100 = [float(line["training_length"]) for lines in of["2", "100"].values() for line in lines]
+    assert f"{sum(each < 10 for each in at_100)} of {len(at_100)} runs end so" in PAGE
+    assert min(float(line["training_length"]) for line in of["2", "100"]["minGRU"]) > 50
+    assert (
+        number(of["2", "100"]["minGRU"]) == 1 and "There minGRU waits in all five seeds and solves the task in" in PAGE
+    )
