@@ -212,7 +212,7 @@ def test_more_agents_than_colours_are_in_the_tables_and_it_is_said(tmp_path):
     assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 6 + 3
 
 
-@pytest.mark.parametrize("tasks", [1, pytest.param(12, marks=pytest.mark.slow), 40])
+@pytest.mark.parametrize("tasks", [1, 12, pytest.param(40, marks=pytest.mark.slow)])
 def test_any_number_of_tasks_has_its_figures(tmp_path, tasks):
     performance = [[float(task < block) for task in range(tasks)] for block in range(tasks + 1)]
     performance[0][0] = float("nan")

@@ -94,7 +94,7 @@ def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_bes
         assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
 
 
-@pytest.mark.parametrize("method", ["finetune", "ewc"])
+@pytest.mark.parametrize("method", [pytest.param("finetune", marks=pytest.mark.slow), "ewc"])
 def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit(monkeypatch, method):
     settings = (SEEDS, "together=true", f"method={method}", *PPO)
     assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
