@@ -122,6 +122,7 @@ for read, name in ((lambda path: read_plain(content_of(path)), "agent.pt"), (dec
 """
 
 
+@pytest.mark.slow
 def test_zip_bombs_are_refused_in_less_memory_than_they_ask_for(tmp_path):
     large = torch.zeros(2**26)  # 256 MiB
     bomb = archive(records_of(saved({"frames": 64, "agent": {}, "x": large})), zipfile.ZIP_DEFLATED)

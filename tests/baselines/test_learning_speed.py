@@ -200,7 +200,7 @@ def test_a_compiled_agent_learns_the_same_but_for_rounding(small_agent, name):
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in ("ppo", "dqn") else pytest.param(name, marks=pytest.mark.slow) for name in COMPILED]
+    "name", [name if name == "ppo" else pytest.param(name, marks=pytest.mark.slow) for name in COMPILED]
 )
 def test_an_agent_that_goes_on_from_a_saved_state_begins_with_a_compiled_step(small_agent, monkeypatch, name):
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))

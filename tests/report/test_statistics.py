@@ -178,6 +178,7 @@ def gain(runs, experts):
     return ((runs - experts) / (1 - experts)).mean(-1)
 
 
+@pytest.mark.slow
 def test_a_number_of_two_groups_has_the_uncertainty_of_both():
     runs, experts = np.array([[0.9], [0.8], [1.0], [0.9], [0.9]]), np.array([[0.5], [0.6], [0.4], [0.5], [0.5]])
     certain = np.repeat(experts.mean(0, keepdims=True), 10_000, 0)
