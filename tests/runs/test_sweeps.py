@@ -219,7 +219,6 @@ def test_directories_that_are_not_named_after_the_configuration_are_refused(lear
     assert "hydra.sweep.subdir must be ${run_name:}, got ${hydra.job.num}; change" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_three_hundred_cells_are_named_as_they_would_be_run_from_few_compositions(learned, monkeypatch, capsys):
     original, compositions = ConfigLoaderImpl.load_sweep_config, []
 
