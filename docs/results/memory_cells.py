@@ -49,12 +49,12 @@ def not_run() -> str:
 def texts() -> dict[str, str]:
     """Return the numbers and lists within the text of the page."""
     of = finished()
-    places = {"shared": SHARED, "unique": UNIQUE, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
-    found = {place: ranking(of.get(condition, {})) for place, condition in places.items()}
-    found |= {f"mohqa_{place}": count(of.get(condition, {}).get("mohqa")) for place, condition in places.items()}
-    one_step = {place: of[places[place]]["dqn, 1 step"] for place in ("unique", "find_unique")}
-    found |= {f"dqn_{place}": count(lines) for place, lines in one_step.items()}
-    found |= {f"dqn_{place}_once": str(sum(solved_once(lines))) for place, lines in one_step.items()}
+    ranked = {"shared": SHARED, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
+    found = {place: ranking(of.get(condition, {})) for place, condition in ranked.items()}
+    for place, condition in (("unique", UNIQUE), ("find_unique", TO_FIND[1])):
+        one_step = of[condition]["dqn, 1 step"]
+        found |= {f"dqn_{place}": count(one_step), f"dqn_{place}_once": str(sum(solved_once(one_step)))}
+        found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
     found["lower"], found["alike"] = memory_graphs.distinguishable()
     found |= {"lost": memory_graphs.lost(), "with_noise": memory_graphs.with_noise()}
     return found | memory_ladder.texts() | {"intervals": memory_graphs.intervals()}

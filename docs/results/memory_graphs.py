@@ -184,9 +184,8 @@ def verdict_table() -> str:
     for condition, of in columns(OF_CLAIM).items():
         poor = [AGENTS[name] for name in RIVALS if name in of and sum(solved(of[name])) <= POOR]
         others = [AGENTS[name] for name in RIVALS if name in of and AGENTS[name] not in poor]
-        rows.append(
-            [f"{condition.decisions} decisions, {condition.rewards}", ", ".join(poor), ", ".join(others) or "none"]
-        )
+        lists = (", ".join(names) or "none" for names in (poor, others))
+        rows.append([f"{condition.decisions} decisions, {condition.rewards}", *lists])
     return table(["", "agrees", "does not agree"], rows)
 
 

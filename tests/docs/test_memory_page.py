@@ -181,6 +181,20 @@ def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     assert sorted(lower) == sorted(name for name in others if p_values[name] <= 0.05)
     assert sorted(alike) == sorted(name for name in others if p_values[name] > 0.05)
     assert all(sum(paired[name]) < sum(paired["LSTM"]) for name in lower)
+    lost = [line for key, of in lines.items() if key[1] == "0" for line in of if line["frames_to_90"]]
+    gone = [line for line in lost if float(line["greedy_return"]) < 0.9]
+    assert f"Of {len(lost)} runs that solved the task at an evaluation, {len(gone)} did not after training" in table
+    noisy = [line for key, of in lines.items() if key[1] == "25" for line in of]
+    agents = {line["agent"] for line in noisy}
+    plain = [
+        line
+        for key, of in lines.items()
+        if key[:2] == ("204800", "0") and key[2] in agents
+        for line in of
+        if line["unique_decisions"] == "False" and line["wait_prob"] != "0"
+    ]
+    words = f"{number(noisy)} of {len(noisy)} runs with noise and {number(plain)} of {len(plain)} without"
+    assert f"solve the task after training in {words}." in PAGE
     readme = (CHECKOUT / "README.md").read_text(encoding="utf-8")
     assert f"PPO with an LSTM solves {number(given['LSTM'])} of 45 runs once first rewards are given" in readme
     assert sum(number(on_hardest(unique, False, names)["LSTM"]) for unique in (False, True)) == 0
@@ -300,6 +314,18 @@ def test_what_the_page_says_in_words_of_the_ladder_holds(names):
         of[line["depth"], line["expected_length"]].setdefault(names[line["agent"]], []).append(line)
 
     assert {line["frames"] for line in ladder} == {"409600"}
+    for (depth, length), each in of.items():
+        part = PAGE.split(f" Depth {depth}: ")[1]
+        place = ["6" if depth == "2" else "10", "30", "100", "300"].index(length)
+        for name, lines in each.items():
+            means = [
+                sum(float(line[key]) for line in lines) / 5
+                for key in ("greedy_return", "training_return", "training_length")
+            ]
+            shown = part.split(f"| {name} | ")[1].split(" | ")[place].rstrip(" |").split("; ")
+            assert int(shown[0]) == number(lines) and len(lines) == 5
+            assert [float(value) for value in shown[1:]] == pytest.approx(means, abs=0.51)
+            assert [float(value) for value in shown[1:3]] == pytest.approx(means[:2], abs=0.0051)
     assert says(PAGE.split("expected length of 100 steps: ")[1].split(". With 300")[0], of["2", "100"])
     assert says(PAGE.split("With 300 steps: ")[1].split(". With 300")[0], of["2", "300"])
     longest = [line for (_, length), each in of.items() if length == "300" for lines in each.values() for line in lines]
