@@ -126,6 +126,12 @@ def test_seeds_that_solve_the_hardest_graphs_are_counted_from_the_raw_results(un
     poor, others = ([rival for rival in ran if (number(of[rival]) <= 1) == few] for few in (True, False))
     verdict = f"| {decisions} decisions, first rewards {rewards} | {', '.join(poor)} | {', '.join(others) or 'none'} |"
     assert verdict in table
+    part = PAGE.split("### p = 0.9" + (" |" if given else ", first rewards to be found |"))[1].split("###")[0]
+    for name, lines in of.items():
+        means = (sum(float(line[key]) for line in lines) / 5 for key in ("greedy_return", "training_return"))
+        shown = f"{number(lines)} ({at_any_evaluation(lines)}); " + "; ".join(f"{mean:.2f}" for mean in means)
+        cells = part.split(f"| {name} | ")[1].split(" | ")
+        assert cells[(1 + 2 * unique) if given else unique].rstrip(" |") == shown
 
 
 def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
@@ -184,6 +190,11 @@ def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     lost = [line for key, of in lines.items() if key[1] == "0" for line in of if line["frames_to_90"]]
     gone = [line for line in lost if float(line["greedy_return"]) < 0.9]
     assert f"Of {len(lost)} runs that solved the task at an evaluation, {len(gone)} did not after training" in table
+    parts = {f"{names[line['agent']]} " for line in gone}
+    for name in names:
+        of_agent = [[line for line in each if line["agent"] == name] for each in (gone, lost)]
+        words = f"{names[name]} {len(of_agent[0])} of {len(of_agent[1])}"
+        assert (words in table) == (f"{names[name]} " in parts)
     noisy = [line for key, of in lines.items() if key[1] == "25" for line in of]
     agents = {line["agent"] for line in noisy}
     plain = [
