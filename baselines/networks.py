@@ -258,7 +258,7 @@ def critic(in_key: str, num_features: int) -> ValueOperator:
 class ActorCritic(TensorDictSequential):
     """A policy of a trunk, an `actor` and a `critic`; computes what TorchRL's modules do, in plain tensors.
 
-    Further modules are called as they are.
+    Further modules compute one value each from what these have written.
     """
 
     capturable = True
@@ -266,8 +266,14 @@ class ActorCritic(TensorDictSequential):
 
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action``, ``action_log_prob``, ``state_value`` and the trunk's next state."""
+        for key, value in self.act_on_tensors(tensordict).items():
+            tensordict.set(key, value)
+        return tensordict
+
+    def act_on_tensors(self, data: Data) -> dict[Any, Tensor]:
+        """Return what `forward` writes; see `ctgraph_rl.learn.collect.act`."""
         trunk, actor, critic, *others = self.module
-        written = trunk.act(tensordict)
+        written = trunk.act(data)
         features = written.pop(actor.in_keys[0])
         log_probs = log_probabilities(actor, features)
         chances = log_probs.softmax(dim=-1)
@@ -275,18 +281,16 @@ class ActorCritic(TensorDictSequential):
             action = chances.argmax(dim=-1)
         else:
             action = draw(chances)
-        action = guided(tensordict, action)
+        action = guided(data, action)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
         written["state_value"] = critic.module(features)
-        for key, value in written.items():
-            tensordict.set(key, value)
         for module in others:
-            module(tensordict)
-        return tensordict
+            written[module.out_keys[0]] = module.module(*(written[key] for key in module.in_keys))
+        return written
 
 
-def guided(data: TensorDictBase, action: Tensor) -> Tensor:
+def guided(data: Data, action: Tensor) -> Tensor:
     """Return the actions that a guide gave, int64 [num_envs], and where it gave none the policy's own."""
     given = data.get(GUIDED_ACTION, None)
     return action if given is None else torch.where(given < 0, action, given)

@@ -11,16 +11,16 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
-from ctgraph_rl.batch.specs import specs_of
-from ctgraph_rl.checks import is_int, require, require_all
+from ctgraph_rl.batch.specs import checked_num_ids, specs_of
+from ctgraph_rl.checks import require, require_all
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.tree import Swap
-from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
@@ -95,7 +95,7 @@ class CTGraphEnv(EnvBase):
         flags = {"check_actions": check_actions, "info": info}
         require(*((isinstance(v, bool), f"{name} must be true or false, got {v!r}") for name, v in flags.items()))
         tasks = require_all(Task, "tasks", tasks)
-        self.num_task_ids = _num_task_ids(task_ids, num_task_ids)
+        self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
         device = None if device is None else checked_device(device)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
         self.check_actions, self.info = check_actions, info
@@ -304,6 +304,21 @@ class CTGraphEnv(EnvBase):
         data["reward"] = reward.unsqueeze(-1)
         return data
 
+    def step_and_restart_data(self, action: Tensor | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return what `step_data` returns, and then `restart_data` for the rows that are done; on CPUs in one call."""
+        rows, stepped = self.rows, None
+        if rows.uses_kernel and not rows.tasks_change:
+            most = rows.max_branching if self.check_actions else -1
+            stepped = rows.native.step_and_restart(rows.state, action, most)
+        if stepped is None:  # also where an action is refused: here it is said why
+            after = self.step_data(action)
+            return after, self.restart_data(after["done"], after["observation"])
+        rows.state, shown = stepped
+        done = shown.done.unsqueeze(-1)
+        none = torch.zeros_like(done)
+        after = {**self._data(shown.observation, done, none, shown), "reward": shown.reward.unsqueeze(-1)}
+        return after, self._data(shown.following, none, done, None)
+
     def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.
 
@@ -314,7 +329,9 @@ class CTGraphEnv(EnvBase):
         observation = self.rows.restart(done.squeeze(-1), observation)
         return self._data(observation, torch.zeros_like(done), done, None)
 
-    def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | None) -> dict[str, Tensor]:
+    def _data(
+        self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped | None
+    ) -> dict[str, Tensor]:
         """Return the rows' data by key, all but rewards.
 
         Args:
@@ -323,11 +340,12 @@ class CTGraphEnv(EnvBase):
             is_init: bool [N, 1].
             shown: says where the rows that are done arrived; None where none is.
         """
+        counts = shown if isinstance(shown, Stepped) else self.rows
         data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
             data |= {
-                "step_count": self.rows.step_count.unsqueeze(-1),
-                "episode_reward": self.rows.episode_reward.unsqueeze(-1),
+                "step_count": counts.step_count.unsqueeze(-1),
+                "episode_reward": counts.episode_reward.unsqueeze(-1),
                 "outcome": done.to(torch.uint8) if shown is None else shown.outcome.unsqueeze(-1),
                 "leaf": (torch.full_like(self.rows.row, NO_LEAF) if shown is None else shown.leaf).unsqueeze(-1),
                 "truncated": torch.zeros_like(done),
@@ -375,18 +393,3 @@ _SHARED = ("terminated", "step_count", "episode_reward", "reward", "task_id")
 def _own(data: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return data that may be written into: their memory is their own."""
     return {key: value.clone() if key in _SHARED else value for key, value in data.items()}
-
-
-def _num_task_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None) -> int:
-    """The length of ``task_id``; 0 for none."""
-    if task_ids is None:
-        require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
-        return 0
-    ids = list(task_ids.values()) if isinstance(task_ids, Mapping) else [task_ids]
-    by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
-    require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
-    needed = max(ids) + 1
-    room = needed if num_task_ids is None else num_task_ids
-    rule = f"num_task_ids must be an integer in {needed}..{MOST_IDS}, from the largest id + 1, got {room!r}"
-    require((is_int(room, needed, MOST_IDS), rule))
-    return room

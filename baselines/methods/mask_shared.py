@@ -35,7 +35,9 @@ class MaskShared(Masks):
 
     stackable = False
 
-    received: Tensor  # s_i, float32 [c, P]
+    received: Tensor  # s_i, float32 [r, P] with r >= c; those after the first c have a share of 0
+    places: Tensor  # of which b is the share of each, and of the own scores, int64 [r + 1]
+    offsets: Tensor  # added to these b: 0, or -infinity, float32 [r + 1]
     betas: nn.Parameter  # b, float32 [weight tensors, max_received + 1]; the last one in use is the own scores'
 
     def __init__(self, max_received: int, backbone_seed: int | None = None) -> None:
@@ -47,7 +49,7 @@ class MaskShared(Masks):
         """See `Method`."""
         self.num_actions = max(task.graph.branching_factor for task in curriculum.tasks) + 1
         self.betas = nn.Parameter(torch.zeros(len(weights.parameters), self.max_received + 1))
-        self.received = torch.zeros(0, len(weights))
+        self._keep(torch.zeros(0, len(weights)))
         super().setup(agent, weights, curriculum)
 
     @property
@@ -57,23 +59,22 @@ class MaskShared(Masks):
 
     def current_scores(self) -> Sequence[Tensor]:
         """Compute the combination."""
-        count = len(self.received)
-        if not count:
+        if not len(self.received):
             return super().current_scores()
-        old = self.weights.split(self.received)
-        return list(map(combined, self.betas[:, : count + 1].unbind(0), old, self.own))
+        betas = self.betas.index_select(-1, self.places) + self.offsets
+        return list(map(combined, betas.unbind(0), self.weights.split(self.received), self.own))
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
         """Start with own scores alone."""
-        self.received = self.received[:0]
+        self._keep(self.received[:0])
         super().start_task(task)
 
     @torch.no_grad()
     def end_task(self) -> None:
         """Store the combination, which the own scores then are."""
         super().end_task()
-        self.received = self.received[:0]
+        self._keep(self.received[:0])
 
     @torch.no_grad()
     def receive(self, scores: Tensor, own_share: float) -> None:
@@ -83,22 +84,32 @@ class MaskShared(Masks):
             scores: float32 [c, P], 1 <= c <= `max_received`.
             own_share: initial share of the own scores, in (0, 1); the others have equal ones.
         """
-        count, changes = len(scores), len(scores) != len(self.received)
+        count, before = len(scores), len(self.received)
         self.set_scores(self.weights.split(flat(self.current_scores())))
-        self.received = scores.to(self.constant)
+        self._keep(scores.to(self.constant))
         self.betas.zero_()
         self.betas[:, :count] = math.log((1 - own_share) / count)
         self.betas[:, count] = math.log(own_share)
-        if changes and self.agent.compiled_step is not None:
+        if len(self.received) != before and self.agent.compiled_step is not None:
             self.agent.compiled_step = make_compiled_step()  # the other one was made for as many as before
         self._write()
         self.agent.weights_changed()
 
+    def _keep(self, scores: Tensor) -> None:
+        """Keep received scores, [c, P]; for compiled steps zeros fill up to 1, 2, 4, 8 ..., as each number is compiled."""
+        count, device = len(scores), scores.device
+        room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
+        excluded = room - count
+        self.num_received = count
+        self.received = torch.cat([scores, scores.new_zeros(excluded, scores.shape[1])]) if excluded else scores
+        self.places = torch.tensor([*range(count), *[0] * excluded, count], device=device)
+        self.offsets = torch.tensor([0.0] * count + [-torch.inf] * excluded + [0.0], device=device)
+
     def get_extra_state(self) -> dict[str, Any]:
         """Return what `Masks` does, and the received scores."""
-        return {**super().get_extra_state(), "received": self.received.clone()}
+        return {**super().get_extra_state(), "received": self.received[: self.num_received].clone()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
-        self.received = state["received"].to(self.constant)
+        self._keep(state["received"].to(self.constant))

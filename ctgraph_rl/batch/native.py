@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -49,6 +49,19 @@ def _unknown(reward_fns: Iterable[RewardFn]) -> list[RewardFn]:
     return [fn for fn in reward_fns if type(fn) not in KERNEL_REWARDS]
 
 
+class Stepped(NamedTuple):
+    """What the rows show after a step, and what those show that then start an episode where one is over."""
+
+    observation: Tensor  # uint8 [N, *shape]
+    following: Tensor  # uint8 [N, *shape]: after the restarts
+    done: Tensor  # bool [N]; before the restarts, as all below
+    outcome: Tensor  # uint8 [N]
+    leaf: Tensor  # int64 [N]
+    step_count: Tensor  # int64 [N]
+    reward: Tensor  # float32 [N]
+    episode_reward: Tensor  # float32 [N]
+
+
 class Native:
     """Takes the steps of one batch by the kernel; every method returns the next states and what `Rows` shows of them.
 
@@ -91,7 +104,28 @@ class Native:
         state, result = self._show(state, mask=mask, shown=shown)
         return state, result.observation
 
-    def _show(self, state: RowState, **arrays: Tensor | None) -> tuple[RowState, Shown]:
+    def step_and_restart(
+        self, state: RowState, action: Tensor | None, most_action: int
+    ) -> tuple[RowState, Stepped] | None:
+        """Step all rows and start an episode in those that are done, as `step` and `restart` do, in one call.
+
+        Args:
+            state: where the rows are.
+            action: int64 [N].
+            most_action: the highest action that a row may take; -1 checks nothing.
+
+        Returns:
+            The next state and what the rows show; None for actions of a wrong shape, dtype or range, and where a row's
+            episode was over before.
+        """
+        n, image = len(self.tables.entry), self.params.bank.shape[1:]
+        if action is None or action.dtype != torch.int64 or action.shape != (n,):
+            return None
+        made = Stepped(*(torch.empty(n, *image if of_images else (), dtype=dtype) for dtype, of_images in _STEPPED))
+        after, wrong = self._run(state, most_action=most_action, restarts=True, action=action, **made._asdict())
+        return None if wrong else (after, made)
+
+    def _show(self, state: RowState, **arrays: Any) -> tuple[RowState, Shown]:
         """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
         n, device = len(self.tables.entry), self.params.row.device
         made = Shown(
@@ -102,8 +136,7 @@ class Native:
         )
         return self.run(state, **arrays, **made._asdict()), made
 
-    @torch.compiler.disable
-    def run(self, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Tensor | None) -> RowState:
+    def run(self, state: RowState, num_steps: int = 1, restarts: bool = False, **arrays: Any) -> RowState:
         """Call the kernel; return the states that it leads to.
 
         Args:
@@ -115,20 +148,34 @@ class Native:
         Raises:
             ValueError: for arrays of a wrong shape or dtype, and for states that the rows' tasks cannot have.
         """
+        after, wrong = self._run(state, num_steps, restarts, **arrays)
+        require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
+        return after
+
+    @torch.compiler.disable
+    def _run(
+        self,
+        state: RowState,
+        num_steps: int = 1,
+        restarts: bool = False,
+        most_action: int = -1,
+        **arrays: Tensor | None,
+    ) -> tuple[RowState, int]:
+        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
         if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call
         n, before = call.num_rows, self._own(state, call)
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
-        call.num_steps, call.restarts = num_steps, restarts
+        call.num_steps, call.restarts, call.most_action = num_steps, restarts, most_action
         call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
         kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
         wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
-        require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
-        self._state = after
-        return after
+        if not wrong:
+            self._state = after
+        return after, wrong
 
     def _own(self, state: RowState, call: _Call) -> RowState:
         """States that the kernel can read: its own are, others are checked."""
@@ -223,12 +270,16 @@ _ARRAYS = {
     "mask": (torch.bool, False, True),
     "shown": (torch.uint8, True, True),
     "observation": (torch.uint8, True, False),
+    "following": (torch.uint8, True, False),
     "done": (torch.bool, False, False),
     "outcome": (torch.uint8, False, False),
     "leaf": (torch.int64, False, False),
+    "step_count": (torch.int64, False, False),
     "reward": (torch.float32, False, False),
+    "episode_reward": (torch.float32, False, False),
 }
 """Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
+_STEPPED = [_ARRAYS[name][:2] for name in Stepped._fields]
 _OF_ROWS = ("mask", "shown")
 """Those of [N, ...]."""
 _Pointers = ctypes.c_void_p * len(RowState._fields)
@@ -238,7 +289,7 @@ class _Call(ctypes.Structure):
     """``Call`` of `kernel.c`."""
 
     _fields_ = [
-        *((name, ctypes.c_int64) for name in (*_SIZES, "num_levels", *_USES, "own_seeds", "restarts")),
+        *((name, ctypes.c_int64) for name in (*_SIZES, "num_levels", *_USES, "own_seeds", "restarts", "most_action")),
         *((name, ctypes.c_void_p) for name in (*_TABLES, *_OPTIONAL_TABLES)),
         ("before", _Pointers),
         ("after", _Pointers),

@@ -43,6 +43,7 @@ typedef struct {
     int64_t draws, pixel_noise, noise_bank, reward_noise, fail_reward, step_reward, goal_change;
     int64_t own_seeds; /* a seed for each row, else one for all */
     int64_t restarts;  /* rows that a step finishes start an episode within it */
+    int64_t most_action; /* actions beyond it are counted, and steps of rows that are over; -1: none is */
     const Task *tasks;
     const int64_t *task, *seed, *row;
     const uint8_t *bank, *noises;
@@ -53,10 +54,11 @@ typedef struct {
     const int64_t *action; /* [T, N], or null for no step */
     const uint8_t *mask;   /* [N], rows that start an episode instead, or null */
     const uint8_t *shown;  /* [N, pixels], what rows that start no episode show, or null to compute it */
-    uint8_t *observation;  /* [T, N, pixels], after the restarts */
-    uint8_t *done, *outcome; /* [T, N] each, or null; before the restarts, as what follows */
-    int64_t *leaf;
-    float *reward;
+    uint8_t *observation;  /* [T, N, pixels], after the restarts, but before them if there is a place for what follows */
+    uint8_t *following;    /* [T, N, pixels], after the restarts, or null */
+    uint8_t *done, *outcome; /* [T, N] each, or null; before the restarts, as all below */
+    int64_t *leaf, *step_count;
+    float *reward, *episode_reward;
 } Call;
 
 /* The rows of a block: what of their tasks all of them need, the fields of `State`, and draws for their ticks. */
@@ -394,6 +396,22 @@ static void store(const Call *call, const Block *block, int64_t first)
     memcpy(to->paid + first, block->paid, n * 4);
 }
 
+/* Whether row j has arrived in an end state and its episode is over. */
+static inline int64_t has_arrived(const Block *block, int j)
+{
+    int64_t kind = block->kind[j];
+    return ((kind == END) & !block->extra_end_step[j]) | ((kind == HOME) & (block->node[j] > 0));
+}
+
+/* How many actions no task knows, and how many steps are those of rows that are over. */
+static int64_t refused(const Call *call, const Block *block, const int64_t *action)
+{
+    int64_t count = 0;
+    for (int j = 0; call->most_action >= 0 && j < block->count; j++)
+        count += (uint64_t)action[j] > (uint64_t)call->most_action || block->kind[j] == FAIL || has_arrived(block, j);
+    return count;
+}
+
 /* Which rows are over, and what they show but their observations. */
 static void result(const Call *call, Block *block, int64_t at)
 {
@@ -401,10 +419,8 @@ static void result(const Call *call, Block *block, int64_t at)
     uint8_t done[BLOCK], outcome[BLOCK];
     int64_t leaf[BLOCK];
     for (int j = 0; j < n; j++) {
-        int64_t kind = block->kind[j], place = block->node[j] - block->first_leaf[j];
-        int64_t arrived = (kind == END) & !block->extra_end_step[j];
-        arrived |= (kind == HOME) & (block->node[j] > 0);
-        block->over[j] = arrived | (kind == FAIL);
+        int64_t arrived = has_arrived(block, j), place = block->node[j] - block->first_leaf[j];
+        block->over[j] = arrived | (block->kind[j] == FAIL);
         block->outcome[j] = block->over[j] + arrived + (arrived & (place == block->goal_leaf[j]));
         leaf[j] = arrived ? place : -1;
     }
@@ -416,22 +432,26 @@ static void result(const Call *call, Block *block, int64_t at)
         memcpy(call->outcome + at, outcome, n);
     if (call->leaf)
         memcpy(call->leaf + at, leaf, n * 8);
+    if (call->step_count)
+        memcpy(call->step_count + at, block->step_count, n * 8);
     if (call->reward)
         memcpy(call->reward + at, block->reward, n * 4);
+    if (call->episode_reward)
+        memcpy(call->episode_reward + at, block->episode_reward, n * 4);
 }
 
-/* What a block observes: that of rows that start no episode may be at hand. How many states were none of their tasks. */
-static int64_t observe_all(const Call *call, Block *block, const int64_t *starts, int64_t first, int64_t at)
+/* What a block observes, where what rows that start no episode show may be at hand. How many states were none of their
+   tasks. */
+static int64_t
+observe_all(const Call *call, Block *block, const uint8_t *shown, const int64_t *starts, uint8_t *restrict out)
 {
-    int64_t wrong = 0, size = call->num_pixels, any = !call->shown;
+    int64_t wrong = 0, size = call->num_pixels, any = !shown;
     for (int j = 0; j < block->count; j++)
         any |= starts[j];
     if (any && call->draws)
         draw_all(block, STREAM_STEP, block->word);
     if (any && call->pixel_noise)
         draw_all(block, STREAM_NOISE, block->noise);
-    uint8_t *out = call->observation + at * size;
-    const uint8_t *shown = call->shown ? call->shown + first * size : NULL;
     for (int j = 0; j < block->count; j++, out += size) {
         if (shown && !starts[j])
             copy(out, shown + j * size, size);
@@ -441,11 +461,12 @@ static int64_t observe_all(const Call *call, Block *block, const int64_t *starts
     return wrong;
 }
 
-/* All steps of one block; how many states were none of their tasks. */
+/* All steps of one block; how many actions were refused and how many states were none of their tasks. */
 static int64_t run_block(const Call *call, int64_t first, int count)
 {
     Block block = {.count = count};
-    int64_t wrong = 0, starts[BLOCK] = {0};
+    int64_t wrong = 0, size = call->num_pixels, starts[BLOCK] = {0};
+    const uint8_t *shown = call->shown ? call->shown + first * size : NULL;
     if (load(call, &block, first))
         return 1;
     for (int j = 0; call->mask && j < count; j++)
@@ -454,14 +475,22 @@ static int64_t run_block(const Call *call, int64_t first, int count)
         draw_all(&block, STREAM_STEP, block.word);
     for (int64_t t = 0; t < call->num_steps; t++) {
         int64_t at = t * call->num_rows + first;
-        if (call->action)
+        uint8_t *seen = call->observation + at * size;
+        if (call->action) {
+            wrong += refused(call, &block, call->action + at);
             advance(call, &block, call->action + at, starts);
+        }
         if (call->mask)
             begin(call, &block, starts);
         result(call, &block, at);
+        if (call->following)
+            wrong += observe_all(call, &block, shown, starts, seen);
         if (call->restarts)
             begin(call, &block, block.over);
-        wrong += observe_all(call, &block, starts, first, at);
+        if (call->following)
+            wrong += observe_all(call, &block, seen, block.over, call->following + at * size);
+        else
+            wrong += observe_all(call, &block, shown, starts, seen);
     }
     store(call, &block, first);
     return wrong;

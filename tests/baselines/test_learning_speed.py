@@ -45,7 +45,7 @@ def test_a_step_in_plain_tensors_equals_torchrls():
     for _ in range(12):
         action = torch.randint(3, (16,), generator=generator)
         written = {"action": action, "own": action.float(), ("next", "own"): action + 1.0}
-        step, data = take_step(plain, data.update(written))
+        step, data = take_step(plain, dict(data.update(written).items(True, True)))
         expected, other = stock.step_and_maybe_reset(other.update(written))
         steps.append(step)
         others.append(expected)

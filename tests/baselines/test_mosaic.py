@@ -132,6 +132,22 @@ def test_what_is_received_replaces_what_was_before_of_which_own_scores_keep_thei
     torch.testing.assert_close(own.scores[0], combination)
 
 
+def test_for_a_compiled_step_zeros_without_a_share_fill_up_what_was_received(make):
+    plain, filled = (connected(make(2, f"agent.compile={flag}"))[1][0] for flag in ("false", "true"))
+    received, mine = torch.randn(3, len(plain.weights)), torch.randn(len(plain.weights))
+    gradients = [torch.randn(parameter.shape) for parameter in plain.weights.parameters]
+
+    for method in (plain, filled):
+        method.take_scores(mine)
+        method.receive(received, 0.4)
+
+    assert (len(plain.received), len(filled.received)) == (3, 4)
+    torch.testing.assert_close(scores(filled), 0.4 * mine + 0.2 * received.sum(dim=0))
+    torch.testing.assert_close(scores(filled), scores(plain))
+    torch.testing.assert_close(*(method.transform_gradients(gradients) for method in (filled, plain)))
+    assert torch.equal(filled.get_extra_state()["received"], received)
+
+
 @pytest.mark.parametrize(
     ("change", "settings", "comes"),
     [

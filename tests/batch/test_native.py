@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.oracles import confounding, fully_observable, record, scripts, surjective
-from helpers.task_families import FAMILIES, MIXED, SWITCHED, VECTORS, batches, calls, examples, seeds
+from helpers.task_families import EVERY_KIND, MIXED, batch, batches, calls, examples, likely, seeds
 from hypothesis import given
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -22,7 +22,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl.envs import StepCounter, TransformedEnv
 
-from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, Task, rollout
+from ctgraph_rl import Block, CTGraphEnv, Curriculum, Rows, Steps, rollout
 from ctgraph_rl.batch import native
 from ctgraph_rl.batch.native import Native
 from ctgraph_rl.core import kernel as library
@@ -35,9 +35,6 @@ from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.configurations import ct_co_b1
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
 
-WIDE = replace(surjective(70, 1, 0.2), goal_change=(1, 2))
-DEEP = replace(surjective(2, 40), goal_change=(1, 1), step_reward=-0.0)
-
 
 @pytest.fixture(autouse=True)
 def tensors_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,29 +42,8 @@ def tensors_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "takes", lambda *tensors: False)
 
 
-KINDS = FAMILIES | {
-    "switched": list(SWITCHED),
-    "vectors": list(VECTORS),
-    "wide": [WIDE, *MIXED],
-    "deep": [DEEP, confounding(3, 20, 0.5)],
-    "unpaid": [replace(fully_observable(), goal_reward=-1.0, fail_reward=-0.0)],
-}
 ENGINES = "off", "required"
-every_kind = pytest.mark.parametrize("tasks", KINDS.values(), ids=KINDS)
-
-
-def batch(tasks: list[Task], num_rows: int) -> list[Task]:
-    return (tasks * num_rows)[:num_rows]
-
-
-def likely(tasks: list[Task], num_steps: int, seed: int = 0) -> Tensor:
-    """Actions [steps, N], half of them on the way to the tasks' own goals as long as nobody waits twice."""
-    rng = np.random.default_rng(seed)
-    ways = [np.array([0, *(x for decision in task.goal for x in (0, decision)), 0, 0]) for task in tasks]
-    best = [np.resize(way, num_steps) for way in ways]
-    largest = 1 + max(task.graph.branching_factor for task in tasks)
-    other = rng.integers(0, largest, (num_steps, len(tasks)))
-    return torch.from_numpy(np.where(rng.random(other.shape) < 0.9, np.stack(best, 1), other))
+every_kind = pytest.mark.parametrize("tasks", EVERY_KIND.values(), ids=EVERY_KIND)
 
 
 def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> bool:

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -271,3 +272,26 @@ def switching(tasks: list[Task], switch: Switch, num_rows: int, **arguments: Any
 def started(rows: Rows, num_episodes: int) -> Tensor:
     """The tasks' numbers in as many episodes, each ended by the start of the next: int64 [episodes, rows]."""
     return torch.stack([(rows.restart(), rows.task)[1] for _ in range(num_episodes)])
+
+
+EVERY_KIND = FAMILIES | {
+    "switched": list(SWITCHED),
+    "vectors": list(VECTORS),
+    "wide": [replace(surjective(70, 1, 0.2), goal_change=(1, 2)), *MIXED],
+    "deep": [replace(surjective(2, 40), goal_change=(1, 1), step_reward=-0.0), confounding(3, 20, 0.5)],
+    "unpaid": [replace(fully_observable(), goal_reward=-1.0, fail_reward=-0.0)],
+}
+
+
+def batch(tasks: list[Task], num_rows: int) -> list[Task]:
+    return (tasks * num_rows)[:num_rows]
+
+
+def likely(tasks: list[Task], num_steps: int, seed: int = 0) -> Tensor:
+    """Actions [steps, N], half of them on the way to the tasks' own goals as long as nobody waits twice."""
+    rng = np.random.default_rng(seed)
+    ways = [np.array([0, *(x for decision in task.goal for x in (0, decision)), 0, 0]) for task in tasks]
+    best = [np.resize(way, num_steps) for way in ways]
+    largest = 1 + max(task.graph.branching_factor for task in tasks)
+    other = rng.integers(0, largest, (num_steps, len(tasks)))
+    return torch.from_numpy(np.where(rng.random(other.shape) < 0.9, np.stack(best, 1), other))

@@ -68,7 +68,7 @@ def test_a_step_of_the_collecting_loop_is_that_of_torchrl(options, kernel):
             for one in (env, twin):
                 one.set_tasks(TASKS[::-1] * 4, at_episode_end=True)
         written = policy(TensorDict(count=torch.zeros(8, 1), batch_size=[8]))
-        step, data = take_step(env, data.update(written))
+        step, data = take_step(env, dict(data.update(written).items(True, True)))
         taken, expected = twin.step_and_maybe_reset(expected.update(written))
         assert same(step, dict(taken.items(True, True)))
         del expected["count"]

@@ -1,0 +1,57 @@
+"""A step and the restarts after it in one call of the kernel: the data of two calls of the tensor engine."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.oracles import fully_observable
+from helpers.task_families import EVERY_KIND, batch, likely
+from helpers.with_methods import same
+
+from ctgraph_rl import CTGraphEnv
+
+
+@pytest.mark.parametrize("tasks", EVERY_KIND.values(), ids=EVERY_KIND)
+def test_a_step_and_its_restarts_in_one_call_give_the_data_of_two(tasks, monkeypatch):
+    tasks = batch(tasks, 6)
+    once, twice = (CTGraphEnv(tasks, seed=3, noise_bank=5, kernel=kernel) for kernel in ("required", "off"))
+    monkeypatch.setattr(once, "step_data", None)
+    num_ended = 0
+    for env in (once, twice):
+        env.reset()
+
+    for action in likely(tasks, 60):
+        after = twice.step_data(action)
+        expected = after, twice.restart_data(after["done"], after["observation"])
+        found = once.step_and_restart_data(action)
+
+        assert [each.keys() for each in found] == [each.keys() for each in expected]
+        assert all(map(same, found, expected))
+        assert same(once.rows.state._asdict(), twice.rows.state._asdict())
+        num_ended += after["done"].sum()
+    assert num_ended
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (None, "got none"),
+        (torch.tensor([0, 3, 0]), r"values in 0..2, got \[3\]"),
+        (torch.tensor([0, 0, -1]), r"values in 0..2, got \[-1\]"),
+        (torch.zeros(3), "got dtype torch.float32"),
+        (torch.zeros(2, dtype=torch.int64), r"got shape \[2\]"),
+        (torch.zeros(3, dtype=torch.int64), r"rows \[1\] are done: reset them first"),
+    ],
+)
+def test_it_refuses_what_a_step_refuses_and_changes_nothing(action, message):
+    env = CTGraphEnv([fully_observable()] * 3, kernel="required")
+    env.reset()
+    if "done" in message:
+        for before in ([0, 0, 0], [0, 1, 0]):
+            env.step_data(torch.tensor(before))
+    state = env.rows.state
+
+    with pytest.raises(ValueError, match=message):
+        env.step_and_restart_data(action)
+
+    assert same(env.rows.state._asdict(), state._asdict())
