@@ -7,8 +7,10 @@ import torch
 from helpers.oracles import fully_observable
 from helpers.task_families import EVERY_KIND, batch, likely
 from helpers.with_methods import same
+from tensordict import TensorDict
 
 from ctgraph_rl import CTGraphEnv
+from ctgraph_rl.policies import OptimalPolicy
 
 
 @pytest.mark.parametrize("tasks", EVERY_KIND.values(), ids=EVERY_KIND)
@@ -55,3 +57,22 @@ def test_it_refuses_what_a_step_refuses_and_changes_nothing(action, message):
         env.step_and_restart_data(action)
 
     assert same(env.rows.state._asdict(), state._asdict())
+
+
+def test_rows_that_are_over_are_refused_or_with_unchecked_actions_restarted():
+    tasks = [fully_observable()] * 2
+    trusting, plain = (CTGraphEnv(tasks, kernel=kernel, check_actions=False) for kernel in ("required", "off"))
+    strict = CTGraphEnv(tasks, kernel="required")
+    for env in (trusting, plain, strict):
+        env.reset()
+        policy, data = OptimalPolicy(env), TensorDict(batch_size=[2])
+        while not env.rows.is_done.all():
+            env.step_data(policy.action(data))
+    action = torch.zeros(2, dtype=torch.int64)
+
+    after = plain.step_data(action)
+    expected = after, plain.restart_data(after["done"], after["observation"])
+
+    assert all(map(same, trusting.step_and_restart_data(action), expected))
+    with pytest.raises(ValueError, match=r"rows \[0, 1\] are done"):
+        strict.step_and_restart_data(action)
