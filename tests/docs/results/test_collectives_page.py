@@ -1,0 +1,102 @@
+"""docs/results/collectives.md: made from the raw results beside it, and what it says of them holds."""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from collections import defaultdict
+
+import pytest
+from helpers.paths import CHECKOUT
+
+FOLDER = CHECKOUT / "docs" / "results"
+PAGE = " ".join((FOLDER / "collectives.md").read_text(encoding="utf-8").split())
+CELL = ("curriculum", "frames_of_block", "exchange", "num_members")
+
+
+@pytest.fixture(scope="module")
+def made():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(FOLDER))
+        yield __import__("collectives")
+        for name in ("collectives", "raw"):
+            sys.modules.pop(name, None)
+
+
+def read(name: str, *keys: str) -> dict[tuple[str, ...], list[dict[str, str]]]:
+    """Raw lines with equal values under some keys."""
+    found = defaultdict(list)
+    with open(FOLDER / f"{name}.csv", newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            found[tuple(line[key] for key in keys)].append(line)
+    return found
+
+
+def mean(values) -> float:
+    values = list(values)
+    return math.fsum(values) / len(values)
+
+
+RUNS, BLOCKS = read("collectives", *CELL, "seed"), read("collective_blocks", *CELL, "seed")
+OF_CELL = read("collectives", *CELL)
+
+
+def l2d2c(num_members: int, frames: int = 12_800, column: str = "learning_time") -> list[float]:
+    return [float(line[column]) for line in OF_CELL["l2d2c_16x16", str(frames), "l2d2c", str(num_members)]]
+
+
+def test_the_page_is_what_its_raw_results_make(made):
+    assert made.page() == (FOLDER / "collectives.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("key", BLOCKS, ids="-".join)
+def test_each_collective_is_one_line_and_its_numbers_are_those_of_its_blocks(key):
+    [line], blocks = RUNS[key], BLOCKS[key]
+    members, frames = int(line["num_members"]), int(line["frames_of_block"])
+    per_member = len(blocks) // members
+    places = {(int(block["member"]), int(block["block"])) for block in blocks}
+
+    assert places == {(member, block) for member in range(members) for block in range(1, per_member + 1)}
+    times = [int(block["frames_to_learn"] or frames) for block in blocks]
+    assert float(line["learning_time"]) == pytest.approx(mean(times))
+    assert float(line["share_learned"]) == pytest.approx(mean(block["frames_to_learn"] != "" for block in blocks))
+    assert float(line["final_return"]) == pytest.approx(mean(float(b["final_return"]) for b in blocks), abs=1e-6)
+    assert all(time % 1280 == 0 and 1280 <= time <= frames for time in times)
+
+
+def test_all_collectives_are_of_one_version_of_the_numbers():
+    assert {line["numbers"] for [line] in RUNS.values()} == {"1"} and set(RUNS) == set(BLOCKS)
+
+
+def test_members_of_l2d2c_learn_each_task_once_each_one_place_behind_the_one_before_it():
+    for (_, _, _, members, _), blocks in BLOCKS.items():
+        of = defaultdict(dict)
+        for block in blocks:
+            of[int(block["member"])][int(block["block"])] = block["task"]
+        for member in range(int(members)):
+            order = [of[member][block] for block in range(1, 17)]
+            assert len(set(order)) == 16
+            assert order == [*list(of[0].values())[16 - member :], *list(of[0].values())[: 16 - member]]
+
+
+def test_learners_alone_send_nothing_and_others_take_masks_over():
+    for (_, _, _, members, _), [line] in RUNS.items():
+        shares = members != "1"
+        assert (float(line["messages"]) > 0) == (float(line["helps"]) > 0) == (float(line["bytes"]) > 0) == shares
+
+
+@pytest.mark.parametrize(
+    ("members", "frames", "name"),
+    [(1, 12_800, "1"), (1, 25_600, "1, blocks of 25,600 frames"), (4, 12_800, "4"), (16, 12_800, "16")],
+)
+def test_a_row_has_the_means_over_its_seeds(members, frames, name):
+    [row] = [line.split(" | ") for line in PAGE.split("| ---")[-1].split("| |") if line.strip().startswith(f"{name} |")]
+    names = ("learning_time", "share_learned", "final_return", "helps", "bytes")
+    times, learned, final, helps, sent = (mean(l2d2c(members, frames, name)) for name in names)
+
+    assert int(row[1]) == len(l2d2c(members, frames))
+    assert row[2].startswith(f"{times:,.0f} [")
+    assert row[3].startswith(f"{learned:.2f} [")
+    assert row[4].startswith(f"{final:.2f} [")
+    assert (row[5], row[6].strip(" |")) == (f"{helps / members:.1f}", f"{sent / members / 1e6:.1f}")
