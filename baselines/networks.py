@@ -258,7 +258,7 @@ def critic(in_key: str, num_features: int) -> ValueOperator:
 class ActorCritic(TensorDictSequential):
     """A policy of a trunk, an `actor` and a `critic`; computes what TorchRL's modules do, in plain tensors.
 
-    Further modules compute one value each from what these have written.
+    Further modules may read the data and what these have written.
     """
 
     capturable = True
@@ -286,7 +286,8 @@ class ActorCritic(TensorDictSequential):
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
         written["state_value"] = critic.module(features)
         for module in others:
-            written[module.out_keys[0]] = module.module(*(written[key] for key in module.in_keys))
+            made = module.module(*(written[key] if key in written else data[key] for key in module.in_keys))
+            written |= zip(module.out_keys, made if isinstance(made, tuple) else (made,), strict=True)
         return written
 
 

@@ -314,10 +314,9 @@ class CTGraphEnv(EnvBase):
             after = self.step_data(action)
             return after, self.restart_data(after["done"], after["observation"])
         rows.state, shown = stepped
-        done = shown.done.unsqueeze(-1)
-        none = torch.zeros_like(done)
-        after = {**self._data(shown.observation, done, none, shown), "reward": shown.reward.unsqueeze(-1)}
-        return after, self._data(shown.following, none, done, None)
+        done, rewards = shown.done.unsqueeze(-1), shown.reward.unsqueeze(-1)
+        after = {**self._data(shown.observation, done, torch.zeros_like(done), shown), "reward": rewards}
+        return after, self._data(shown.following, torch.zeros_like(done), done, None)
 
     def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.

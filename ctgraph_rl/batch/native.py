@@ -121,7 +121,8 @@ class Native:
         n, image = len(self.tables.entry), self.params.bank.shape[1:]
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
             return None
-        made = Stepped(*(torch.empty(n, *image if of_images else (), dtype=dtype) for dtype, of_images in _STEPPED))
+        device, shapes = self.params.row.device, {True: (n, *image), False: (n,)}
+        made = Stepped(*(torch.empty(shapes[images], dtype=dtype, device=device) for dtype, images in _STEPPED))
         after, wrong = self._run(state, most_action=most_action, restarts=True, action=action, **made._asdict())
         return None if wrong else (after, made)
 

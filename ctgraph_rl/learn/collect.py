@@ -138,18 +138,28 @@ def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> Te
 def act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict) -> tuple[Step, TensorDictBase]:
     """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
 
-    A policy with a method ``act_on_tensors`` is asked that way: it takes the data by key and returns what it would
-    write, which saves the time of a TensorDict and a module.
+    A policy whose class defines ``act_on_tensors`` is asked that way, which saves the time of a TensorDict and a module:
+    it takes the data by key and returns what it would write. Derived classes, modules around it and hooks are called.
     """
-    on_tensors = getattr(policy, "act_on_tensors", None)
-    data = dict((carried if on_tensors else policy(carried)).items(True, True))
-    step, following = take_step(env, data if on_tensors is None else data | on_tensors(data))
+    if _acts_on_tensors(policy):
+        data = dict(carried.items(True, True))
+        data |= policy.act_on_tensors(data)  # type: ignore[attr-defined]
+    else:
+        data = dict(policy(carried).items(True, True))
+    step, following = take_step(env, data)
     lasts = TRIAL in start.keys()  # noqa: SIM118, a TensorDict iterates over rows
     for key, value in start.items():
         state = step["next", key]
         begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
         following.set(key, state if lasts else torch.where(begins, value, state))
     return step, following
+
+
+def _acts_on_tensors(policy: Policy) -> bool:
+    """Return whether a policy's ``act_on_tensors`` does all that a call does."""
+    if "act_on_tensors" not in vars(type(policy)):
+        return False
+    return not (policy._forward_hooks or policy._forward_pre_hooks or policy._compiled_call_impl)  # type: ignore[attr-defined]
 
 
 def _is_captured(env: EnvBase, policy: Policy) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from string import Template
@@ -31,6 +31,15 @@ FRAMES, LONGER = "12800", "25600"
 
 NUMBERS = ("1", "4", "16")
 """Members of the collectives of l2d2c_16x16."""
+
+EXCHANGES = {"isolated": "alone", "mosaic": "MOSAIC", "mosaic_no_similarity": "without similarity"}
+"""What members of ct28_mosaic_skips_d5 do, as the page calls it."""
+
+PUBLISHED = {
+    "isolated": {2: 0.98, 3: 0.98, 4: 0.34, 5: 0.11, 6: 0.0, 7: 0.0, 8: 0.0},
+    "mosaic": {2: 1.00, 3: 0.99, 4: 0.98, 5: 0.95, 6: 0.97, 7: 0.91, 8: 0.74},
+}
+"""Final returns by depth in the raw data of MOSAIC, means over 28 members and five seeds."""
 
 BATCH = 1_280
 """Frames of a batch: the least time."""
@@ -77,7 +86,7 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
     cell = {
         "curriculum": about["curriculum"],
         "frames_of_block": frames,
-        "exchange": str(collective.config["exchange"]["_target_"]).rpartition(".")[2].lower(),
+        "exchange": _exchange(collective.config["exchange"]),
         "num_members": len({each.member for each in collective.learned}),
         "seed": collective.config["seed"],
     }
@@ -96,6 +105,12 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
         for each in collective.learned
     ]
     return {**cell, **values, **final, "numbers": about["numbers"], **machine_of(about)}, blocks
+
+
+def _exchange(config: Mapping[str, Any]) -> str:
+    """Return the name of an exchange's file, which the configuration of a run lacks."""
+    name = str(config["_target_"]).rpartition(".")[2].lower()
+    return name if config.get("use_similarity", True) else f"{name}_no_similarity"
 
 
 @cache
@@ -147,7 +162,7 @@ def _interval(values: Sequence[float], bounds: tuple[float, float]) -> str:
 
 
 def faster(num_members: str) -> str:
-    """Return by what factor a block is learned sooner than by one in blocks of twice as many frames, with its interval."""
+    """Return by what factor a block is learned sooner than alone, in longer blocks, with its interval."""
     import numpy as np
 
     from ctgraph_rl.report import statistics
@@ -199,6 +214,51 @@ def draw(path: Path) -> None:
     returns.set(xlabel="block", ylabel="final return", ylim=(-0.03, 1.03))
     returns.legend(fontsize=7, frameon=False, loc="lower right")
     save_figure(figure, path, DPI)
+
+
+def by_depth(exchange: str) -> dict[int, list[float]]:
+    """Return the mean final return of the members whose tasks have a depth, for each depth one number for each seed."""
+    of: dict[int, dict[str, list[float]]] = {}
+    for line in read(BLOCKS):
+        if (line["curriculum"], line["exchange"]) == ("ct28_mosaic_skips_d5", exchange):
+            depth = line["task"].count(".") + 1
+            of.setdefault(depth, {}).setdefault(line["seed"], []).append(float(line["final_return"] or 0))
+    return {
+        depth: [sum(values) / len(values) for _, values in sorted(seeds.items())] for depth, seeds in sorted(of.items())
+    }
+
+
+def mosaic_table() -> str:
+    """Return the table of final returns by depth, beside the published ones."""
+    found = {exchange: by_depth(exchange) for exchange in EXCHANGES}
+    head = ["depth"]
+    for exchange, name in EXCHANGES.items():
+        head += [f"{name}, published"] * (exchange in PUBLISHED) + [name]
+    rows = []
+    for depth in next(iter(found.values())):
+        row = [str(depth)]
+        for exchange in EXCHANGES:
+            row += [f"{PUBLISHED[exchange][depth]:.2f}"] if exchange in PUBLISHED else []
+            values = found[exchange].get(depth)
+            row.append("not run" if values is None else mean_of(values, (0, 1)))
+        rows.append(row)
+    return table(head, rows)
+
+
+def agreement(exchange: str) -> str:
+    """Return at which depths the published mean is inside the interval of the mean over seeds, and where it is not."""
+    from ctgraph_rl.report import statistics
+
+    inside, outside = [], []
+    for depth, values in by_depth(exchange).items():
+        found, published = statistics.mean(values, bounds=(0, 1)), PUBLISHED[exchange][depth]
+        if found.low is None or found.high is None:
+            return "one seed has no interval"
+        (inside if found.low <= published <= found.high else outside).append(str(depth))
+    parts = [f"inside at depth {', '.join(inside)}"] * bool(inside) + [f"outside at {', '.join(outside)}"] * bool(
+        outside
+    )
+    return "; ".join(parts)
 
 
 def not_run() -> str:

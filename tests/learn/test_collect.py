@@ -8,8 +8,10 @@ import pytest
 import torch
 from helpers.oracles import confounding, surjective
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn.common import TensorDictModuleWrapper
 from torch import Tensor
 
+from baselines.networks import ActorCritic
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect, take_step
 
@@ -77,3 +79,35 @@ def test_a_step_of_the_collecting_loop_is_that_of_torchrl(options, kernel):
 
 def same(found: dict[Any, Tensor], expected: dict[Any, Tensor]) -> bool:
     return found.keys() == expected.keys() and all(torch.equal(found[key], expected[key]) for key in expected)
+
+
+class Zero(ActorCritic):
+    """A policy derived from one that acts on tensors."""
+
+    def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
+        return super().forward(tensordict).set("action", torch.zeros(8, dtype=torch.int64))
+
+
+def hooked(policy: ActorCritic) -> ActorCritic:
+    policy.register_forward_hook(lambda module, given, data: data.set("action", torch.zeros(8, dtype=torch.int64)))
+    return policy
+
+
+class Wrapped(TensorDictModuleWrapper):
+    """A policy around one that acts on tensors."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.td_module(tensordict).set("action", torch.zeros(8, dtype=torch.int64))
+
+
+@pytest.mark.parametrize(
+    "change", [lambda policy: Zero(*policy.module), hooked, Wrapped], ids=["derived", "hook", "around"]
+)
+def test_what_changes_the_actions_of_a_policy_is_asked(small_agent, change):
+    env = CTGraphEnv(TASKS * 4)
+    policy = small_agent("ppo", TASKS).policy
+    [plain] = collect(env, policy, 8 * 40, 40)
+
+    [batch] = collect(env, change(policy), 8 * 40, 40)
+
+    assert plain["action"].any() and not batch["action"].any()
