@@ -96,7 +96,7 @@ class MaskShared(Masks):
         self.agent.weights_changed()
 
     def _keep(self, scores: Tensor) -> None:
-        """Keep received scores, [c, P]; as steps are compiled for each number, zeros fill theirs up to 1, 2, 4, 8 ..."""
+        """Keep received scores, [c, P]; for compiled steps, made for each number, zeros fill up to 1, 2, 4, 8 ..."""
         count, device = len(scores), scores.device
         room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
         excluded = room - count

@@ -138,7 +138,7 @@ def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> Te
 def act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict) -> tuple[Step, TensorDictBase]:
     """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
 
-    A policy whose class defines ``act_on_tensors`` is asked that way, which saves the time of a TensorDict and a module:
+    A policy whose class defines ``act_on_tensors`` is asked that way: without the time of a TensorDict and a module,
     it takes the data by key and returns what it would write. Derived classes, modules around it and hooks are called.
     """
     if _acts_on_tensors(policy):
