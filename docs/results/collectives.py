@@ -41,6 +41,9 @@ PUBLISHED = {
 }
 """Final returns by depth in the raw data of MOSAIC, means over 28 members and five seeds."""
 
+SOLVED = 0.9
+"""The least mean return of greedy episodes in a task that is solved; the optimum is 1."""
+
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
@@ -91,6 +94,7 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
         "seed": collective.config["seed"],
     }
     values = {key: metrics[key]["value"] for key in ("learning_time", "share_learned", "messages", "bytes", "helps")}
+    solved = {number: _solved(log.parent / f"member_{number:03}") for number in {e.member for e in collective.learned}}
     returns = [each.final_return for each in collective.learned]
     final = {"final_return": math.fsum(0.0 if math.isnan(value) else value for value in returns) / len(returns)}
     blocks = [
@@ -100,11 +104,28 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
             "block": each.block,
             "task": each.label,
             "frames_to_learn": "" if each.frames_to_learn is None else each.frames_to_learn,
+            "frames_to_solve": solved[each.member].get(each.block, ""),
             "final_return": "" if math.isnan(each.final_return) else round(each.final_return, 6),
         }
         for each in collective.learned
     ]
     return {**cell, **values, **final, "numbers": about["numbers"], **machine_of(about)}, blocks
+
+
+def _solved(member: Path) -> dict[int, int]:
+    """Return the frames of each block until an evaluation within it found its task solved; nothing where none did."""
+    from ctgraph_rl.log.run_log import RunLog
+
+    log, ends, found = RunLog.read(member / "run.jsonl"), {}, {}
+    for line in log.of_kind("training"):
+        ends[line["block"]] = line["frames"]
+    trained = log.of_kind("run")[0]["trained"]
+    for line in log.of_kind("evaluation"):
+        for block, end in ends.items():
+            start = ends.get(block - 1, 0)
+            if start < line["frames"] <= end and [line["task"]] == trained[block - 1] and line["return_mean"] >= SOLVED:
+                found.setdefault(block, line["frames"] - start)
+    return found
 
 
 def _exchange(config: Mapping[str, Any]) -> str:
