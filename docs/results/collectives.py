@@ -8,23 +8,16 @@ stay as they were. ``python docs/results/collectives.py`` makes the page.
 from __future__ import annotations
 
 import argparse
-import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from raw import HERE, Raw, groups, machine_of, machines, mean_of, read, shown, table, write
+from collective_runs import BLOCKS, CELL, KEY, NAME, collect
+from raw import HERE, Raw, groups, machines, mean_of, read, shown, table
 
-NAME, BLOCKS = "collectives", "collective_blocks"
 SEEDS = 5
-
-CELL = ("curriculum", "frames_of_block", "exchange", "num_members")
-"""The columns that tell the cells of an experiment apart."""
-
-KEY = (*CELL, "seed")
 
 FRAMES, LONGER = "12800", "25600"
 """Frames of a block of l2d2c_16x16, and of the run alone that has twice as many."""
@@ -41,97 +34,10 @@ PUBLISHED = {
 }
 """Final returns by depth in the raw data of MOSAIC, means over 28 members and five seeds."""
 
-SOLVED = 0.9
-"""The least mean return of greedy episodes in a task that is solved; the optimum is 1."""
-
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
 DPI = 220
-
-
-def collect(folders: Sequence[Path]) -> None:
-    """Add the finished collectives under some folders to the raw results."""
-    found = [measured(path) for folder in folders for path in sorted(folder.rglob("collective.jsonl"))]
-    new = [pair for pair in found if pair is not None]
-    _merge(NAME, [line for line, _ in new], [line for line, _ in new])
-    _merge(BLOCKS, [line for line, _ in new], [line for _, lines in new for line in lines])
-
-
-def _merge(name: str, collectives: Raw, lines: Raw) -> None:
-    """Write the lines of some collectives in place of those that a file has of them."""
-    present = {_key(line) for line in collectives}
-    kept = [line for line in read(name) if _key(line) not in present]
-    write(name, sorted([*kept, *lines], key=lambda line: tuple(map(_place, [line[key] for key in KEY]))))
-
-
-def _key(line: dict[str, str]) -> tuple[str, ...]:
-    return tuple(str(line[key]) for key in KEY)
-
-
-def _place(value: object) -> tuple[int, str]:
-    """Order numbers by their value, and texts behind them."""
-    text = str(value)
-    return (int(text), "") if text.isdigit() else (10**9, text)
-
-
-def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
-    """Return the line of a collective and those of its members' blocks; None if it is not finished."""
-    from ctgraph_rl.collective.summary import read_collective
-    from ctgraph_rl.log.run_log import RunLog
-
-    if not (log.parent / "metrics.json").exists():
-        return None
-    collective = read_collective(log.parent)
-    metrics = json.loads((log.parent / "metrics.json").read_text(encoding="utf-8"))
-    about = RunLog.read(log.parent / "member_000" / "run.jsonl").of_kind("run")[0]
-    [frames] = {each.frames for each in collective.learned}
-    cell = {
-        "curriculum": about["curriculum"],
-        "frames_of_block": frames,
-        "exchange": _exchange(collective.config["exchange"]),
-        "num_members": len({each.member for each in collective.learned}),
-        "seed": collective.config["seed"],
-    }
-    values = {key: metrics[key]["value"] for key in ("learning_time", "share_learned", "messages", "bytes", "helps")}
-    solved = {number: _solved(log.parent / f"member_{number:03}") for number in {e.member for e in collective.learned}}
-    returns = [each.final_return for each in collective.learned]
-    final = {"final_return": math.fsum(0.0 if math.isnan(value) else value for value in returns) / len(returns)}
-    blocks = [
-        {
-            **cell,
-            "member": each.member,
-            "block": each.block,
-            "task": each.label,
-            "frames_to_learn": "" if each.frames_to_learn is None else each.frames_to_learn,
-            "frames_to_solve": solved[each.member].get(each.block, ""),
-            "final_return": "" if math.isnan(each.final_return) else round(each.final_return, 6),
-        }
-        for each in collective.learned
-    ]
-    return {**cell, **values, **final, "numbers": about["numbers"], **machine_of(about)}, blocks
-
-
-def _solved(member: Path) -> dict[int, int]:
-    """Return the frames of each block until an evaluation within it found its task solved; nothing where none did."""
-    from ctgraph_rl.log.run_log import RunLog
-
-    log, ends, found = RunLog.read(member / "run.jsonl"), {}, {}
-    for line in log.of_kind("training"):
-        ends[line["block"]] = line["frames"]
-    trained = log.of_kind("run")[0]["trained"]
-    for line in log.of_kind("evaluation"):
-        for block, end in ends.items():
-            start = ends.get(block - 1, 0)
-            if start < line["frames"] <= end and [line["task"]] == trained[block - 1] and line["return_mean"] >= SOLVED:
-                found.setdefault(block, line["frames"] - start)
-    return found
-
-
-def _exchange(config: Mapping[str, Any]) -> str:
-    """Return the name of an exchange's file, which the configuration of a run lacks."""
-    name = str(config["_target_"]).rpartition(".")[2].lower()
-    return name if config.get("use_similarity", True) else f"{name}_no_similarity"
 
 
 @cache
@@ -150,29 +56,56 @@ def numbers_in(lines: Raw, column: str) -> list[float]:
     return [float(line[column]) for line in lines]
 
 
+def solving_times(num_members: str, frames: str = FRAMES) -> list[float]:
+    """Return the mean frames until a block's task is solved for each seed; none without an evaluation each batch."""
+    lines = on_l2d2c(num_members, frames)
+    if any(int(line["evaluated_every"]) > BATCH for line in lines):
+        return []
+    of = groups(read(BLOCKS), *KEY)
+    blocks = [of[tuple(line[key] for key in KEY)] for line in lines]
+    return [sum(float(block["frames_to_solve"] or frames) for block in each) / len(each) for each in blocks]
+
+
+def solved_blocks(num_members: str, frames: str = FRAMES) -> tuple[int, int]:
+    """Return how many blocks had their tasks solved by their end at the latest, and how many there are."""
+    cell = ("l2d2c_16x16", frames, "l2d2c", num_members)
+    blocks = groups(read(BLOCKS), *CELL).get(cell, [])
+    return sum(block["frames_to_solve"] != "" for block in blocks), len(blocks)
+
+
 def l2d2c_table() -> str:
     """Return the table of collectives of L2D2-C by their number of members."""
-    head = ["members", "seeds", "frames to learn a block", "blocks learned", "final return", "masks taken over", "MB"]
+    head = ["members", "seeds", "blocks solved", "frames to solve", "frames to a return of 0.9", "final return"]
     rows = []
     for number, frames in (("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)):
         lines = on_l2d2c(number, frames)
         if lines:
             name = number if frames == FRAMES else f"{number}, blocks of {int(frames):,} frames"
-            rows.append([name, str(len(lines)), *_row(lines, int(number), int(frames))])
-    return table(head, rows)
+            rows.append([name, str(len(lines)), *_row(number, frames), *_sharing(lines, int(number))])
+    return table([*head, "masks taken over", "MB"], rows)
 
 
-def _row(lines: Raw, number: int, frames: int) -> list[str]:
-    per_member = [value / number for value in numbers_in(lines, "helps")]
-    sent = [value / number / 1e6 for value in numbers_in(lines, "bytes")]
-    times = numbers_in(lines, "learning_time")
+def _row(number: str, frames: str) -> list[str]:
+    solved, count = solved_blocks(number, frames)
+    lines, bounds = on_l2d2c(number, frames), (BATCH, float(frames))
     return [
-        f"{sum(times) / len(times):,.0f} {_interval(times, (BATCH, frames))}",
-        mean_of(numbers_in(lines, "share_learned"), (0, 1)),
+        f"{solved:,} of {count:,}",
+        _frames(solving_times(number, frames), bounds),
+        _frames(numbers_in(lines, "learning_time"), bounds),
         mean_of(numbers_in(lines, "final_return"), (0, 1)),
-        f"{sum(per_member) / len(per_member):.1f}",
-        f"{sum(sent) / len(sent):.1f}",
     ]
+
+
+def _sharing(lines: Raw, number: int) -> list[str]:
+    """Return what a member took over and sent in a run."""
+    return [
+        f"{sum(numbers_in(lines, key)) / len(lines) / number / unit:.1f}"
+        for key, unit in (("helps", 1), ("bytes", 1e6))
+    ]
+
+
+def _frames(times: Sequence[float], bounds: tuple[float, float]) -> str:
+    return f"{sum(times) / len(times):,.0f} {_interval(times, bounds)}" if times else "not measured"
 
 
 def _interval(values: Sequence[float], bounds: tuple[float, float]) -> str:
@@ -183,16 +116,16 @@ def _interval(values: Sequence[float], bounds: tuple[float, float]) -> str:
 
 
 def faster(num_members: str) -> str:
-    """Return by what factor a block is learned sooner than alone, in longer blocks, with its interval."""
+    """Return by what factor a task is solved sooner than alone, with its interval."""
     import numpy as np
 
     from ctgraph_rl.report import statistics
 
-    groups_ = [numbers_in(lines, "learning_time") for lines in (on_l2d2c("1", LONGER), on_l2d2c(num_members))]
-    if not all(groups_):
+    both = solving_times("1"), solving_times(num_members)
+    if not all(both):
         return "-"
-    alone, together = (np.array(group)[:, None] for group in groups_)
-    return shown(statistics.of_two_groups(alone, together, _ratio, (BATCH, float(LONGER))))
+    alone, shared = (np.array(times)[:, None] for times in both)
+    return shown(statistics.of_two_groups(alone, shared, _ratio, (BATCH, float(FRAMES))))
 
 
 def _ratio(first: Any, second: Any) -> Any:
@@ -208,27 +141,27 @@ def by_block(num_members: str, frames: str = FRAMES) -> list[float]:
     return [sum(values) / len(values) for _, values in sorted(of.items())]
 
 
+def _learning_times(num_members: str) -> list[float]:
+    return numbers_in(on_l2d2c(num_members), "learning_time")
+
+
 def draw(path: Path) -> None:
     """Draw the frames to learn a block over the number of members, and the final returns block by block."""
     from ctgraph_rl.visualize.style import new_figure, save_figure
 
     figure = new_figure(7.2, 2.9)
     times, returns = figure.subplots(1, 2)
-    means = {}
-    for number in NUMBERS:
-        values = numbers_in(on_l2d2c(number, LONGER if number == "1" else FRAMES), "learning_time")
-        if values:
-            means[int(number)] = sum(values) / len(values)
-            times.plot([int(number)] * len(values), values, "o", ms=3, mec="0.35", mfc="none", mew=0.6)
-    times.plot(list(means), list(means.values()), "-", color="0", lw=1, label="mean over seeds")
-    if 1 in means:
-        line = [means[1] / number for number in means]
-        times.plot(list(means), line, ":", color="0.5", lw=1, label="alone, divided by N")
-    times.set(xscale="log", yscale="log", xlabel="members N", ylabel="frames to learn a block")
+    kinds = {"greedy policy solves it": solving_times, "a batch has a return of 0.9": _learning_times}
+    for (label, of), style in zip(kinds.items(), ("o-", "s--"), strict=True):
+        found = {int(number): values for number in NUMBERS if (values := of(number))}
+        for number, values in found.items():
+            times.plot([number] * len(values), values, style[0], ms=3, mec="0.35", mfc="none", mew=0.6)
+        means = [sum(values) / len(values) for values in found.values()]
+        times.plot(list(found), means, style[1:], color="0", lw=1, label=label)
+    times.set(xscale="log", ylim=(0, 1.04 * float(FRAMES)), xlabel="members N", ylabel="frames until")
     times.set_xticks([int(number) for number in NUMBERS], NUMBERS)
     times.minorticks_off()
-    times.set_yticks([1000, 2000, 5000, 10_000, 20_000], ["1,000", "2,000", "5,000", "10,000", "20,000"])
-    times.legend(fontsize=7, frameon=False)
+    times.legend(fontsize=7, frameon=False, loc="lower left")
     for number, style in zip(NUMBERS, (":", "--", "-"), strict=True):
         values = by_block(number)
         returns.plot(range(1, len(values) + 1), values, style, color="0", lw=1, label=f"N = {number}")
@@ -293,12 +226,17 @@ def not_run() -> str:
 def page() -> str:
     """Return the page: the template with its tables and numbers."""
     template = Template((HERE / "collectives_template.md").read_text(encoding="utf-8"))
-    texts = {f"faster_{number}": faster(number) for number in NUMBERS[1:]}
-    for number, frames in (("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)):
-        lines = on_l2d2c(number, frames)
-        share = numbers_in(lines, "share_learned")
-        name = f"learned_{number}" + ("_longer" if frames == LONGER else "")
-        texts[name] = f"{sum(share) / len(share):.0%}" if share else "-"
+    texts = {"faster_4": faster("4")}
+    for number in NUMBERS:
+        returns = numbers_in(on_l2d2c(number), "final_return")
+        texts[f"return_{number}"] = f"{sum(returns) / len(returns):.2f}"
+        texts[f"solved_{number}"] = "{:,} of {:,}".format(*solved_blocks(number))
+    for number in NUMBERS[1:]:
+        for column in ("reported", "obtained"):
+            values = numbers_in(on_l2d2c(number), f"{column}_return")
+            texts[f"{column}_{number}"] = f"{sum(values) / len(values):.2f}"
+    first, *_, last = by_block("16")[1:]
+    texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
 
 

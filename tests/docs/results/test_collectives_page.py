@@ -11,7 +11,8 @@ import pytest
 from helpers.paths import CHECKOUT
 
 FOLDER = CHECKOUT / "docs" / "results"
-PAGE = " ".join((FOLDER / "collectives.md").read_text(encoding="utf-8").split())
+LINES = (FOLDER / "collectives.md").read_text(encoding="utf-8").splitlines()
+PAGE = " ".join(" ".join(LINES).split())
 CELL = ("curriculum", "frames_of_block", "exchange", "num_members")
 
 
@@ -60,6 +61,8 @@ def test_each_collective_is_one_line_and_its_numbers_are_those_of_its_blocks(key
     assert places == {(member, block) for member in range(members) for block in range(1, per_member + 1)}
     times = [int(block["frames_to_learn"] or frames) for block in blocks]
     assert float(line["learning_time"]) == pytest.approx(mean(times))
+    solved = [int(block["frames_to_solve"]) for block in blocks if block["frames_to_solve"]]
+    assert all(time % int(line["evaluated_every"]) == 0 and 0 < time <= frames for time in solved)
     assert float(line["share_learned"]) == pytest.approx(mean(block["frames_to_learn"] != "" for block in blocks))
     assert float(line["final_return"]) == pytest.approx(mean(float(b["final_return"]) for b in blocks), abs=1e-6)
     assert all(time % 1280 == 0 and 1280 <= time <= frames for time in times)
@@ -86,17 +89,48 @@ def test_learners_alone_send_nothing_and_others_take_masks_over():
         assert (float(line["messages"]) > 0) == (float(line["helps"]) > 0) == (float(line["bytes"]) > 0) == shares
 
 
+def solving_times(members: int) -> list[float]:
+    """The mean frames until a task is solved for each seed, of collectives that were evaluated after each batch."""
+    keys = [key for key, [line] in RUNS.items() if key[1:4] == ("12800", "l2d2c", str(members))]
+    assert {RUNS[key][0]["evaluated_every"] for key in keys} == {"1280"}
+    return [mean(float(block["frames_to_solve"] or 12_800) for block in BLOCKS[key]) for key in keys]
+
+
 @pytest.mark.parametrize(
     ("members", "frames", "name"),
     [(1, 12_800, "1"), (1, 25_600, "1, blocks of 25,600 frames"), (4, 12_800, "4"), (16, 12_800, "16")],
 )
 def test_a_row_has_the_means_over_its_seeds(members, frames, name):
-    [row] = [line.split(" | ") for line in PAGE.split("| ---")[-1].split("| |") if line.strip().startswith(f"{name} |")]
-    names = ("learning_time", "share_learned", "final_return", "helps", "bytes")
-    times, learned, final, helps, sent = (mean(l2d2c(members, frames, name)) for name in names)
+    [row] = [line.split(" | ") for line in LINES if line.startswith(f"| {name} |")]
+    names = ("learning_time", "final_return", "helps", "bytes")
+    times, final, helps, sent = (mean(l2d2c(members, frames, name)) for name in names)
+    blocks = [
+        each for key, found in BLOCKS.items() if key[1:4] == (str(frames), "l2d2c", str(members)) for each in found
+    ]
 
     assert int(row[1]) == len(l2d2c(members, frames))
-    assert row[2].startswith(f"{times:,.0f} [")
-    assert row[3].startswith(f"{learned:.2f} [")
-    assert row[4].startswith(f"{final:.2f} [")
-    assert (row[5], row[6].strip(" |")) == (f"{helps / members:.1f}", f"{sent / members / 1e6:.1f}")
+    assert row[2] == f"{sum(block['frames_to_solve'] != '' for block in blocks):,} of {len(blocks):,}"
+    if row[3] != "not measured":
+        assert row[3].startswith(f"{mean(solving_times(members)):,.0f} [")
+    assert row[4].startswith(f"{times:,.0f} [")
+    assert row[5].startswith(f"{final:.2f} [")
+    assert (row[6], row[7].strip(" |")) == (f"{helps / members:.1f}", f"{sent / members / 1e6:.1f}")
+
+
+def test_what_the_text_says_of_sharing_holds():
+    alone, shared = mean(solving_times(1)), mean(solving_times(4))
+    of_block = defaultdict(list)
+    for key, blocks in BLOCKS.items():
+        for block in blocks if key[3] == "16" else ():
+            of_block[int(block["block"])].append(float(block["final_return"]))
+    numbers = {
+        name: [f"{mean(l2d2c(members, column=name)):.2f}" for members in (4, 16)]
+        for name in ("reported_return", "obtained_return")
+    }
+
+    assert f"alone a task takes {alone / shared:.2f} [" in PAGE
+    assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
+    assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
+    assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
+    returns = [f"{mean(l2d2c(members, column='final_return')):.2f}" for members in (1, 4, 16)]
+    assert "mean return of {} alone, {} with 4 members and {} with 16".format(*returns) in PAGE
