@@ -58,7 +58,7 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
     about = RunLog.read(log.parent / "member_000" / "run.jsonl").of_kind("run")[0]
     [frames] = {each.frames for each in collective.learned}
     cell = {
-        "curriculum": about["curriculum"],
+        "curriculum": about["curriculum"].removesuffix(" (modified)"),  # in frames and evaluations, which are columns
         "frames_of_block": frames,
         "exchange": _exchange(collective.config["exchange"]),
         "num_members": len({each.member for each in collective.learned}),

@@ -57,10 +57,8 @@ def numbers_in(lines: Raw, column: str) -> list[float]:
 
 
 def solving_times(num_members: str, frames: str = FRAMES) -> list[float]:
-    """Return the mean frames until a block's task is solved for each seed; none without an evaluation each batch."""
-    lines = on_l2d2c(num_members, frames)
-    if any(int(line["evaluated_every"]) > BATCH for line in lines):
-        return []
+    """Return the mean frames until a block's task is solved, for each seed that was evaluated after each batch."""
+    lines = [line for line in on_l2d2c(num_members, frames) if int(line["evaluated_every"]) == BATCH]
     of = groups(read(BLOCKS), *KEY)
     blocks = [of[tuple(line[key] for key in KEY)] for line in lines]
     return [sum(float(block["frames_to_solve"] or frames) for block in each) / len(each) for each in blocks]
@@ -87,10 +85,10 @@ def l2d2c_table() -> str:
 
 def _row(number: str, frames: str) -> list[str]:
     solved, count = solved_blocks(number, frames)
-    lines, bounds = on_l2d2c(number, frames), (BATCH, float(frames))
+    lines, times, bounds = on_l2d2c(number, frames), solving_times(number, frames), (BATCH, float(frames))
     return [
         f"{solved:,} of {count:,}",
-        _frames(solving_times(number, frames), bounds),
+        _frames(times, bounds) + (f" (n = {len(times)})" if 0 < len(times) < len(lines) else ""),
         _frames(numbers_in(lines, "learning_time"), bounds),
         mean_of(numbers_in(lines, "final_return"), (0, 1)),
     ]
@@ -105,14 +103,13 @@ def _sharing(lines: Raw, number: int) -> list[str]:
 
 
 def _frames(times: Sequence[float], bounds: tuple[float, float]) -> str:
-    return f"{sum(times) / len(times):,.0f} {_interval(times, bounds)}" if times else "not measured"
-
-
-def _interval(values: Sequence[float], bounds: tuple[float, float]) -> str:
+    """Return the mean of numbers of frames with its interval, where two seeds or more have one."""
     from ctgraph_rl.report import statistics
 
-    found = statistics.mean(values, bounds=bounds)
-    return f"[{found.low:,.0f}, {found.high:,.0f}]"
+    found = statistics.mean(times, bounds=bounds)
+    if found.value is None or found.low is None or found.high is None:
+        return "not measured" if found.value is None else f"{found.value:,.0f}"
+    return f"{found.value:,.0f} [{found.low:,.0f}, {found.high:,.0f}]"
 
 
 def faster(num_members: str) -> str:
@@ -226,7 +223,9 @@ def not_run() -> str:
 def page() -> str:
     """Return the page: the template with its tables and numbers."""
     template = Template((HERE / "collectives_template.md").read_text(encoding="utf-8"))
-    texts = {"faster_4": faster("4")}
+    alone = solving_times("1")
+    mean = sum(alone) / len(alone)
+    texts = {"faster_4": faster("4"), "alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"}
     for number in NUMBERS:
         returns = numbers_in(on_l2d2c(number), "final_return")
         texts[f"return_{number}"] = f"{sum(returns) / len(returns):.2f}"

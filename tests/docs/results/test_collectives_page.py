@@ -91,8 +91,8 @@ def test_learners_alone_send_nothing_and_others_take_masks_over():
 
 def solving_times(members: int) -> list[float]:
     """The mean frames until a task is solved for each seed, of collectives that were evaluated after each batch."""
-    keys = [key for key, [line] in RUNS.items() if key[1:4] == ("12800", "l2d2c", str(members))]
-    assert {RUNS[key][0]["evaluated_every"] for key in keys} == {"1280"}
+    cell = ("12800", "l2d2c", str(members))
+    keys = [key for key, [line] in RUNS.items() if key[1:4] == cell and line["evaluated_every"] == "1280"]
     return [mean(float(block["frames_to_solve"] or 12_800) for block in BLOCKS[key]) for key in keys]
 
 
@@ -128,7 +128,9 @@ def test_what_the_text_says_of_sharing_holds():
         for name in ("reported_return", "obtained_return")
     }
 
-    assert f"alone a task takes {alone / shared:.2f} [" in PAGE
+    assert f"takes {alone:,.0f} frames on average, and {alone / shared:.2f} [" in PAGE
+    assert f"More than {alone / 1280:.1f} times is not possible" in PAGE
+    assert 3_000 < alone < 3_400 and l2d2c(1) == [12_800] * 5  # a quarter of the frames, and none at all
     assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
     assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
     assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
