@@ -134,5 +134,7 @@ def test_what_the_text_says_of_sharing_holds():
     assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
     assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
     assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
+    assert min(l2d2c(4, column="final_return")) > max(l2d2c(1, column="final_return"))
+    assert len(l2d2c(4)) == len(l2d2c(1)) == 5 and math.comb(10, 5) == 252
     returns = [f"{mean(l2d2c(members, column='final_return')):.2f}" for members in (1, 4, 16)]
     assert "mean return of {} alone, {} with 4 members and {} with 16".format(*returns) in PAGE
