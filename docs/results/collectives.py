@@ -28,15 +28,6 @@ FRAMES, LONGER = "12800", "25600"
 NUMBERS = ("1", "4", "16")
 """Members of the collectives of l2d2c_16x16."""
 
-EXCHANGES = {"isolated": "alone", "mosaic": "MOSAIC", "mosaic_no_similarity": "without similarity"}
-"""What members of ct28_mosaic_skips_d5 do, as the page calls it."""
-
-PUBLISHED = {
-    "isolated": {2: 0.98, 3: 0.98, 4: 0.34, 5: 0.11, 6: 0.0, 7: 0.0, 8: 0.0},
-    "mosaic": {2: 1.00, 3: 0.99, 4: 0.98, 5: 0.95, 6: 0.97, 7: 0.91, 8: 0.74},
-}
-"""Final returns by depth in the raw data of MOSAIC, means over 28 members and five seeds."""
-
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
@@ -167,56 +158,16 @@ def draw(path: Path) -> None:
     save_figure(figure, path, DPI)
 
 
-def by_depth(exchange: str) -> dict[int, list[float]]:
-    """Return the mean final return of the members whose tasks have a depth, for each depth one number for each seed."""
-    of: dict[int, dict[str, list[float]]] = {}
-    for line in read(BLOCKS):
-        if (line["curriculum"], line["exchange"]) == ("ct28_mosaic_skips_d5", exchange):
-            depth = line["task"].count(".") + 1
-            of.setdefault(depth, {}).setdefault(line["seed"], []).append(float(line["final_return"] or 0))
-    return {
-        depth: [sum(values) / len(values) for _, values in sorted(seeds.items())] for depth, seeds in sorted(of.items())
-    }
-
-
-def mosaic_table() -> str:
-    """Return the table of final returns by depth, beside the published ones."""
-    found = {exchange: by_depth(exchange) for exchange in EXCHANGES}
-    head = ["depth"]
-    for exchange, name in EXCHANGES.items():
-        head += [f"{name}, published"] * (exchange in PUBLISHED) + [name]
-    rows = []
-    for depth in next(iter(found.values())):
-        row = [str(depth)]
-        for exchange in EXCHANGES:
-            row += [f"{PUBLISHED[exchange][depth]:.2f}"] if exchange in PUBLISHED else []
-            values = found[exchange].get(depth)
-            row.append("not run" if values is None else mean_of(values, (0, 1)))
-        rows.append(row)
-    return table(head, rows)
-
-
-def agreement(exchange: str) -> str:
-    """Return at which depths the published mean is inside the interval of the mean over seeds, and where it is not."""
-    from ctgraph_rl.report import statistics
-
-    inside, outside = [], []
-    for depth, values in by_depth(exchange).items():
-        found, published = statistics.mean(values, bounds=(0, 1)), PUBLISHED[exchange][depth]
-        if found.low is None or found.high is None:
-            return "one seed has no interval"
-        (inside if found.low <= published <= found.high else outside).append(str(depth))
-    parts = [f"inside at depth {', '.join(inside)}"] * bool(inside) + [f"outside at {', '.join(outside)}"] * bool(
-        outside
-    )
-    return "; ".join(parts)
-
-
 def not_run() -> str:
     """Return which seeds are missing, or that none is."""
     wanted = [("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)]
     missing = {cell: SEEDS - len(on_l2d2c(*cell)) for cell in wanted}
     parts = [f"{count} of {SEEDS} seeds with N = {number}" for (number, _), count in missing.items() if count]
+    parts += [
+        f"evaluations after each batch of {count} seeds with N = {number}"
+        for number in NUMBERS
+        if (count := len(on_l2d2c(number)) - len(solving_times(number)))
+    ]
     return f"Not run yet: {'; '.join(parts)}." if parts else "All seeds that were planned are here."
 
 

@@ -21,7 +21,7 @@ def made():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(FOLDER))
         yield __import__("collectives")
-        for name in ("collectives", "raw"):
+        for name in ("collectives", "collective_runs", "raw"):
             sys.modules.pop(name, None)
 
 
