@@ -33,6 +33,9 @@ EMULATIONS = {
 }
 """Variables by which a process takes the code of another CPU."""
 
+if torch.backends.cpu.get_cpu_capability() != "AVX512":
+    del EMULATIONS["avx512"]  # illegal instructions on this CPU
+
 LEARNERS = [
     *({"agent": name} for name in ("ppo", "a2c", "dqn", "lstm_ppo")),
     {"agent": "ppo_published", "agent.num_minibatches": 8},
@@ -86,7 +89,7 @@ def test_portable_runs_are_equal_under_the_instructions_of_other_cpus_and_ordina
         return results_of_all(tmp_path / f"{emulation} {setting}", setting, emulation)
 
     held = [run_as(emulation, "true") for emulation in EMULATIONS]
-    ordinary = [run_as(emulation, "false") for emulation in ("avx512", "old")]
+    ordinary = [run_as(emulation, "false") for emulation in ("no libm", "old")]
 
     for name in held[0]:
         assert all(equal(each[name], held[0][name]) for each in held), name
