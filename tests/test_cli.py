@@ -136,8 +136,9 @@ def test_the_console_script_passes_what_follows_a_command(call, command, tmp_pat
 
 
 def test_garbage_collection_is_paused_during_the_first_import_of_torch_alone(monkeypatch):
-    freezes = []
+    freezes, rarer = [], []
     monkeypatch.setattr(gc, "freeze", lambda: freezes.append(gc.isenabled()))
+    monkeypatch.setattr(gc, "set_threshold", lambda *counts: rarer.append(counts))
 
     with first_imports():  # torch is there
         assert gc.isenabled()
@@ -147,7 +148,7 @@ def test_garbage_collection_is_paused_during_the_first_import_of_torch_alone(mon
         raise ImportError
 
     assert gc.isenabled()
-    assert freezes == [False]
+    assert freezes == [False] and rarer == [(*gc.get_threshold()[:2], 100)]
 
 
 def in_a_folder_that_shadows(checkout, tmp_path, path, code):

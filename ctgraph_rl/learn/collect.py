@@ -115,7 +115,7 @@ def batches(
     With ``carried`` and ``done`` it resumes after ``done`` frames.
     """
     start = start_of_episodes(env, initial_state)
-    carried = env.reset().update(start) if carried is None else carried
+    data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
     act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
     steps: list[Step] = []
     unstored = [key for key in start.keys() if key.startswith(UNSTORED)]  # noqa: SIM118, rows otherwise
@@ -123,10 +123,10 @@ def batches(
         if between_steps is not None:
             between_steps(frames)
         with set_exploration_type(ExplorationType.RANDOM):
-            step, carried = act_once(carried)
+            step, data = act_once(data)
         _append(steps, step, unstored)
         if len(steps) == num_steps or frames + env.numel() == num_frames:
-            yield in_time_order(steps, env), carried
+            yield in_time_order(steps, env), TensorDict(data, env.batch_size, device=env.device)
             steps = []
 
 
@@ -135,23 +135,22 @@ def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> Te
     return TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
 
 
-def act(env: CTGraphEnv, policy: Policy, carried: TensorDictBase, start: TensorDict) -> tuple[Step, TensorDictBase]:
+def act(env: CTGraphEnv, policy: Policy, data: Step, start: TensorDict) -> tuple[Step, Step]:
     """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
 
     A policy whose class defines ``act_on_tensors`` is asked that way: without the time of a TensorDict and a module,
     it takes the data by key and returns what it would write. Derived classes, modules around it and hooks are called.
     """
     if _acts_on_tensors(policy):
-        data = dict(carried.items(True, True))
-        data |= policy.act_on_tensors(data)  # type: ignore[attr-defined]
+        data = data | policy.act_on_tensors(data)  # type: ignore[attr-defined]
     else:
-        data = dict(policy(carried).items(True, True))
+        data = dict(policy(TensorDict(data, env.batch_size, device=env.device)).items(True, True))
     step, following = take_step(env, data)
     lasts = TRIAL in start.keys()  # noqa: SIM118, a TensorDict iterates over rows
     for key, value in start.items():
         state = step["next", key]
         begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
-        following.set(key, state if lasts else torch.where(begins, value, state))
+        following[key] = state if lasts else torch.where(begins, value, state)
     return step, following
 
 
@@ -185,28 +184,27 @@ class CapturedAct:
         self._region: Region | None = None
         self._params: RowParams | None = None
 
-    def __call__(self, carried: TensorDictBase) -> tuple[Step, TensorDictBase]:
+    def __call__(self, data: Step) -> tuple[Step, Step]:
         """See `act`."""
         rows = self.env.rows
         if rows.tasks_change:
-            return act(self.env, self.policy, carried, self.start)
+            return act(self.env, self.policy, data, self.start)
         if self._region is None or self._params is not rows.params:
             self._region, self._params = Region(self._act), rows.params
-        given = {key: value for key, value in carried.items() if key in self._read}
+        given = {key: value for key, value in data.items() if key in self._read}
         found = self._region(_labelled("carried", given) | _labelled("rows", rows.state._asdict()))
         rows.state = RowState(**_part("rows", found))
         step = {key: value.clone() for key, value in _part("step", found).items()}
-        return step, TensorDict(_part("following", found), self.env.batch_size, device=self.env.device)
+        return step, _part("following", found)
 
     def _act(self, given: Step) -> Step:
         env, rows = self.env, self.env.rows
         checks, env.check_actions, rows.state = env.check_actions, False, RowState(**_part("rows", given))
         try:
-            carried = TensorDict(_part("carried", given), env.batch_size, device=env.device)
-            step, following = act(env, self.policy, carried, self.start)
+            step, following = act(env, self.policy, _part("carried", given), self.start)
         finally:
             env.check_actions = checks
-        after = _labelled("following", dict(following.items())) | _labelled("rows", rows.state._asdict())
+        after = _labelled("following", following) | _labelled("rows", rows.state._asdict())
         return _labelled("step", step) | after
 
 
@@ -218,7 +216,7 @@ def _part(label: str, values: Step) -> Step:
     return {key[1]: value for key, value in values.items() if key[0] == label}
 
 
-def take_step(env: EnvBase, data: Step) -> tuple[Step, TensorDictBase]:
+def take_step(env: EnvBase, data: Step) -> tuple[Step, Step]:
     """Step all rows with the actions in their data; rows that are finished start an episode at once.
 
     The same as ``env.step_and_maybe_reset``, which makes several TensorDicts a step and takes twice as long.
@@ -228,13 +226,12 @@ def take_step(env: EnvBase, data: Step) -> tuple[Step, TensorDictBase]:
     """
     if type(env) is not CTGraphEnv:
         taken, following = env.step_and_maybe_reset(TensorDict(data, env.batch_size, device=env.device))
-        return dict(taken.items(True, True)), following
+        return dict(taken.items(True, True)), dict(following.items(True, True))
     step = dict(data)
     after, restarted = env.step_and_restart_data(step.get("action"))
     step |= {("next", key): value for key, value in after.items()}
     kept = {key: value for key, value in step.items() if key[0] != "next" and key != "reward"}
-    following = kept | restarted
-    return step, TensorDict(following, env.batch_size, device=env.device)
+    return step, kept | restarted
 
 
 def _append(steps: list[Step], step: Step, unstored: Sequence[str]) -> None:

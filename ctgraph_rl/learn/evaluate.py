@@ -93,12 +93,13 @@ def _first_episodes(
 ) -> TensorDict:
     """Return the last data of each row's first episodes, [rows, num_episodes]."""
     start = start_of_episodes(env, initial_state)
-    carried = env.reset().update(start)
-    result = carried.select("episode_reward", "step_count", "outcome", "leaf")
+    first = env.reset().update(start)
+    data = dict(first.items(True, True))
+    result = first.select("episode_reward", "step_count", "outcome", "leaf")
     result = result.unsqueeze(-1).expand(env.numel(), num_episodes).clone()
     played = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
     while (played < num_episodes).any():
-        step, carried = act(env, policy, carried, start)
+        step, data = act(env, policy, data, start)
         ends = (step["next", "done"].squeeze(-1) & (played < num_episodes)).nonzero().squeeze(-1)
         for key, value in result.items():
             value[ends, played[ends]] = step["next", key][ends]

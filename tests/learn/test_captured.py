@@ -99,7 +99,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
     for optimiser in (each for each in vars(agent).values() if isinstance(each, torch.optim.Optimizer)):
         optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
     start, steps = start_of_episodes(env, agent.initial_state), []
-    act, carried = CapturedAct(env, agent.policy, start), env.reset().to(META).update(start)
+    act, carried = CapturedAct(env, agent.policy, start), dict(env.reset().to(META).update(start).items(True, True))
     env.rows.to(META)
     env._device = META
 
