@@ -12,13 +12,16 @@ from raw import Raw, machine_of, read, write
 
 NAME, BLOCKS = "collectives", "collective_blocks"
 
-CELL = ("curriculum", "frames_of_block", "exchange", "num_members")
+CELL = ("curriculum", "frames_of_block", "exchange", "num_members", "num_epochs")
 """The columns that tell the cells of an experiment apart."""
 
 KEY = (*CELL, "seed")
 
 SOLVED = 0.9
 """The least mean return of greedy episodes in a task that is solved; the optimum is 1."""
+
+SETTLED = 5
+"""Batches after the first one with such a return, from which on `_below` counts."""
 
 
 def collect(folders: Sequence[Path]) -> None:
@@ -62,10 +65,13 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
         "frames_of_block": frames,
         "exchange": _exchange(collective.config["exchange"]),
         "num_members": len({each.member for each in collective.learned}),
+        "num_epochs": collective.config["agent"]["num_epochs"],
         "seed": collective.config["seed"],
     }
     values = {key: metrics[key]["value"] for key in ("learning_time", "share_learned", "messages", "bytes", "helps")}
-    solved = {number: _solved(log.parent / f"member_{number:03}") for number in {e.member for e in collective.learned}}
+    folders = {number: log.parent / f"member_{number:03}" for number in {each.member for each in collective.learned}}
+    solved = {number: _solved(folder) for number, folder in folders.items()}
+    below = {number: _below(folder) for number, folder in folders.items()}
     returns = [each.final_return for each in collective.learned]
     final = {"final_return": math.fsum(0.0 if math.isnan(value) else value for value in returns) / len(returns)}
     blocks = [
@@ -77,6 +83,7 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
             "frames_to_learn": "" if each.frames_to_learn is None else each.frames_to_learn,
             "frames_to_solve": solved[each.member].get(each.block, ""),
             "final_return": "" if math.isnan(each.final_return) else round(each.final_return, 6),
+            "share_below": below[each.member].get(each.block, ""),
         }
         for each in collective.learned
     ]
@@ -98,6 +105,25 @@ def _solved(member: Path) -> dict[int, int]:
             start = ends.get(block - 1, 0)
             if start < line["frames"] <= end and [line["task"]] == trained[block - 1] and line["return_mean"] >= SOLVED:
                 found.setdefault(block, line["frames"] - start)
+    return found
+
+
+def _below(member: Path) -> dict[int, float]:
+    """Return each block's share of batches with a mean return below `SOLVED`, from `SETTLED` after the first above.
+
+    Blocks without such a batch have none.
+    """
+    from ctgraph_rl.log.run_log import RunLog
+
+    returns: dict[int, list[float]] = {}
+    for line in RunLog.read(member / "run.jsonl").of_kind("training"):
+        returns.setdefault(line["block"], []).append(line["return_mean"])
+    found = {}
+    for block, values in returns.items():
+        first = next((i for i, value in enumerate(values) if value >= SOLVED), len(values))
+        later = values[first + SETTLED :]
+        if later:
+            found[block] = round(sum(not value >= SOLVED for value in later) / len(later), 6)
     return found
 
 

@@ -31,6 +31,21 @@ NUMBERS = ("1", "4", "16")
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
+MOSAIC, MOSAIC_DEPTHS = "ct28_mosaic_skips_d5", range(2, 9)
+"""The curriculum of MOSAIC's members, and the depths of its first two families, with a member each."""
+
+ALONE = (0.98, 0.98, 0.34, 0.11, 0.0, 0.0, 0.0)
+SHARED = (1.0, 0.99, 0.98, 0.95, 0.97, 0.91, 0.74)
+"""Published final returns at these depths, means over four families and five seeds of the public raw data."""
+
+PUBLISHED = (
+    ("isolated, 1 epoch", "isolated", "1", ALONE),
+    ("isolated, 8 epochs", "isolated", "8", ALONE),
+    ("MOSAIC, 1 epoch", "mosaic", "1", SHARED),
+    ("MOSAIC, 8 epochs", "mosaic", "8", SHARED),
+)
+"""Title, exchange, epochs and published returns of the columns with which a published number is compared."""
+
 DPI = 220
 
 
@@ -42,7 +57,7 @@ def cells() -> dict[tuple[str, ...], Raw]:
 
 def on_l2d2c(num_members: str, frames: str = FRAMES) -> Raw:
     """Lines of the collectives of l2d2c_16x16 with as many members."""
-    return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members), [])
+    return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members, "8"), [])
 
 
 def numbers_in(lines: Raw, column: str) -> list[float]:
@@ -60,7 +75,7 @@ def solving_times(num_members: str, frames: str = FRAMES) -> list[float]:
 
 def solved_blocks(num_members: str, frames: str = FRAMES) -> tuple[int, int]:
     """Return how many blocks had their tasks solved by their end at the latest, and how many there are."""
-    cell = ("l2d2c_16x16", frames, "l2d2c", num_members)
+    cell = ("l2d2c_16x16", frames, "l2d2c", num_members, "8")
     blocks = groups(read(BLOCKS), *CELL).get(cell, [])
     return sum(block["frames_to_solve"] != "" for block in blocks), len(blocks)
 
@@ -158,6 +173,55 @@ def draw(path: Path) -> None:
     save_figure(figure, path, DPI)
 
 
+def by_depth(exchange: str, num_epochs: str, column: str = "final_return") -> dict[int, list[float]]:
+    """Return a column of the blocks of `MOSAIC` by depth: isolated members' own values, of others means of a seed."""
+    found: dict[int, dict[tuple[str, str], list[float]]] = {}
+    for line in read(BLOCKS):
+        if (line["curriculum"], line["exchange"], line["num_epochs"]) == (MOSAIC, exchange, num_epochs) and line[
+            column
+        ]:
+            sample = (line["seed"], line["member"] if exchange == "isolated" else "")
+            depth = 1 + line["task"].count(".")
+            found.setdefault(depth, {}).setdefault(sample, []).append(float(line[column]))
+    return {depth: [sum(each) / len(each) for each in found[depth].values()] for depth in sorted(found)}
+
+
+def mosaic_table() -> str:
+    """Return the final returns of members by the depths of their tasks, beside the published ones."""
+    head, rows = ["depth", *(name for name, *_ in PUBLISHED), "MOSAIC without similarity"], []
+    columns = [*((exchange, epochs) for _, exchange, epochs, _ in PUBLISHED), ("mosaic_no_similarity", "1")]
+    returns = [by_depth(*column) for column in columns]
+    for depth in MOSAIC_DEPTHS:
+        cells = [mean_of(each[depth], (0, 1)) if depth in each else "not run" for each in returns]
+        stated = [f"{values[depth - 2]:.2f}; " for *_, values in PUBLISHED]
+        rows.append([str(depth), *(there + cell for there, cell in zip([*stated, ""], cells, strict=True))])
+    return table(head, rows)
+
+
+def agreements() -> str:
+    """Return which published returns lie in the intervals of our own, and which do not."""
+    from ctgraph_rl.report import statistics
+
+    lines = []
+    for name, exchange, epochs, published in PUBLISHED:
+        within, beyond = [], []
+        for depth, values in by_depth(exchange, epochs).items():
+            found = statistics.mean(values, bounds=(0, 1))
+            if found.low is not None and found.high is not None:
+                inside = found.low - 0.005 <= published[depth - 2] <= found.high + 0.005
+                (within if inside else beyond).append(str(depth))
+        if within or beyond:
+            inside, outside = (", ".join(depths) or "none" for depths in (within, beyond))
+            lines.append(f"- {name}: in the interval at depth {inside}; not at {outside}.")
+    return "\n".join(lines)
+
+
+def settled(num_epochs: str) -> tuple[float, int]:
+    """Return the mean share of batches below 0.9 of isolated members that once had more, and their number."""
+    shares = [each for values in by_depth("isolated", num_epochs, "share_below").values() for each in values]
+    return sum(shares) / len(shares), len(shares)
+
+
 def not_run() -> str:
     """Return which seeds are missing, or that none is."""
     wanted = [("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)]
@@ -169,6 +233,21 @@ def not_run() -> str:
         if (count := len(on_l2d2c(number)) - len(solving_times(number)))
     ]
     return f"Not run yet: {'; '.join(parts)}." if parts else "All seeds that were planned are here."
+
+
+def mosaic_runs() -> str:
+    """Return how many seeds there are of each exchange on `MOSAIC`."""
+    names = {"isolated": "isolated", "mosaic": "MOSAIC", "mosaic_no_similarity": "MOSAIC without similarity"}
+    found: dict[tuple[str, str], int] = {}
+    for line in read(NAME):
+        if line["curriculum"] == MOSAIC:
+            key = (line["exchange"], line["num_epochs"])
+            found[key] = found.get(key, 0) + 1
+    parts = [
+        f"{count} of {names[exchange]} with {epochs} epoch{'s' * (epochs != '1')}"
+        for (exchange, epochs), count in found.items()
+    ]
+    return ", ".join(parts)
 
 
 def page() -> str:
@@ -190,6 +269,10 @@ def page() -> str:
             texts[f"{column}_{number}"] = f"{sum(values) / len(values):.2f}"
     first, *_, last = by_block("16")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
+    for epochs in ("1", "8"):
+        share, count = settled(epochs)
+        texts |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}
+    texts |= {"mosaic": mosaic_table(), "agreements": agreements(), "mosaic_runs": mosaic_runs()}
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
 
 

@@ -13,7 +13,7 @@ from helpers.paths import CHECKOUT
 FOLDER = CHECKOUT / "docs" / "results"
 LINES = (FOLDER / "collectives.md").read_text(encoding="utf-8").splitlines()
 PAGE = " ".join(" ".join(LINES).split())
-CELL = ("curriculum", "frames_of_block", "exchange", "num_members")
+CELL = ("curriculum", "frames_of_block", "exchange", "num_members", "num_epochs")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ OF_CELL = read("collectives", *CELL)
 
 
 def l2d2c(num_members: int, frames: int = 12_800, column: str = "learning_time") -> list[float]:
-    return [float(line[column]) for line in OF_CELL["l2d2c_16x16", str(frames), "l2d2c", str(num_members)]]
+    return [float(line[column]) for line in OF_CELL["l2d2c_16x16", str(frames), "l2d2c", str(num_members), "8"]]
 
 
 def test_the_page_is_what_its_raw_results_make(made):
@@ -65,7 +65,8 @@ def test_each_collective_is_one_line_and_its_numbers_are_those_of_its_blocks(key
     assert all(time % int(line["evaluated_every"]) == 0 and 0 < time <= frames for time in solved)
     assert float(line["share_learned"]) == pytest.approx(mean(block["frames_to_learn"] != "" for block in blocks))
     assert float(line["final_return"]) == pytest.approx(mean(float(b["final_return"]) for b in blocks), abs=1e-6)
-    assert all(time % 1280 == 0 and 1280 <= time <= frames for time in times)
+    batch = {"l2d2c_16x16": 1280, "ct28_mosaic_skips_d5": 512}[key[0]]
+    assert all(time % batch == 0 and batch <= time <= frames for time in times if time < frames)
 
 
 def test_all_collectives_are_of_one_version_of_the_numbers():
@@ -73,7 +74,9 @@ def test_all_collectives_are_of_one_version_of_the_numbers():
 
 
 def test_members_of_l2d2c_learn_each_task_once_each_one_place_behind_the_one_before_it():
-    for (_, _, _, members, _), blocks in BLOCKS.items():
+    for (curriculum, _, _, members, *_), blocks in BLOCKS.items():
+        if curriculum != "l2d2c_16x16":
+            continue
         of = defaultdict(dict)
         for block in blocks:
             of[int(block["member"])][int(block["block"])] = block["task"]
@@ -84,15 +87,15 @@ def test_members_of_l2d2c_learn_each_task_once_each_one_place_behind_the_one_bef
 
 
 def test_learners_alone_send_nothing_and_others_take_masks_over():
-    for (_, _, _, members, _), [line] in RUNS.items():
-        shares = members != "1"
+    for (_, _, exchange, members, *_), [line] in RUNS.items():
+        shares = members != "1" and exchange != "isolated"
         assert (float(line["messages"]) > 0) == (float(line["helps"]) > 0) == (float(line["bytes"]) > 0) == shares
 
 
 def solving_times(members: int) -> list[float]:
     """The mean frames until a task is solved for each seed, of collectives that were evaluated after each batch."""
-    cell = ("12800", "l2d2c", str(members))
-    keys = [key for key, [line] in RUNS.items() if key[1:4] == cell and line["evaluated_every"] == "1280"]
+    cell = ("12800", "l2d2c", str(members), "8")
+    keys = [key for key, [line] in RUNS.items() if key[1:5] == cell and line["evaluated_every"] == "1280"]
     return [mean(float(block["frames_to_solve"] or 12_800) for block in BLOCKS[key]) for key in keys]
 
 
@@ -104,9 +107,8 @@ def test_a_row_has_the_means_over_its_seeds(members, frames, name):
     [row] = [line.split(" | ") for line in LINES if line.startswith(f"| {name} |")]
     names = ("learning_time", "final_return", "helps", "bytes")
     times, final, helps, sent = (mean(l2d2c(members, frames, name)) for name in names)
-    blocks = [
-        each for key, found in BLOCKS.items() if key[1:4] == (str(frames), "l2d2c", str(members)) for each in found
-    ]
+    cell = (str(frames), "l2d2c", str(members), "8")
+    blocks = [each for key, found in BLOCKS.items() if key[1:5] == cell for each in found]
 
     assert int(row[1]) == len(l2d2c(members, frames))
     assert row[2] == f"{sum(block['frames_to_solve'] != '' for block in blocks):,} of {len(blocks):,}"
@@ -121,7 +123,7 @@ def test_what_the_text_says_of_sharing_holds():
     alone, shared = mean(solving_times(1)), mean(solving_times(4))
     of_block = defaultdict(list)
     for key, blocks in BLOCKS.items():
-        for block in blocks if key[3] == "16" else ():
+        for block in blocks if key[2:5] == ("l2d2c", "16", "8") else ():
             of_block[int(block["block"])].append(float(block["final_return"]))
     numbers = {
         name: [f"{mean(l2d2c(members, column=name)):.2f}" for members in (4, 16)]
@@ -138,3 +140,37 @@ def test_what_the_text_says_of_sharing_holds():
     assert len(l2d2c(4)) == len(l2d2c(1)) == 5 and math.comb(10, 5) == 252
     returns = [f"{mean(l2d2c(members, column='final_return')):.2f}" for members in (1, 4, 16)]
     assert "mean return of {} alone, {} with 4 members and {} with 16".format(*returns) in PAGE
+
+
+def of_mosaic(exchange: str, num_epochs: int) -> list[dict[str, str]]:
+    """The blocks of 14 members, each of which learns one task."""
+    cell = ("ct28_mosaic_skips_d5", "102400", exchange, "14", str(num_epochs))
+    return [block for key, blocks in BLOCKS.items() if key[:5] == cell for block in blocks]
+
+
+COLUMNS = [("isolated", 1), ("isolated", 8), ("mosaic", 1), ("mosaic", 8), ("mosaic_no_similarity", 1)]
+
+
+@pytest.mark.parametrize("depth", range(2, 9))
+def test_a_depth_of_mosaic_has_the_means_of_its_members(depth):
+    [row] = [
+        line.strip("| ").split(" | ")[1:]
+        for line in LINES
+        if line.startswith(f"| {depth} | 0.") or line.startswith(f"| {depth} | 1.")
+    ]
+
+    for shown, (exchange, num_epochs) in zip(row, COLUMNS, strict=True):
+        blocks = [block for block in of_mosaic(exchange, num_epochs) if len(block["task"].split(".")) == depth]
+        returns = [float(block["final_return"]) for block in blocks]
+        assert shown.split("; ")[-1].split(" [")[0] == (f"{mean(returns):.2f}" if returns else "not run")
+
+
+def test_what_the_text_says_of_epochs_holds():
+    for num_epochs in (8, 1):
+        shares = [float(block["share_below"]) for block in of_mosaic("isolated", num_epochs) if block["share_below"]]
+        members = f"{mean(shares):.2f}"
+        assert members in PAGE and f"{len(shares)} members)" in PAGE
+    alone = [
+        [float(each["share_below"] or 0) for each in of_mosaic("isolated", n) if each["share_below"]] for n in (1, 8)
+    ]
+    assert mean(alone[0]) < mean(alone[1]) / 2
