@@ -11,6 +11,7 @@ import argparse
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from statistics import median
 from string import Template
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +32,8 @@ NUMBERS = ("1", "4", "16")
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
-MOSAIC, MOSAIC_DEPTHS = "ct28_mosaic_skips_d5", range(2, 9)
-"""The curriculum of MOSAIC's members, and the depths of its first two families, with a member each."""
+MOSAIC, MOSAIC_DEPTHS, MOSAIC_BATCH = "ct28_mosaic_skips_d5", range(2, 9), 512
+"""The curriculum of MOSAIC's members, the depths of its first two families, a member each, and frames of a batch."""
 
 ALONE = (0.98, 0.98, 0.34, 0.11, 0.0, 0.0, 0.0)
 SHARED = (1.0, 0.99, 0.98, 0.95, 0.97, 0.91, 0.74)
@@ -45,6 +46,10 @@ PUBLISHED = (
     ("MOSAIC, 8 epochs", "mosaic", "8", SHARED),
 )
 """Title, exchange, epochs and published returns of the columns with which a published number is compared."""
+
+FOUND_ALONE = ("13", "34", "69, 7 of 20", *["not stated"] * 4)
+FOUND_SHARED = ("not stated", "not stated", "32", "42", "48", "58", "68")
+"""Published batches until a return of 0.9 at these depths, medians over the runs that reached it."""
 
 DPI = 220
 
@@ -198,6 +203,27 @@ def mosaic_table() -> str:
     return table(head, rows)
 
 
+def times_table() -> str:
+    """Return the batches until members first have a return of 0.9, by depth, beside the published ones."""
+    names = {"isolated": "isolated", "mosaic": "MOSAIC", "mosaic_no_similarity": "MOSAIC without similarity"}
+    found: dict[tuple[str, int], list[str]] = {}
+    for line in read(BLOCKS):
+        if (line["curriculum"], line["num_epochs"]) == (MOSAIC, "1"):
+            found.setdefault((line["exchange"], 1 + line["task"].count(".")), []).append(line["frames_to_learn"])
+    rows = []
+    for depth, alone, shared in zip(MOSAIC_DEPTHS, FOUND_ALONE, FOUND_SHARED, strict=True):
+        ours = [_batches(found.get((exchange, depth), [])) for exchange in names]
+        rows.append([str(depth), f"{alone}; {ours[0]}", f"{shared}; {ours[1]}", ours[2]])
+    return table(["depth", *names.values()], rows)
+
+
+def _batches(frames: Sequence[str]) -> str:
+    """Return the median number of batches of those who reached it, and how many did where not all did."""
+    reached = sorted(int(each) // MOSAIC_BATCH for each in frames if each)
+    middle = f"{median(reached):g}" if reached else "never"
+    return f"{middle}, {len(reached)} of {len(frames)}" if 0 < len(reached) < len(frames) else middle
+
+
 def agreements() -> str:
     """Return which published returns lie in the intervals of our own, and which do not."""
     from ctgraph_rl.report import statistics
@@ -272,7 +298,12 @@ def page() -> str:
     for epochs in ("1", "8"):
         share, count = settled(epochs)
         texts |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}
-    texts |= {"mosaic": mosaic_table(), "agreements": agreements(), "mosaic_runs": mosaic_runs()}
+    texts |= {
+        "mosaic": mosaic_table(),
+        "mosaic_times": times_table(),
+        "agreements": agreements(),
+        "mosaic_runs": mosaic_runs(),
+    }
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import statistics
 import sys
 from collections import defaultdict
 
@@ -155,12 +156,18 @@ COLUMNS = [("isolated", 1), ("isolated", 8), ("mosaic", 1), ("mosaic", 8), ("mos
 @pytest.mark.parametrize("depth", range(2, 9))
 def test_a_depth_of_mosaic_has_the_means_of_its_members(depth):
     lines = LINES[LINES.index("## MOSAIC on nested goals") :]
-    [row] = [line.strip("| ").split(" | ")[1:] for line in lines if line.startswith(f"| {depth} |")]
+    row, times = (line.strip("| ").split(" | ")[1:] for line in lines if line.startswith(f"| {depth} |"))
 
     for shown, (exchange, num_epochs) in zip(row, COLUMNS, strict=True):
         blocks = [block for block in of_mosaic(exchange, num_epochs) if len(block["task"].split(".")) == depth]
         returns = [float(block["final_return"]) for block in blocks]
         assert shown.split("; ")[-1].split(" [")[0] == (f"{mean(returns):.2f}" if returns else "not run")
+    for shown, (exchange, num_epochs) in zip(times, [each for each in COLUMNS if each[1] == 1], strict=True):
+        blocks = [block for block in of_mosaic(exchange, num_epochs) if len(block["task"].split(".")) == depth]
+        reached = [int(block["frames_to_learn"]) / 512 for block in blocks if block["frames_to_learn"]]
+        number = shown.split("; ")[-1].split(", ")[0]
+        assert number == (f"{statistics.median(reached):g}" if reached else "never")
+        assert shown.endswith(f", {len(reached)} of {len(blocks)}") == (0 < len(reached) < len(blocks))
 
 
 def test_what_the_text_says_of_epochs_holds():
