@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shlex
@@ -42,6 +43,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         required = hasattr(item, "callspec") and item.callspec.params.get("kernel") == "required"
         if required or "test_native.py" in item.nodeid or "test_kernel.py" in item.nodeid or "compiled" in item.nodeid:
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
+
+
+def pytest_collection_finish() -> None:
+    """Leave imports and collected tests out of garbage collections and make full ones rarer, as commands do."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*gc.get_threshold()[:2], packages.FULL_COLLECTIONS)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -206,11 +206,11 @@ def test_a_buffer_that_holds_no_whole_row_is_refused_where_rows_are_replayed(com
 def test_every_agent_goes_on_with_every_method_as_if_never_stopped(compose, agent, method):
     its = life(compose, agent, method)
     whole, lines, states = its.live()
+    state = states[(METHODS.index(method) + list(AGENTS).index(agent)) % 2]  # half of a method's agents take the first
 
-    for state in states:
-        resumed, later, _ = its.live(state)
-        assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
-        assert later and later == lines[-len(later) :]
+    resumed, later, _ = its.live(state)
+    assert equal(dict(resumed.state_dict()), dict(whole.state_dict()))
+    assert later and later == lines[-len(later) :]
     if method != "multitask":
         assert [state["frames"] for state in states] == [112, 240]
     check_policies(its, whole)
