@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from pathlib import Path
 from statistics import median
 from string import Template
@@ -28,6 +29,9 @@ FRAMES, LONGER = "12800", "25600"
 
 NUMBERS = ("1", "4", "16")
 """Members of the collectives of l2d2c_16x16."""
+
+WANTED = [("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)]
+"""Members and frames of a block of the rows of its table."""
 
 BATCH = 1_280
 """Frames of a batch: the least time."""
@@ -60,9 +64,9 @@ def cells() -> dict[tuple[str, ...], Raw]:
     return groups(read(NAME), *CELL)
 
 
-def on_l2d2c(num_members: str, frames: str = FRAMES) -> Raw:
+def on_l2d2c(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> Raw:
     """Lines of the collectives of l2d2c_16x16 with as many members."""
-    return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members, "8"), [])
+    return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members, num_epochs), [])
 
 
 def numbers_in(lines: Raw, column: str) -> list[float]:
@@ -70,36 +74,44 @@ def numbers_in(lines: Raw, column: str) -> list[float]:
     return [float(line[column]) for line in lines]
 
 
-def solving_times(num_members: str, frames: str = FRAMES) -> list[float]:
+def solving_times(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> list[float]:
     """Return the mean frames until a block's task is solved, for each seed that was evaluated after each batch."""
-    lines = [line for line in on_l2d2c(num_members, frames) if int(line["evaluated_every"]) == BATCH]
+    lines = [line for line in on_l2d2c(num_members, frames, num_epochs) if int(line["evaluated_every"]) == BATCH]
     of = groups(read(BLOCKS), *KEY)
     blocks = [of[tuple(line[key] for key in KEY)] for line in lines]
     return [sum(float(block["frames_to_solve"] or frames) for block in each) / len(each) for each in blocks]
 
 
-def solved_blocks(num_members: str, frames: str = FRAMES) -> tuple[int, int]:
+def solved_blocks(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> tuple[int, int]:
     """Return how many blocks had their tasks solved by their end at the latest, and how many there are."""
-    cell = ("l2d2c_16x16", frames, "l2d2c", num_members, "8")
+    cell = ("l2d2c_16x16", frames, "l2d2c", num_members, num_epochs)
     blocks = groups(read(BLOCKS), *CELL).get(cell, [])
     return sum(block["frames_to_solve"] != "" for block in blocks), len(blocks)
 
 
 def l2d2c_table() -> str:
     """Return the table of collectives of L2D2-C by their number of members."""
-    head = ["members", "seeds", "blocks solved", "frames to solve", "frames to a return of 0.9", "final return"]
+    head = [
+        "members",
+        "epochs",
+        "seeds",
+        "blocks solved",
+        "frames to solve",
+        "frames to a return of 0.9",
+        "final return",
+    ]
     rows = []
-    for number, frames in (("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)):
-        lines = on_l2d2c(number, frames)
+    for epochs, (number, frames) in product(("1", "8"), WANTED):
+        lines = on_l2d2c(number, frames, epochs)
         if lines:
             name = number if frames == FRAMES else f"{number}, blocks of {int(frames):,} frames"
-            rows.append([name, str(len(lines)), *_row(number, frames), *_sharing(lines, int(number))])
+            rows.append([name, epochs, str(len(lines)), *_row(number, frames, epochs), *_sharing(lines, int(number))])
     return table([*head, "masks taken over", "MB"], rows)
 
 
-def _row(number: str, frames: str) -> list[str]:
-    solved, count = solved_blocks(number, frames)
-    lines, times, bounds = on_l2d2c(number, frames), solving_times(number, frames), (BATCH, float(frames))
+def _row(*cell: str) -> list[str]:
+    solved, count = solved_blocks(*cell)
+    lines, times, bounds = on_l2d2c(*cell), solving_times(*cell), (BATCH, float(cell[1]))
     return [
         f"{solved:,} of {count:,}",
         _frames(times, bounds) + (f" (n = {len(times)})" if 0 < len(times) < len(lines) else ""),
@@ -140,11 +152,11 @@ def _ratio(first: Any, second: Any) -> Any:
     return (first / second)[..., 0]
 
 
-def by_block(num_members: str, frames: str = FRAMES) -> list[float]:
+def by_block(num_members: str, num_epochs: str = "1") -> list[float]:
     """Return the mean final return of all members and seeds in each block, from the first."""
     of: dict[int, list[float]] = {}
     for line in read(BLOCKS):
-        if (line["frames_of_block"], line["num_members"]) == (frames, num_members) and line["exchange"] == "l2d2c":
+        if tuple(line[key] for key in CELL) == ("l2d2c_16x16", FRAMES, "l2d2c", num_members, num_epochs):
             of.setdefault(int(line["block"]), []).append(float(line["final_return"] or 0))
     return [sum(values) / len(values) for _, values in sorted(of.items())]
 
@@ -171,8 +183,8 @@ def draw(path: Path) -> None:
     times.minorticks_off()
     times.legend(fontsize=7, frameon=False, loc="upper right")
     for number, style in zip(NUMBERS, (":", "--", "-"), strict=True):
-        values = by_block(number)
-        returns.plot(range(1, len(values) + 1), values, style, color="0", lw=1, label=f"N = {number}")
+        if values := by_block(number):
+            returns.plot(range(1, len(values) + 1), values, style, color="0", lw=1, label=f"N = {number}")
     returns.set(xlabel="block", ylabel="final return", ylim=(-0.03, 1.03))
     returns.legend(fontsize=7, frameon=False, loc="lower right")
     save_figure(figure, path, DPI)
@@ -250,9 +262,12 @@ def settled(num_epochs: str) -> tuple[float, int]:
 
 def not_run() -> str:
     """Return which seeds are missing, or that none is."""
-    wanted = [("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)]
-    missing = {cell: SEEDS - len(on_l2d2c(*cell)) for cell in wanted}
-    parts = [f"{count} of {SEEDS} seeds with N = {number}" for (number, _), count in missing.items() if count]
+    missing = {cell: SEEDS - len(on_l2d2c(*cell)) for cell in WANTED}
+    parts = [
+        f"{count} of {SEEDS} seeds with N = {number} and blocks of {int(frames):,} frames"
+        for (number, frames), count in missing.items()
+        if count
+    ]
     parts += [
         f"evaluations after each batch of {count} seeds with N = {number}"
         for number in NUMBERS
@@ -283,17 +298,9 @@ def page() -> str:
     mean = sum(alone) / len(alone)
     ratio, same = faster("4"), "the interval includes 1, so that these few seeds do not show that sharing is sooner"
     sooner = ratio.low is not None and ratio.low > 1
-    texts = {"faster_4": shown(ratio), "n_4": str(ratio.n), "verdict": "sharing is sooner" if sooner else same}
-    texts |= {"alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"}
-    for number in NUMBERS:
-        returns = numbers_in(on_l2d2c(number), "final_return")
-        texts[f"return_{number}"] = f"{sum(returns) / len(returns):.2f}"
-        texts[f"solved_{number}"] = "{:,} of {:,}".format(*solved_blocks(number))
-    for number in NUMBERS[1:]:
-        for column in ("reported", "obtained"):
-            values = numbers_in(on_l2d2c(number), f"{column}_return")
-            texts[f"{column}_{number}"] = f"{sum(values) / len(values):.2f}"
-    first, *_, last = by_block("16")[1:]
+    texts = {"faster_4": shown(ratio), "verdict": "sharing is sooner" if sooner else same}
+    texts |= {"alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"} | _of_numbers("1", "") | _of_numbers("8", "_8")
+    first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     for epochs in ("1", "8"):
         share, count = settled(epochs)
@@ -305,6 +312,27 @@ def page() -> str:
         "mosaic_runs": mosaic_runs(),
     }
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
+
+
+def _of_numbers(num_epochs: str, suffix: str) -> dict[str, str]:
+    """Return what the text says of collectives of each number of members that were run."""
+    texts = {}
+    for number in NUMBERS:
+        lines = on_l2d2c(number, num_epochs=num_epochs)
+        solved, count = solved_blocks(number, num_epochs=num_epochs)
+        values = {"n": str(len(lines)), "blocks": f"{count:,}", "solved": f"{solved:,} of {count:,}"}
+        for name, column, form in (
+            ("return", "final_return", ".2f"),
+            ("learned", "share_learned", ".0%"),
+            ("learning", "learning_time", ",.0f"),
+            ("reported", "reported_return", ".2f"),
+            ("obtained", "obtained_return", ".2f"),
+        ):
+            if lines and lines[0][column]:
+                column_of = numbers_in(lines, column)
+                values[name] = format(sum(column_of) / len(column_of), form).replace("%", " %")
+        texts |= {f"{name}_{number}{suffix}": value for name, value in values.items()}
+    return texts
 
 
 def main() -> None:
