@@ -46,10 +46,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave imports and collected tests out of garbage collections and make full ones rarer, as commands do."""
+    """Leave imports and collected tests out of garbage collections, and make all of these rarer."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(*gc.get_threshold()[:2], packages.FULL_COLLECTIONS)
+    gc.set_threshold(50_000, 20, 100)
 
 
 @pytest.fixture(autouse=True, scope="session")
