@@ -300,6 +300,7 @@ def page() -> str:
     sooner = ratio.low is not None and ratio.low > 1
     texts = {"faster_4": shown(ratio), "verdict": "sharing is sooner" if sooner else same}
     texts |= {"alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"} | _of_numbers("1", "") | _of_numbers("8", "_8")
+    texts |= known_and_new()
     first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     for epochs in ("1", "8"):
@@ -312,6 +313,22 @@ def page() -> str:
         "mosaic_runs": mosaic_runs(),
     }
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
+
+
+def known_and_new() -> dict[str, str]:
+    """Return what 4 members learned in blocks whose task one of them had in an earlier block, and in the others."""
+    lines = groups(read(BLOCKS), *CELL)["l2d2c_16x16", FRAMES, "l2d2c", "4", "1"]
+    first: dict[tuple[str, str], int] = {}
+    for line in lines:
+        key = (line["seed"], line["task"])
+        first[key] = min(int(line["block"]), first.get(key, int(line["block"])))
+    texts = {}
+    for name, known in (("new", False), ("known", True)):
+        those = [each for each in lines if (int(each["block"]) > first[each["seed"], each["task"]]) == known]
+        learned = sum(each["frames_to_learn"] != "" for each in those)
+        texts[f"{name}_return"] = f"{sum(numbers_in(those, 'final_return')) / len(those):.2f}"
+        texts[f"{name}_learned"] = f"{learned} of {len(those)} blocks"
+    return texts
 
 
 def _of_numbers(num_epochs: str, suffix: str) -> dict[str, str]:

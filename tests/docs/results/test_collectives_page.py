@@ -144,6 +144,21 @@ def test_what_the_text_says_of_sharing_holds():
     assert "{} and {} with 4 members.".format(*kept) in PAGE and kept[1] >= kept[0]
 
 
+def test_what_the_text_says_of_tasks_that_others_had_holds():
+    of_kind = {True: [], False: []}
+    for key, blocks in BLOCKS.items():
+        for block in blocks if key[:5] == ("l2d2c_16x16", "12800", "l2d2c", "4", "1") else ():
+            earlier = [each for each in blocks if int(each["block"]) < int(block["block"])]
+            of_kind[block["task"] in {each["task"] for each in earlier}].append(block)
+    shown = {known: f"{mean(float(each['final_return']) for each in blocks):.2f}" for known, blocks in of_kind.items()}
+    learned = {known: sum(each["frames_to_learn"] != "" for each in blocks) for known, blocks in of_kind.items()}
+
+    assert f"final return of {shown[False]}, as alone" in PAGE and f"other blocks they have {shown[True]}" in PAGE
+    assert f"return of 0.9 in {learned[False]} of {len(of_kind[False])} blocks" in PAGE
+    assert f"such a batch in {learned[True]} of {len(of_kind[True])} blocks" in PAGE
+    assert learned == {False: 0, True: len(of_kind[True])}
+
+
 def test_what_the_text_says_of_eight_epochs_holds():
     of_block = defaultdict(list)
     for key, blocks in BLOCKS.items():
