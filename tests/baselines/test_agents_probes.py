@@ -121,16 +121,19 @@ def test_one_of_two_actions_pays(compose, name):
     assert learn_probe(compose, name, 200, shows_cue=False) == 1.0
 
 
+@pytest.mark.slow
 @every_agent
 def test_what_pays_depends_on_the_observation(compose, name):
     assert learn_probe(compose, name, 300) == 1.0
 
 
+@pytest.mark.slow
 @every_agent
 def test_the_reward_comes_a_step_after_the_action_that_earned_it(compose, name):
     assert learn_probe(compose, name, 300, length=2, shows_first=True) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECURRENT)
 def test_what_pays_depends_on_the_observation_before(compose, name):
     assert learn_probe(compose, name, 400, length=2) == 1.0
@@ -144,6 +147,7 @@ def test_an_agent_without_memory_cannot_know_the_observation_before(compose, nam
     assert greedy_return(agent, env) == pytest.approx(0.5, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dqn", "lstm_ppo", "ppo", "qrdqn_lstm"])
 def test_an_agent_learns_one_hot_observations_of_three_branches(build_agent, name):
     """A probe: depth 1, where every state shows its kind, is solved exactly."""

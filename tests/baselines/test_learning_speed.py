@@ -233,6 +233,7 @@ def test_an_agent_with_an_lstm_is_not_compiled(small_agent, name):
         small_agent(name, [ct_su_b1()], "+agent.compile=true")
 
 
+@pytest.mark.slow
 def test_the_benchmark_prints_a_row_for_everybody(capsys):
     benchmark.main(["--agents", "a2c", "--rounds", "1", "--seconds", "0.001", "--seeds", "1", "--max-frames", "1"])
 

@@ -18,6 +18,7 @@ FILE = DATA / f"numbers_{NUMBERS}.json"
 HOW = "if that is meant, raise NUMBERS in ctgraph_rl/log/provenance.py and run python -m tests.baselines.pinned"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="portable runs are for x86-64")
 def test_tiny_portable_runs_of_every_agent_with_every_method_have_the_bits_of_the_numbers_version():
     assert FILE.exists(), f"there are no digests of numbers version {NUMBERS}: {HOW}"

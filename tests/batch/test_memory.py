@@ -43,6 +43,7 @@ def test_a_million_rows_of_ct_co_b1_take_less_than_a_gibibyte_beyond_two_observa
     assert int(found.stdout) < 2**30
 
 
+@pytest.mark.slow
 def test_all_rows_share_one_copy_of_the_images_of_every_state_of_a_large_tree():
     graph = CTGraph(3, 10)
     waits, decisions = graph.num_wait_states, graph.num_decision_states

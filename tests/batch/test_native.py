@@ -57,7 +57,7 @@ def bits(value: Tensor) -> np.ndarray:
 
 
 @every_kind
-@pytest.mark.parametrize("num_rows", [1, 5, 64, 1000])
+@pytest.mark.parametrize("num_rows", [5, *(pytest.param(number, marks=pytest.mark.slow) for number in (1, 64, 1000))])
 def test_a_compiled_rollout_gives_the_bits_of_the_tensor_code(tasks, num_rows):
     tasks = batch(tasks, num_rows)
     rows, twin = (Rows(tasks, seed=2**62 + 5, first_row=2**31, kernel="off") for _ in range(2))

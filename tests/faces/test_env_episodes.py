@@ -93,6 +93,7 @@ def test_a_navigation_policy_gets_the_reward_with_probability_b_to_the_minus_d(b
     assert is_uniform(torch.bincount(last["leaf"].flatten()).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "prob"),
     [(ct_su_b1((1, 2)), 1 / 243), (surjective(2, 2, 0.5, goal=(2, 1)), 3 / 3375), (surjective(3, 1, 0.5), 1 / 196)],

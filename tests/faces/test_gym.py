@@ -225,6 +225,7 @@ def test_observations_can_be_flattened():
     assert env.reset(seed=0)[0].shape == (144,)
 
 
+@pytest.mark.slow
 def test_async_vector_env_runs_the_single_environment():
     envs = AsyncVectorEnv([lambda: CTGraphGymEnv("CT-FO-B2")] * 2)
     twin = CTGraphVectorEnv(2, "CT-FO-B2")

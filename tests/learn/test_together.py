@@ -203,9 +203,10 @@ def wide(value: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        *((name, "finetune") for name in AGENTS),
-        *(("ppo", method) for method in ("ewc", "mask_lc")),
-        *(pytest.param("ppo", m, marks=pytest.mark.slow) for m in METHODS if m not in ("ewc", "mask_lc")),
+        ("a2c", "finetune"),
+        ("ppo", "mask_lc"),
+        *(pytest.param(name, "finetune", marks=pytest.mark.slow) for name in AGENTS if name != "a2c"),
+        *(pytest.param("ppo", method, marks=pytest.mark.slow) for method in METHODS if method != "mask_lc"),
     ],
 )
 def test_each_seed_ends_near_its_run_alone(make, name, method):
@@ -220,10 +221,8 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [("ppo", "ewc"), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in COMPILED)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "method"), [("ppo", "ewc"), *COMPILED])
 def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeypatch, name, method):
     its = make(
         name, method, "agent.compile=true", curriculum=of(Block(ONE, 64), Block(THREE, 64), task_id="at_boundaries")
@@ -305,10 +304,11 @@ def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        ("ppo", "ewc"),
         ("ppo_published", "mask_lc"),
-        ("prioritized dqn", "l2"),
-        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in [("ppo", "finetune"), ("a2c", "scratch")]),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in [("ppo", "ewc"), ("ppo", "finetune"), ("a2c", "scratch"), ("prioritized dqn", "l2")]
+        ),
     ],
 )
 def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_path, name, method):
@@ -344,7 +344,9 @@ def spoil(monkeypatch, numbers=(1,)) -> None:
     monkeypatch.setattr(Group, "learn", spoiled)
 
 
-@pytest.mark.parametrize(("name", "method"), [("ppo", "ewc"), ("prioritized dqn", "finetune")])
+@pytest.mark.parametrize(
+    ("name", "method"), [pytest.param("ppo", "ewc", marks=pytest.mark.slow), ("prioritized dqn", "finetune")]
+)
 def test_a_seed_that_is_not_finite_fails_alone_and_changes_no_bit_of_another(make, monkeypatch, tmp_path, name, method):
     its, kept = make(name, method), []
     group, logs = its.learn()

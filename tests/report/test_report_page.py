@@ -200,6 +200,7 @@ def test_curves_have_bands_from_ten_seeds_on_within_what_is_possible():
     assert [point.low for point in curve] == pytest.approx([0.69150, 0.55498], abs=5e-6)
 
 
+@pytest.mark.slow
 def test_more_agents_than_colours_are_in_the_tables_and_it_is_said(tmp_path):
     for number in range(8):
         write_run(tmp_path / "runs" / f"{number}", agent=f"Agent{number}")

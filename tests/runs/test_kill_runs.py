@@ -24,13 +24,9 @@ def kill_runs(checkout: Path, *arguments: str) -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_runs_that_are_killed_end_as_if_never_stopped(checkout):
-    kill_runs(checkout, "--kills", "2", "--agents", "a2c")
-
-
 @pytest.mark.slow
-def test_runs_of_three_agents_that_are_killed_end_as_if_never_stopped(checkout):
-    kill_runs(checkout, "--kills", "6", "--agents", "dqn,lstm_ppo,rl2")
+def test_runs_of_four_agents_that_are_killed_end_as_if_never_stopped(checkout):
+    kill_runs(checkout, "--kills", "8", "--agents", "a2c,dqn,lstm_ppo,rl2")
 
 
 def start(run_dir: Path, checkout: Path) -> subprocess.Popen:

@@ -26,6 +26,13 @@ with tarfile.open(ARCHIVE) as _archive:
 """For each run its command line, and its directory in ``runs`` and ``stopped``."""
 
 every_run = pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
+every_run_some_slow = pytest.mark.parametrize(
+    "cell",
+    [
+        pytest.param(cell, id=name, marks=[] if number % 4 == 0 else [pytest.mark.slow])
+        for number, (name, cell) in enumerate(CELLS.items())
+    ],
+)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +80,7 @@ def made_alike(run_dir: Path) -> bool:
     return all(about[key] == here[key] for key in here)
 
 
-@every_run
+@every_run_some_slow
 def test_the_same_command_finds_a_finished_run_and_shows_it(command, stored, capsys, cell):
     code, run_dir = command("runs", cell)
 
@@ -92,7 +99,7 @@ def test_the_agents_of_a_finished_and_of_a_stopped_run_are_loaded_as_they_were_s
     assert checkpoint["frames"] == 160  # in the middle of the third of four blocks of 64 frames
 
 
-@every_run
+@every_run_some_slow
 def test_the_same_command_resumes_a_stopped_run_which_ends_as_the_one_that_was_never_stopped(command, stored, cell):
     whole = stored / "runs" / cell["directory"]
     before = [line for line in lines(whole) if line.get("frames", 0) <= 160]

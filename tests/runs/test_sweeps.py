@@ -251,11 +251,11 @@ def test_lists_and_dictionaries_can_be_swept(learned, monkeypatch):
     assert found == two
 
 
+@pytest.mark.slow
 def test_a_sweep_on_processes_runs_every_cell_and_shows_no_bars(checkout, tmp_path):
     pytest.importorskip("joblib")
     command = [sys.executable, "-m", "ctgraph_rl.run", "-m", "hydra/launcher=joblib", *SHORT, "seed=0,-1,1"]
     env = {**os.environ, "PYTHONPATH": str(checkout)}
-
     result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
 
     assert (result.returncode, result.stderr) == (1, "")

@@ -201,8 +201,14 @@ def test_a_buffer_that_holds_no_whole_row_is_refused_where_rows_are_replayed(com
 # Runs
 
 
-@pytest.mark.parametrize("agent", AGENTS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("agent", "method"),
+    [
+        pytest.param(agent, method, marks=[] if (number + place) % len(AGENTS) == 0 else [pytest.mark.slow])
+        for number, method in enumerate(METHODS)
+        for place, agent in enumerate(AGENTS)
+    ],
+)
 def test_every_agent_goes_on_with_every_method_as_if_never_stopped(compose, agent, method):
     its = life(compose, agent, method)
     whole, lines, states = its.live()

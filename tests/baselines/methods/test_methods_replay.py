@@ -47,6 +47,7 @@ OFFERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offers", OFFERS.values(), ids=OFFERS)
 def test_every_item_is_kept_with_the_same_chance_and_every_pair_too(offers):
     """12 items and 3 places: an item is kept with chance 1/4, a pair with 3/12 * 2/11."""
