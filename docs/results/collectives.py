@@ -1,8 +1,8 @@
 """Learners that share: raw results, and collectives.md and its figure, which are made of them.
 
 ``python docs/results/collectives.py collect RUNS...`` adds the finished collectives under some folders to
-collectives.csv, a line each, and to collective_blocks.csv, a line for each member and block. Lines of other collectives
-stay as they were. ``python docs/results/collectives.py`` makes the page.
+collectives.csv, a line each, and to collective_blocks.csv, a line for each member and block, and the finished runs on
+ct28 to selecting.csv. Lines of other runs stay as they were. ``python docs/results/collectives.py`` makes the page.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from statistics import median
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+import selecting
 from collective_runs import BLOCKS, CELL, KEY, NAME, collect
 from raw import HERE, Raw, groups, machines, mean_of, read, shown, table
 
@@ -296,11 +297,15 @@ def page() -> str:
     template = Template((HERE / "collectives_template.md").read_text(encoding="utf-8"))
     alone = solving_times("1")
     mean = sum(alone) / len(alone)
-    ratio, same = faster("4"), "the interval includes 1, so that these few seeds do not show that sharing is sooner"
-    sooner = ratio.low is not None and ratio.low > 1
-    texts = {"faster_4": shown(ratio), "verdict": "sharing is sooner" if sooner else same}
+    same = "the intervals include 1, so that these few seeds do not show that sharing is sooner"
+    ratios = {number: faster(number) for number in NUMBERS[1:]}
+    sooner = all(ratio.low is not None and ratio.low > 1 for ratio in ratios.values())
+    texts = {f"faster_{number}": shown(ratio) for number, ratio in ratios.items()}
+    texts |= {"verdict": "sharing is sooner" if sooner else same}
     texts |= {"alone": f"{mean:,.0f}", "most": f"{mean / BATCH:.1f}"} | _of_numbers("1", "") | _of_numbers("8", "_8")
-    texts |= known_and_new()
+    texts |= known_and_new("4") | known_and_new("16")
+    longer = numbers_in(on_l2d2c("1", LONGER), "learning_time")
+    texts["learning_longer"] = f"{sum(longer) / len(longer):,.0f}"
     first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
     for epochs in ("1", "8"):
@@ -311,13 +316,14 @@ def page() -> str:
         "mosaic_times": times_table(),
         "agreements": agreements(),
         "mosaic_runs": mosaic_runs(),
+        **selecting.texts(),
     }
-    return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME), not_run=not_run(), **texts)
+    return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME, selecting.NAME), not_run=not_run(), **texts)
 
 
-def known_and_new() -> dict[str, str]:
-    """Return what 4 members learned in blocks whose task one of them had in an earlier block, and in the others."""
-    lines = groups(read(BLOCKS), *CELL)["l2d2c_16x16", FRAMES, "l2d2c", "4", "1"]
+def known_and_new(num_members: str) -> dict[str, str]:
+    """Return what members learned in blocks whose task one of them had in an earlier block, and in the others."""
+    lines = groups(read(BLOCKS), *CELL)["l2d2c_16x16", FRAMES, "l2d2c", num_members, "1"]
     first: dict[tuple[str, str], int] = {}
     for line in lines:
         key = (line["seed"], line["task"])
@@ -326,8 +332,8 @@ def known_and_new() -> dict[str, str]:
     for name, known in (("new", False), ("known", True)):
         those = [each for each in lines if (int(each["block"]) > first[each["seed"], each["task"]]) == known]
         learned = sum(each["frames_to_learn"] != "" for each in those)
-        texts[f"{name}_return"] = f"{sum(numbers_in(those, 'final_return')) / len(those):.2f}"
-        texts[f"{name}_learned"] = f"{learned} of {len(those)} blocks"
+        texts[f"{name}_return_{num_members}"] = f"{sum(numbers_in(those, 'final_return')) / len(those):.2f}"
+        texts[f"{name}_learned_{num_members}"] = f"{learned} of {len(those)} blocks"
     return texts
 
 
@@ -361,6 +367,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.command == "collect":
         collect(options.runs)
+        selecting.collect(options.runs)
     else:
         (HERE / "collectives.md").write_text(page(), encoding="utf-8")
         draw(HERE / "collectives.png")

@@ -94,11 +94,11 @@ def test_learners_alone_send_nothing_and_others_take_masks_over():
         assert (float(line["messages"]) > 0) == (float(line["helps"]) > 0) == (float(line["bytes"]) > 0) == shares
 
 
-def solving_times(members: int, epochs: int = 1) -> list[float]:
+def solving_times(members: int, epochs: int = 1, frames: int = 12_800) -> list[float]:
     """The mean frames until a task is solved for each seed, of collectives that were evaluated after each batch."""
-    cell = ("l2d2c_16x16", "12800", "l2d2c", str(members), str(epochs))
+    cell = ("l2d2c_16x16", str(frames), "l2d2c", str(members), str(epochs))
     keys = [key for key, [line] in RUNS.items() if key[:5] == cell and line["evaluated_every"] == "1280"]
-    return [mean(float(block["frames_to_solve"] or 12_800) for block in BLOCKS[key]) for key in keys]
+    return [mean(float(block["frames_to_solve"] or frames) for block in BLOCKS[key]) for key in keys]
 
 
 def rows_of_l2d2c() -> dict[tuple[str, str], list[str]]:
@@ -123,40 +123,53 @@ def test_a_row_has_the_means_over_its_seeds():
         assert int(row[0]) == len(l2d2c(members, epochs, frames))
         assert row[1] == f"{sum(block['frames_to_solve'] != '' for block in blocks):,} of {len(blocks):,}"
         if row[2] != "not measured":
-            assert row[2].split(" [")[0] == f"{mean(solving_times(members, epochs)):,.0f}"
+            assert row[2].split(" [")[0] == f"{mean(solving_times(members, epochs, frames)):,.0f}"
         assert row[3].split(" [")[0] == f"{times:,.0f}"
         assert row[4].split(" [")[0] == f"{final:.2f}"
         assert row[5:] == [f"{helps / members:.1f}", f"{sent / members / 1e6:.1f}"]
 
 
 def test_what_the_text_says_of_sharing_holds():
-    alone, shared = mean(solving_times(1)), mean(solving_times(4))
-    returns = [l2d2c(members, column="final_return") for members in (1, 4)]
+    alone, *shared = (mean(solving_times(members)) for members in (1, 4, 16))
+    returns = [l2d2c(members, column="final_return") for members in (1, 4, 16)]
 
-    assert f"takes {alone:,.0f} frames on average, and {alone / shared:.2f} [" in PAGE
+    assert f"a task takes {alone:,.0f} frames on average, {alone / shared[0]:.2f} [" in PAGE
+    assert f"with 4 members and {alone / shared[1]:.2f} [" in PAGE
     assert f"More than {alone / 1280:.1f} times is not possible" in PAGE
     assert 3_000 < alone < 3_700 and l2d2c(1) == [12_800] * 5  # about a quarter of the frames, and none at all
-    assert "mean return of {:.2f} alone and {:.2f} with 4 members".format(*map(mean, returns)) in PAGE
-    assert min(returns[1]) > max(returns[0]) and f"The lowest of {len(returns[1])} seeds" in PAGE
-    share = f"{mean(l2d2c(4, column='share_learned')):.0%}".replace("%", " %")
-    assert f"one does in {share} of blocks, after {mean(l2d2c(4)):,.0f} frames on average" in PAGE
-    kept = [f"{mean(l2d2c(4, column=column)):.2f}" for column in ("reported_return", "obtained_return")]
-    assert "{} and {} with 4 members.".format(*kept) in PAGE and kept[1] >= kept[0]
+    assert "mean return of {:.2f} alone, {:.2f} with 4 members and {:.2f} with 16".format(*map(mean, returns)) in PAGE
+    assert max(returns[0]) < min(returns[1]) and max(returns[1]) < min(returns[2])
+    shares = [f"{mean(l2d2c(members, column='share_learned')):.0%}".replace("%", " %") for members in (4, 16)]
+    assert f"one does in {shares[0]} of blocks, after {mean(l2d2c(4)):,.0f} frames on average" in PAGE
+    assert f"with 16 in {shares[1]}, after {mean(l2d2c(16)):,.0f} frames" in PAGE
+    assert f"in each block, after {mean(l2d2c(1, frames=25_600)):,.0f} frames." in PAGE
+    assert set(l2d2c(1, frames=25_600, column="share_learned")) == {1}
+    columns = [(members, column) for members in (4, 16) for column in ("reported_return", "obtained_return")]
+    kept = [f"{mean(l2d2c(members, column=column)):.2f}" for members, column in columns]
+    assert "{} and {} with 4 members, {} and {} with 16.".format(*kept) in PAGE
+    assert kept[1] >= kept[0] and kept[3] >= kept[2]
 
 
 def test_what_the_text_says_of_tasks_that_others_had_holds():
-    of_kind = {True: [], False: []}
-    for key, blocks in BLOCKS.items():
-        for block in blocks if key[:5] == ("l2d2c_16x16", "12800", "l2d2c", "4", "1") else ():
-            earlier = [each for each in blocks if int(each["block"]) < int(block["block"])]
-            of_kind[block["task"] in {each["task"] for each in earlier}].append(block)
-    shown = {known: f"{mean(float(each['final_return']) for each in blocks):.2f}" for known, blocks in of_kind.items()}
-    learned = {known: sum(each["frames_to_learn"] != "" for each in blocks) for known, blocks in of_kind.items()}
+    new, known = [], []
+    for members in (4, 16):
+        of_kind = {True: [], False: []}
+        for key, blocks in BLOCKS.items():
+            for block in blocks if key[:5] == ("l2d2c_16x16", "12800", "l2d2c", str(members), "1") else ():
+                earlier = [each for each in blocks if int(each["block"]) < int(block["block"])]
+                of_kind[block["task"] in {each["task"] for each in earlier}].append(block)
+        for kind, found in ((False, new), (True, known)):
+            learned = sum(each["frames_to_learn"] != "" for each in of_kind[kind])
+            assert learned == kind * len(of_kind[kind])
+            final = mean(float(each["final_return"]) for each in of_kind[kind])
+            found += [f"{final:.2f}", f"{learned} of {len(of_kind[kind])} blocks"]
+        assert members == 4 or {each["block"] for each in of_kind[False]} == {"1"}
 
-    assert f"final return of {shown[False]}, as alone" in PAGE and f"other blocks they have {shown[True]}" in PAGE
-    assert f"return of 0.9 in {learned[False]} of {len(of_kind[False])} blocks" in PAGE
-    assert f"such a batch in {learned[True]} of {len(of_kind[True])} blocks" in PAGE
-    assert learned == {False: 0, True: len(of_kind[True])}
+    first, second, third, fourth = new
+    assert f"4 members have a final return of {first} and 16 members of {third}" in PAGE
+    assert f"a return of 0.9 in {second} and in {fourth}" in PAGE
+    first, second, third, fourth = known
+    assert f"other blocks they have {first} and {third}, and such a batch in {second} and {fourth}" in PAGE
 
 
 def test_what_the_text_says_of_eight_epochs_holds():
