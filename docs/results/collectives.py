@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from functools import cache
 from itertools import product
 from pathlib import Path
-from statistics import median
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+import mosaic
 import selecting
 from collective_runs import BLOCKS, CELL, KEY, NAME, collect
-from raw import HERE, Raw, groups, machines, mean_of, read, shown, table
+from raw import HERE, Raw, groups, machines, mean_of, numbers_in, read, shown, table
 
 SEEDS = 5
 
@@ -37,25 +37,6 @@ WANTED = [("1", FRAMES), ("1", LONGER), ("4", FRAMES), ("16", FRAMES)]
 BATCH = 1_280
 """Frames of a batch: the least time."""
 
-MOSAIC, MOSAIC_DEPTHS, MOSAIC_BATCH = "ct28_mosaic_skips_d5", range(2, 9), 512
-"""The curriculum of MOSAIC's members, the depths of its first two families, a member each, and frames of a batch."""
-
-ALONE = (0.98, 0.98, 0.34, 0.11, 0.0, 0.0, 0.0)
-SHARED = (1.0, 0.99, 0.98, 0.95, 0.97, 0.91, 0.74)
-"""Published final returns at these depths, means over four families and five seeds of the public raw data."""
-
-PUBLISHED = (
-    ("isolated, 1 epoch", "isolated", "1", ALONE),
-    ("isolated, 8 epochs", "isolated", "8", ALONE),
-    ("MOSAIC, 1 epoch", "mosaic", "1", SHARED),
-    ("MOSAIC, 8 epochs", "mosaic", "8", SHARED),
-)
-"""Title, exchange, epochs and published returns of the columns with which a published number is compared."""
-
-FOUND_ALONE = ("13", "34", "69, 7 of 20", *["not stated"] * 4)
-FOUND_SHARED = ("not stated", "not stated", "32", "42", "48", "58", "68")
-"""Published batches until a return of 0.9 at these depths, medians over the runs that reached it."""
-
 DPI = 220
 
 
@@ -68,11 +49,6 @@ def cells() -> dict[tuple[str, ...], Raw]:
 def on_l2d2c(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> Raw:
     """Lines of the collectives of l2d2c_16x16 with as many members."""
     return cells().get(("l2d2c_16x16", frames, "l2d2c", num_members, num_epochs), [])
-
-
-def numbers_in(lines: Raw, column: str) -> list[float]:
-    """A column, one number for each seed."""
-    return [float(line[column]) for line in lines]
 
 
 def solving_times(num_members: str, frames: str = FRAMES, num_epochs: str = "1") -> list[float]:
@@ -191,76 +167,6 @@ def draw(path: Path) -> None:
     save_figure(figure, path, DPI)
 
 
-def by_depth(exchange: str, num_epochs: str, column: str = "final_return") -> dict[int, list[float]]:
-    """Return a column of the blocks of `MOSAIC` by depth: isolated members' own values, of others means of a seed."""
-    found: dict[int, dict[tuple[str, str], list[float]]] = {}
-    for line in read(BLOCKS):
-        if (line["curriculum"], line["exchange"], line["num_epochs"]) == (MOSAIC, exchange, num_epochs) and line[
-            column
-        ]:
-            sample = (line["seed"], line["member"] if exchange == "isolated" else "")
-            depth = 1 + line["task"].count(".")
-            found.setdefault(depth, {}).setdefault(sample, []).append(float(line[column]))
-    return {depth: [sum(each) / len(each) for each in found[depth].values()] for depth in sorted(found)}
-
-
-def mosaic_table() -> str:
-    """Return the final returns of members by the depths of their tasks, beside the published ones."""
-    head, rows = ["depth", *(name for name, *_ in PUBLISHED), "MOSAIC without similarity"], []
-    columns = [*((exchange, epochs) for _, exchange, epochs, _ in PUBLISHED), ("mosaic_no_similarity", "1")]
-    returns = [by_depth(*column) for column in columns]
-    for depth in MOSAIC_DEPTHS:
-        cells = [mean_of(each[depth], (0, 1)) if depth in each else "not run" for each in returns]
-        stated = [f"{values[depth - 2]:.2f}; " for *_, values in PUBLISHED]
-        rows.append([str(depth), *(there + cell for there, cell in zip([*stated, ""], cells, strict=True))])
-    return table(head, rows)
-
-
-def times_table() -> str:
-    """Return the batches until members first have a return of 0.9, by depth, beside the published ones."""
-    names = {"isolated": "isolated", "mosaic": "MOSAIC", "mosaic_no_similarity": "MOSAIC without similarity"}
-    found: dict[tuple[str, int], list[str]] = {}
-    for line in read(BLOCKS):
-        if (line["curriculum"], line["num_epochs"]) == (MOSAIC, "1"):
-            found.setdefault((line["exchange"], 1 + line["task"].count(".")), []).append(line["frames_to_learn"])
-    rows = []
-    for depth, alone, shared in zip(MOSAIC_DEPTHS, FOUND_ALONE, FOUND_SHARED, strict=True):
-        ours = [_batches(found.get((exchange, depth), [])) for exchange in names]
-        rows.append([str(depth), f"{alone}; {ours[0]}", f"{shared}; {ours[1]}", ours[2]])
-    return table(["depth", *names.values()], rows)
-
-
-def _batches(frames: Sequence[str]) -> str:
-    """Return the median number of batches of those who reached it, and how many did where not all did."""
-    reached = sorted(int(each) // MOSAIC_BATCH for each in frames if each)
-    middle = f"{median(reached):g}" if reached else "never"
-    return f"{middle}, {len(reached)} of {len(frames)}" if 0 < len(reached) < len(frames) else middle
-
-
-def agreements() -> str:
-    """Return which published returns lie in the intervals of our own, and which do not."""
-    from ctgraph_rl.report import statistics
-
-    lines = []
-    for name, exchange, epochs, published in PUBLISHED:
-        within, beyond = [], []
-        for depth, values in by_depth(exchange, epochs).items():
-            found = statistics.mean(values, bounds=(0, 1))
-            if found.low is not None and found.high is not None:
-                inside = found.low - 0.005 <= published[depth - 2] <= found.high + 0.005
-                (within if inside else beyond).append(str(depth))
-        if within or beyond:
-            inside, outside = (", ".join(depths) or "none" for depths in (within, beyond))
-            lines.append(f"- {name}: in the interval at depth {inside}; not at {outside}.")
-    return "\n".join(lines)
-
-
-def settled(num_epochs: str) -> tuple[float, int]:
-    """Return the mean share of batches below 0.9 of isolated members that once had more, and their number."""
-    shares = [each for values in by_depth("isolated", num_epochs, "share_below").values() for each in values]
-    return sum(shares) / len(shares), len(shares)
-
-
 def not_run() -> str:
     """Return which seeds are missing, or that none is."""
     missing = {cell: SEEDS - len(on_l2d2c(*cell)) for cell in WANTED}
@@ -275,21 +181,6 @@ def not_run() -> str:
         if (count := len(on_l2d2c(number)) - len(solving_times(number)))
     ]
     return f"Not run yet: {'; '.join(parts)}." if parts else "All seeds that were planned are here."
-
-
-def mosaic_runs() -> str:
-    """Return how many seeds there are of each exchange on `MOSAIC`."""
-    names = {"isolated": "isolated", "mosaic": "MOSAIC", "mosaic_no_similarity": "MOSAIC without similarity"}
-    found: dict[tuple[str, str], int] = {}
-    for line in read(NAME):
-        if line["curriculum"] == MOSAIC:
-            key = (line["exchange"], line["num_epochs"])
-            found[key] = found.get(key, 0) + 1
-    parts = [
-        f"{count} of {names[exchange]} with {epochs} epoch{'s' * (epochs != '1')}"
-        for (exchange, epochs), count in found.items()
-    ]
-    return ", ".join(parts)
 
 
 def page() -> str:
@@ -308,16 +199,7 @@ def page() -> str:
     texts["learning_longer"] = f"{sum(longer) / len(longer):,.0f}"
     first, *_, last = by_block("16", "8")[1:]
     texts |= {"second": f"{first:.2f}", "last": f"{last:.2f}"}
-    for epochs in ("1", "8"):
-        share, count = settled(epochs)
-        texts |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}
-    texts |= {
-        "mosaic": mosaic_table(),
-        "mosaic_times": times_table(),
-        "agreements": agreements(),
-        "mosaic_runs": mosaic_runs(),
-        **selecting.texts(),
-    }
+    texts |= mosaic.texts() | selecting.texts()
     return template.substitute(l2d2c=l2d2c_table(), machines=machines(NAME, selecting.NAME), not_run=not_run(), **texts)
 
 

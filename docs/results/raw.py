@@ -66,6 +66,11 @@ def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
     return found
 
 
+def numbers_in(lines: Raw, column: str) -> list[float]:
+    """A column, one number for each seed."""
+    return [float(line[column]) for line in lines]
+
+
 def mean_of(values: Sequence[float | None], bounds: tuple[float, float]) -> str:
     """Mean over seeds with its interval; seeds without a value are counted, not averaged.
 
