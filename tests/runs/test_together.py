@@ -24,7 +24,7 @@ from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import find_runs, read_run
 from ctgraph_rl.runs.together import run_as_one, train_experts
 
-TINY = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
+TINY = ("curriculum=ct2_interfering", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
 PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
 SEEDS = "seed=0,1,2"
 EXPERTS = (
