@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import json
 import os
@@ -10,6 +11,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +69,15 @@ def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def compose() -> Iterator[Callable[..., DictConfig]]:
-    """Composes a configuration from overrides, as the command line does."""
+    """Composes a configuration from overrides, as the command line does; equal overrides once."""
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(packages.conf_dir(), version_base="1.3"):
-        yield lambda *overrides, **how: hydra.compose("config", overrides=list(overrides), **how)
+        yield lambda *overrides, **how: copy.deepcopy(_composed(overrides, **how))
+
+
+@cache
+def _composed(overrides: Sequence[str], **how: Any) -> DictConfig:
+    return hydra.compose("config", overrides=list(overrides), **how)
 
 
 @pytest.fixture

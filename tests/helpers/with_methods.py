@@ -18,19 +18,14 @@ from helpers.small_agents import SMALL_AGENT, batches
 
 TASKS = (ONE, TWO, THREE)
 
-COMPOSED: dict[tuple[str, ...], Any] = {}
-
 
 def made(compose, group: str, name: str, *overrides: str) -> Any:
-    """What builds the choice of a group of the configuration, which is composed once."""
-    choice = (f"{group}={name}", *overrides)
-    if choice not in COMPOSED:
-        COMPOSED[choice] = config.target(compose(*choice), group)
-    return COMPOSED[choice]
+    """What builds the choice of a group of the configuration."""
+    return config.target(compose(f"{group}={name}", *overrides), group)
 
 
 def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
-    """An agent as the fixture ``small_agent`` builds it, whose configuration is composed once."""
+    """An agent as the fixture ``small_agent`` builds it."""
     env = CTGraphEnv(tasks)
     torch.manual_seed(0)
     make_agent = made(compose, "agent", agent, *SMALL_AGENT[agent], *overrides)
