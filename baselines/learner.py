@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
-from types import FunctionType
+from functools import cache, cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from baselines.hooks import Hooks
 from baselines.networks import Data
-from baselines.optimisers import capturable, functional_step
+from baselines.optimisers import OptimiserParts, capturable, functional_step, parts_of
 from ctgraph_rl.checks import at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
@@ -66,7 +65,7 @@ class Learner(nn.Module):
             *true_or_false(compile=compile),
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
-        self.compiled_step = make_compiled_step() if compile else None
+        self.compiled_step = compiled_gradient_step() if compile else None
         self._region: Region | None = None
         self.method = Hooks()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
@@ -144,8 +143,6 @@ class Learner(nn.Module):
         """Replace the optimiser by a new one of the same kind for these parameters."""
         self.optimiser = type(self.optimiser)(parameters, **self.optimiser.defaults)
         self._region = None
-        if self.compiled_step is not None:
-            self.compiled_step = make_compiled_step()
 
     def clear_optimiser_state(self, parameters: Iterable[nn.Parameter]) -> None:
         """Set the optimiser's state of these parameters to zero."""
@@ -172,7 +169,7 @@ class Learner(nn.Module):
         if usual and self.is_captured:
             return self._captured_step(batch)
         if self.compiled_step is not None and usual:
-            return self.compiled_step(self, batch)
+            return self.compiled_step(self, batch, parts_of(self.optimiser))
         return self._eager_step(batch)
 
     @property
@@ -189,7 +186,7 @@ class Learner(nn.Module):
 
     def _step_to_capture(self, batch: Data) -> dict[str, Tensor]:
         if self.compiled_step is not None:
-            return self.compiled_step(self, batch)
+            return self.compiled_step(self, batch, parts_of(self.optimiser))
         with capturable(self.optimiser):
             return self._eager_step(batch)
 
@@ -240,19 +237,23 @@ def reset_layer(module: nn.Module) -> None:
         module.reset_parameters()  # type: ignore[operator]
 
 
-Step = Callable[[Learner, Data], dict[str, Tensor]]
+Step = Callable[[Learner, Data, OptimiserParts], dict[str, Tensor]]
+
+MOST_COMPILED = 2**14
+"""Gradient steps of different agents, methods and sizes that a process may compile; the compiler's own limit is 8."""
 
 
-def make_compiled_step() -> Step:
-    """Return `functional_gradient_step`, compiled for one agent and one size of minibatches.
+@cache
+def compiled_gradient_step() -> Step:
+    """Return `functional_gradient_step`, compiled once for all learners of equal structure.
 
     With small networks and minibatches nearly all time is spent between operations; a compiled step has no such gaps.
-    Each call compiles a copy of the code, as the number of compilations of one function is limited. Between operations
-    there are no checks of sizes and, on machines without a GPU, no Python.
+    The compiler finds by itself whether a learner needs other code than those before: for another agent or method,
+    other settings or sizes of tensors. A learner of the same structure, or the next task, uses what is there.
     """
     torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
-    step = FunctionType(functional_gradient_step.__code__.replace(), functional_gradient_step.__globals__)
-    return torch.compile(step, fullgraph=True, dynamic=False, options=compiler_options())
+    torch._dynamo.config.recompile_limit = torch._dynamo.config.accumulated_recompile_limit = MOST_COMPILED
+    return torch.compile(functional_gradient_step, fullgraph=True, dynamic=False, options=compiler_options())
 
 
 def compiler_options() -> dict[str, Any]:
@@ -260,14 +261,14 @@ def compiler_options() -> dict[str, Any]:
     return {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
 
 
-def functional_gradient_step(learner: Learner, batch: Data) -> dict[str, Tensor]:
-    """Take `Learner.gradient_step` without a branch on data; the optimiser must have its state."""
+def functional_gradient_step(learner: Learner, batch: Data, optimiser: OptimiserParts) -> dict[str, Tensor]:
+    """Take `Learner.gradient_step` without a branch on data, given the parts of the learner's optimiser."""
     losses = learner.losses(batch)
     gradients = learner.method.transform_gradients(torch.autograd.grad(total_loss(losses), learner.weights))
     norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()  # fuses; PyTorch's does not
     scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
     with torch.no_grad():
-        functional_step(learner.optimiser, [gradient * scale for gradient in gradients])
+        functional_step(optimiser, [gradient * scale for gradient in gradients])
     learner.method.after_step()
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -39,26 +39,42 @@ def capturable(optimiser: torch.optim.Optimizer) -> Iterator[None]:
         group["capturable"] = before
 
 
-def functional_step(optimiser: torch.optim.Optimizer, gradients: list[Tensor]) -> None:
+class OptimiserParts(NamedTuple):
+    """What a step of an optimiser reads and updates.
+
+    Compiled code that read the optimiser itself would be bound to that one; by its parts it serves all of its kind.
+    """
+
+    is_adam: bool
+    settings: dict[str, Any]
+    parameters: list[Tensor]
+    state: list[dict[str, Tensor]]
+    """Of each parameter."""
+
+
+def parts_of(optimiser: torch.optim.Optimizer) -> OptimiserParts:
+    """Return the parts of an optimiser that has its state; tensors are the optimiser's own, not copies."""
+    [group], is_adam = optimiser.param_groups, isinstance(optimiser, torch.optim.Adam)
+    names = ("betas", "amsgrad") if is_adam else ("alpha", "momentum", "centered")
+    settings = {key: group[key] for key in ("lr", "eps", "weight_decay", "maximize", *names)}
+    parameters: list[Tensor] = list(group["params"])
+    return OptimiserParts(is_adam, settings, parameters, [optimiser.state[parameter] for parameter in parameters])
+
+
+def functional_step(parts: OptimiserParts, gradients: list[Tensor]) -> None:
     """Update an optimiser's parameters in place by PyTorch's own functions on the optimiser's own state.
 
     A state dict is the same as after ``optimiser.step()``.
     """
-    group = optimiser.param_groups[0]
-    parameters: list[Tensor] = list(group["params"])
-    state: dict[str, list[Tensor]] = {
-        key: [optimiser.state[parameter][key] for parameter in parameters] for key in optimiser.state[parameters[0]]
-    }
-    settings: dict[str, Any] = {key: group[key] for key in ("lr", "eps", "weight_decay", "maximize")}
-    settings |= {"foreach": False, "capturable": parameters[0].is_cuda}
-    if isinstance(optimiser, torch.optim.Adam):  # compiled, PyTorch's functions need all lists by position
+    parameters = parts.parameters
+    state: dict[str, list[Tensor]] = {key: [each[key] for each in parts.state] for key in parts.state[0]}
+    settings: dict[str, Any] = {**parts.settings, "foreach": False, "capturable": parameters[0].is_cuda}
+    if parts.is_adam:  # compiled, PyTorch's functions need all lists by position
         moments: tuple[list[Tensor], list, list] = (state["exp_avg"], state["exp_avg_sq"], [])
-        beta1, beta2 = group["betas"]
-        settings |= {"amsgrad": group["amsgrad"], "beta1": beta1, "beta2": beta2}
+        settings["beta1"], settings["beta2"] = settings.pop("betas")
         adam(parameters, gradients, *moments, state["step"], **settings)
     else:
         averages: tuple[list[Tensor], list, list] = (state["square_avg"], [], [])
-        settings |= {key: group[key] for key in ("alpha", "momentum", "centered")}
         rmsprop(parameters, gradients, *averages, state["step"], **settings)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from baselines.learner import Learner, make_compiled_step
+from baselines.learner import Learner
 from baselines.methods.masks import Masks, combined
 from baselines.methods.weights import Weights, flat
 from ctgraph_rl.checks import at_least_one, require
@@ -84,14 +84,12 @@ class MaskShared(Masks):
             scores: float32 [c, P], 1 <= c <= `max_received`.
             own_share: initial share of the own scores, in (0, 1); the others have equal ones.
         """
-        count, before = len(scores), len(self.received)
+        count = len(scores)
         self.set_scores(self.weights.split(flat(self.current_scores())))
         self._keep(scores.to(self.constant))
         self.betas.zero_()
         self.betas[:, :count] = math.log((1 - own_share) / count)
         self.betas[:, count] = math.log(own_share)
-        if len(self.received) != before and self.agent.compiled_step is not None:
-            self.agent.compiled_step = make_compiled_step()  # the other one was made for as many as before
         self._write()
         self.agent.weights_changed()
 
