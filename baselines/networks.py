@@ -298,10 +298,11 @@ def guided(data: Data, action: Tensor) -> Tensor:
 
 
 def draw(chances: Tensor) -> Tensor:
-    """Draw a number of each categorical distribution, [..., n], int64 [...]; on GPUs without a wait of the host."""
-    if chances.is_cpu:
-        return chances.flatten(0, -2).multinomial(1, replacement=True).view(chances.shape[:-1])
-    return (chances / torch.empty_like(chances).exponential_()).argmax(dim=-1)  # as `multinomial`, which may wait
+    """Draw a number of each categorical distribution, [..., n], int64 [...].
+
+    The same as `torch.multinomial` draws, without its checks: a fifth of the time, and no wait of the host for a GPU.
+    """
+    return (chances / torch.empty_like(chances).exponential_()).argmax(dim=-1)
 
 
 def log_probabilities(actor: ProbabilisticActor, features: Tensor) -> Tensor:

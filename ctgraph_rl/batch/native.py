@@ -76,10 +76,11 @@ class Native:
         self.params, self.tables = params, tables
         self._call: _Call | None = None
         self._state: RowState | None = None
+        self._shapes: Stepped | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies start without what is prepared."""
-        return {"params": self.params, "tables": self.tables, "_call": None, "_state": None}
+        return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": None}
 
     def reset(self, state: RowState, mask: Tensor) -> tuple[RowState, Shown]:
         """See `Rows.reset`."""
@@ -118,11 +119,14 @@ class Native:
             The next state and what the rows show; None for actions of a wrong shape, dtype or range, and where a row's
             episode was over before.
         """
-        n, image = len(self.tables.entry), self.params.bank.shape[1:]
+        n = len(self.tables.entry)
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
             return None
-        device, shapes = self.params.row.device, {True: (n, *image), False: (n,)}
-        made = Stepped(*(torch.empty(shapes[images], dtype=dtype, device=device) for dtype, images in _STEPPED))
+        if self._shapes is None:
+            one = [torch.empty((), dtype=dtype, device=self.params.row.device) for dtype, _ in _STEPPED]
+            shapes = [(n, *self.params.bank.shape[1:]) if images else (n,) for _, images in _STEPPED]
+            self._shapes = Stepped(*(value.expand(shape) for value, shape in zip(one, shapes, strict=True)))
+        made = Stepped(*map(torch.empty_like, self._shapes))
         after, wrong = self._run(state, most_action=most_action, restarts=True, action=action, **made._asdict())
         return None if wrong else (after, made)
 
@@ -153,8 +157,13 @@ class Native:
         require((wrong == 0, "the rows' states are none of their tasks: they have images outside the bank"))
         return after
 
-    @torch.compiler.disable
-    def _run(
+    def _run(self, state: RowState, *how: Any, **arrays: Any) -> tuple[RowState, int]:
+        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
+        if torch.compiler.is_compiling():  # which cannot look into the call; disabling it takes 50 µs
+            return torch.compiler.disable(self._call_kernel)(state, *how, **arrays)
+        return self._call_kernel(state, *how, **arrays)
+
+    def _call_kernel(
         self,
         state: RowState,
         num_steps: int = 1,
@@ -162,7 +171,6 @@ class Native:
         most_action: int = -1,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
-        """Call the kernel, see `run`; return the states, and how often it met something wrong."""
         if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call

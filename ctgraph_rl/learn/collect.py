@@ -117,25 +117,24 @@ def batches(
     start = start_of_episodes(env, initial_state)
     data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
     act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
-    steps: list[Step] = []
-    unstored = [key for key in start.keys() if key.startswith(UNSTORED)]  # noqa: SIM118, rows otherwise
-    for frames in range(done, num_frames, env.numel()):
-        if between_steps is not None:
-            between_steps(frames)
+    unstored, num_rows = [key for key in start if key.startswith(UNSTORED)], env.numel()
+    for first in range(done, num_frames, num_rows * num_steps):
+        steps: list[Step] = []
         with set_exploration_type(ExplorationType.RANDOM):
-            step, data = act_once(data)
-        _append(steps, step, unstored)
-        if len(steps) == num_steps or frames + env.numel() == num_frames:
-            yield in_time_order(steps, env), TensorDict(data, env.batch_size, device=env.device)
-            steps = []
+            for frames in range(first, min(first + num_rows * num_steps, num_frames), num_rows):
+                if between_steps is not None:
+                    between_steps(frames)
+                step, data = act_once(data)
+                _append(steps, step, unstored)
+        yield in_time_order(steps, env), TensorDict(data, env.batch_size, device=env.device)
 
 
-def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> TensorDict:
+def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> Step:
     """Return the recurrent state that every episode starts with; empty without memory."""
-    return TensorDict(batch_size=env.batch_size) if initial_state is None else initial_state(env.numel())
+    return {} if initial_state is None else dict(initial_state(env.numel()).items())
 
 
-def act(env: CTGraphEnv, policy: Policy, data: Step, start: TensorDict) -> tuple[Step, Step]:
+def act(env: CTGraphEnv, policy: Policy, data: Step, start: Step) -> tuple[Step, Step]:
     """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
 
     A policy whose class defines ``act_on_tensors`` is asked that way: without the time of a TensorDict and a module,
@@ -146,11 +145,10 @@ def act(env: CTGraphEnv, policy: Policy, data: Step, start: TensorDict) -> tuple
     else:
         data = dict(policy(TensorDict(data, env.batch_size, device=env.device)).items(True, True))
     step, following = take_step(env, data)
-    lasts = TRIAL in start.keys()  # noqa: SIM118, a TensorDict iterates over rows
     for key, value in start.items():
         state = step["next", key]
         begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
-        following[key] = state if lasts else torch.where(begins, value, state)
+        following[key] = state if TRIAL in start else torch.where(begins, value, state)
     return step, following
 
 
@@ -178,7 +176,7 @@ class CapturedAct:
         start: the recurrent state that every episode starts with.
     """
 
-    def __init__(self, env: CTGraphEnv, policy: Policy, start: TensorDict) -> None:
+    def __init__(self, env: CTGraphEnv, policy: Policy, start: Step) -> None:
         self.env, self.policy, self.start = env, policy, start
         self._read = {*env.observation_spec.keys(), *env.done_keys, *start.keys()}
         self._region: Region | None = None
