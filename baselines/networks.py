@@ -264,6 +264,13 @@ class ActorCritic(TensorDictSequential):
     capturable = True
     """Whether it acts without a branch on data; see `ctgraph_rl.learn.collect.CapturedAct`."""
 
+    def __init__(
+        self, trunk: TensorDictModuleBase, actor: ProbabilisticActor, critic: ValueOperator, *others: Any, **how: Any
+    ) -> None:
+        super().__init__(trunk, actor, critic, *others, **how)
+        self._parts = trunk, actor.in_keys[0], actor.module[0].module, critic.module, others
+        """What acting needs of the modules, which takes 30 µs to find."""
+
     def forward(self, tensordict: TensorDictBase, **kwargs: Any) -> TensorDictBase:
         """Write ``action``, ``action_log_prob``, ``state_value`` and the trunk's next state."""
         for key, value in self.act_on_tensors(tensordict).items():
@@ -272,10 +279,10 @@ class ActorCritic(TensorDictSequential):
 
     def act_on_tensors(self, data: Data) -> dict[Any, Tensor]:
         """Return what `forward` writes; see `ctgraph_rl.learn.collect.act`."""
-        trunk, actor, critic, *others = self.module
+        trunk, key, logits, value, others = self._parts
         written = trunk.act(data)
-        features = written.pop(actor.in_keys[0])
-        log_probs = log_probabilities(actor, features)
+        features = written.pop(key)
+        log_probs = normalised(logits(features))
         chances = log_probs.softmax(dim=-1)
         if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
             action = chances.argmax(dim=-1)
@@ -284,7 +291,7 @@ class ActorCritic(TensorDictSequential):
         action = guided(data, action)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
-        written["state_value"] = critic.module(features)
+        written["state_value"] = value(features)
         for module in others:
             made = module.module(*(written[key] if key in written else data[key] for key in module.in_keys))
             written |= zip(module.out_keys, made if isinstance(made, tuple) else (made,), strict=True)
@@ -307,7 +314,11 @@ def draw(chances: Tensor) -> Tensor:
 
 def log_probabilities(actor: ProbabilisticActor, features: Tensor) -> Tensor:
     """Compute the logarithms of an `actor`'s probabilities, [..., num_actions]."""
-    logits = actor.module[0].module(features)
+    return normalised(actor.module[0].module(features))
+
+
+def normalised(logits: Tensor) -> Tensor:
+    """Compute log-probabilities, [..., n], from logits."""
     return logits - logits.logsumexp(dim=-1, keepdim=True)
 
 

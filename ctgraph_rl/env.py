@@ -107,6 +107,7 @@ class CTGraphEnv(EnvBase):
         self.register_buffer("_id_of_task", numbers, persistent=False)
         self._task_id = torch.empty(0), torch.empty(0)
         self._steps: list[TensorDictBase] | None = None
+        self._running: dict[str, Tensor] = {}
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -314,9 +315,11 @@ class CTGraphEnv(EnvBase):
             after = self.step_data(action)
             return after, self.restart_data(after["done"], after["observation"])
         rows.state, shown = stepped
+        if not self._running:  # shared by all steps
+            self._running = self._not_done()
         done, rewards = shown.done.unsqueeze(-1), shown.reward.unsqueeze(-1)
-        after = {**self._data(shown.observation, done, torch.zeros_like(done), shown), "reward": rewards}
-        return after, self._data(shown.following, torch.zeros_like(done), done, None)
+        after = {**self._data(shown.observation, done, self._running["done"], shown), "reward": rewards}
+        return after, self._restarted(shown.following, done, self._running)
 
     def restart_data(self, done: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Start an episode in the rows that are done; return the data that the next step starts from by key.
@@ -325,33 +328,34 @@ class CTGraphEnv(EnvBase):
             done: bool [N, 1], after the last step.
             observation: uint8 [N, *shape], after the last step.
         """
-        observation = self.rows.restart(done.squeeze(-1), observation)
-        return self._data(observation, torch.zeros_like(done), done, None)
+        return self._restarted(self.rows.restart(done.squeeze(-1), observation), done, self._not_done())
 
-    def _data(
-        self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped | None
-    ) -> dict[str, Tensor]:
-        """Return the rows' data by key, all but rewards.
-
-        Args:
-            observation: uint8 [N, *shape].
-            done: bool [N, 1].
-            is_init: bool [N, 1].
-            shown: says where the rows that are done arrived; None where none is.
-        """
-        counts = shown if isinstance(shown, Stepped) else self.rows
+    def _data(self, observation: Tensor, done: Tensor, is_init: Tensor, shown: Shown | Stepped) -> dict[str, Tensor]:
+        """Return the rows' data by key, all but rewards; ``shown`` says where the rows that are done arrived."""
         data = {"observation": observation, "is_init": is_init, "done": done, "terminated": done}
         if self.info:
-            data |= {
-                "step_count": counts.step_count.unsqueeze(-1),
-                "episode_reward": counts.episode_reward.unsqueeze(-1),
-                "outcome": done.to(torch.uint8) if shown is None else shown.outcome.unsqueeze(-1),
-                "leaf": (torch.full_like(self.rows.row, NO_LEAF) if shown is None else shown.leaf).unsqueeze(-1),
-                "truncated": torch.zeros_like(done),
-            }
-        if self.num_task_ids:
-            data["task_id"] = self._shown_ids()
+            ends = {"outcome": shown.outcome.unsqueeze(-1), "leaf": shown.leaf.unsqueeze(-1)}
+            data |= {**ends, "truncated": torch.zeros_like(done)}
+        return data | self._counts(shown if isinstance(shown, Stepped) else self.rows)
+
+    def _restarted(self, observation: Tensor, is_init: Tensor, running: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the rows' data after the finished ones have started an episode; see `_not_done`."""
+        return {"observation": observation, "is_init": is_init, **running, **self._counts(self.rows)}
+
+    def _not_done(self) -> dict[str, Tensor]:
+        """Make what rows show that are not done, [N, 1] by key."""
+        false = torch.zeros_like(self.rows.row, dtype=torch.bool).unsqueeze(-1)
+        data = {"done": false, "terminated": false}
+        if self.info:
+            leaf = torch.full_like(self.rows.row, NO_LEAF).unsqueeze(-1)
+            data |= {"outcome": false.to(torch.uint8), "leaf": leaf, "truncated": false.clone()}
         return data
+
+    def _counts(self, counts: Rows | Stepped) -> dict[str, Tensor]:
+        """Return the rows' data that count over an episode, and their task ids."""
+        keys = ("step_count", "episode_reward") if self.info else ()
+        data = {key: getattr(counts, key).unsqueeze(-1) for key in keys}
+        return data | {"task_id": self._shown_ids()} if self.num_task_ids else data
 
     def _shown_ids(self) -> Tensor:
         """Return the rows' task ids as one-hot, uint8 [N, num_task_ids]; zeros for tasks without one."""

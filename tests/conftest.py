@@ -11,7 +11,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from helpers.sweeping import UNLUCKY
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
+from baselines.learner import compiled_gradient_step
 from ctgraph_rl import packages
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.runs import config, job
@@ -73,6 +74,18 @@ def compose() -> Iterator[Callable[..., DictConfig]]:
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(packages.conf_dir(), version_base="1.3"):
         yield lambda *overrides, **how: copy.deepcopy(_composed(overrides, **how))
+
+
+@pytest.fixture
+def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None]]:
+    """Sets the backend that compiles gradient steps; steps of other tests are compiled again."""
+
+    def set_backend(backend: Any) -> None:
+        monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
+        compiled_gradient_step.cache_clear()
+
+    yield set_backend
+    compiled_gradient_step.cache_clear()
 
 
 @cache
