@@ -127,7 +127,7 @@ class Native:
             shapes = [(n, *self.params.bank.shape[1:]) if images else (n,) for _, images in _STEPPED]
             self._shapes = Stepped(*(value.expand(shape) for value, shape in zip(one, shapes, strict=True)))
         made = Stepped(*map(torch.empty_like, self._shapes))
-        after, wrong = self._run(state, most_action=most_action, restarts=True, action=action, **made._asdict())
+        after, wrong = self._run(state, most_action=most_action, restarts=True, made=made, action=action)
         return None if wrong else (after, made)
 
     def _show(self, state: RowState, **arrays: Any) -> tuple[RowState, Shown]:
@@ -169,6 +169,7 @@ class Native:
         num_steps: int = 1,
         restarts: bool = False,
         most_action: int = -1,
+        made: Stepped | None = None,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
         if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
@@ -179,7 +180,10 @@ class Native:
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
         call.num_steps, call.restarts, call.most_action = num_steps, restarts, most_action
         call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
-        kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in _ARRAYS]
+        names = _ARRAYS if made is None else _READ
+        kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in names]
+        for name, array in () if made is None else made._asdict().items():  # made for this call: nothing to check
+            setattr(call, name, array.data_ptr())
         wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
         if not wrong:
@@ -289,6 +293,7 @@ _ARRAYS = {
 }
 """Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
 _STEPPED = [_ARRAYS[name][:2] for name in Stepped._fields]
+_READ = [name for name, (*_, is_read) in _ARRAYS.items() if is_read]
 _OF_ROWS = ("mask", "shown")
 """Those of [N, ...]."""
 _Pointers = ctypes.c_void_p * len(RowState._fields)
