@@ -188,38 +188,74 @@ def test_what_the_text_says_of_eight_epochs_holds():
     assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
 
 
-def of_mosaic(exchange: str, num_epochs: int) -> list[dict[str, str]]:
-    """The blocks of 14 members, each of which learns one task."""
-    cell = ("ct28_mosaic_skips_d5", "102400", exchange, "14", str(num_epochs))
+def of_mosaic(exchange: str, num_members: int, num_epochs: int = 1) -> list[dict[str, str]]:
+    """The blocks of members that learn one task each."""
+    cell = ("ct28_mosaic_skips_d5", "102400", exchange, str(num_members), str(num_epochs))
     return [block for key, blocks in BLOCKS.items() if key[:5] == cell for block in blocks]
 
 
-COLUMNS = [("isolated", 1), ("isolated", 8), ("mosaic", 1), ("mosaic", 8), ("mosaic_no_similarity", 1)]
+def at(depth: int, blocks: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [block for block in blocks if len(block["task"].split(".")) == depth]
 
 
-@pytest.mark.parametrize("depth", range(2, 9))
+COLUMNS = [("isolated", 14), ("mosaic", 28), ("mosaic_no_similarity", 28), ("mosaic", 14), ("mosaic_no_similarity", 14)]
+
+
+@pytest.mark.parametrize("depth", range(2, 10))
 def test_a_depth_of_mosaic_has_the_means_of_its_members(depth):
     lines = LINES[LINES.index("## MOSAIC on nested goals") :]
-    row, times = (line.strip("| ").split(" | ")[1:] for line in lines if line.startswith(f"| {depth} |"))
+    row, times, *of_8 = (line.strip("| ").split(" | ")[1:] for line in lines if line.startswith(f"| {depth} |"))
 
-    for shown, (exchange, num_epochs) in zip(row, COLUMNS, strict=True):
-        blocks = [block for block in of_mosaic(exchange, num_epochs) if len(block["task"].split(".")) == depth]
-        returns = [float(block["final_return"]) for block in blocks]
-        assert shown.split("; ")[-1].split(" [")[0] == (f"{mean(returns):.2f}" if returns else "not run")
-    for shown, (exchange, num_epochs) in zip(times, [each for each in COLUMNS if each[1] == 1], strict=True):
-        blocks = [block for block in of_mosaic(exchange, num_epochs) if len(block["task"].split(".")) == depth]
+    for shown, column in zip(row, COLUMNS, strict=True):
+        returns = [float(block["final_return"]) for block in at(depth, of_mosaic(*column))]
+        assert shown.split("; ")[-1].split(" [")[0] == (f"{mean(returns):.2f}" if returns else "-")
+    for shown, column in zip(times, COLUMNS[:3], strict=True):
+        blocks = at(depth, of_mosaic(*column))
         reached = [int(block["frames_to_learn"]) / 512 for block in blocks if block["frames_to_learn"]]
         number = shown.split("; ")[-1].split(", ")[0]
         assert number == (f"{statistics.median(reached):g}" if reached else "never")
         assert shown.endswith(f", {len(reached)} of {len(blocks)}") == (0 < len(reached) < len(blocks))
+    for shown, exchange in zip(of_8[0] if of_8 else (), ("isolated", "mosaic"), strict=bool(of_8)):
+        returns = [float(block["final_return"]) for block in at(depth, of_mosaic(exchange, 14, 8))]
+        assert shown.split(" [")[0] == f"{mean(returns):.2f}"
+
+
+PUBLISHED = {"isolated": (9.5, 1.0), "MOSAIC": (25.7, 0.8), "MOSAIC without similarity": (19.9, 0.0)}
+
+
+def test_a_sum_of_returns_is_that_of_all_members_and_differs_from_the_published_one_as_stated():
+    start = LINES.index("| members | exchange | seeds | sum of final returns | published | difference |") + 2
+    rows = [line.strip("| ").split(" | ") for line in LINES[start : LINES.index("", start)]]
+    assert len(rows) >= 5
+
+    for members, name, seeds, shown, _, *difference in rows:
+        exchange = name.lower().replace(" without ", "_no_")
+        halves = exchange == "isolated" and members == "28"
+        sums = defaultdict(list)
+        for block in of_mosaic(exchange, 14 if halves else int(members)):
+            sums[int(block["seed"]) % 14_000].append(float(block["final_return"]))
+        first_half = exchange == "isolated" and members == "14"
+        found = [math.fsum(each[:14] if first_half else each) for each in sums.values()]
+        found = [each for each, of in zip(found, sums.values(), strict=True) if first_half or len(of) == int(members)]
+        assert (seeds, shown.split(" [")[0]) == (str(len(found)), f"{mean(found):.2f}")
+        if members == "28" and len(found) == 5:
+            value, half = PUBLISHED[name]
+            ours, theirs = statistics.variance(found) / 5, (half / 2.7764) ** 2
+            freedom = (ours + theirs) ** 2 / ((ours**2 + theirs**2) / 4)
+            quantile = {4: 2.7764, 5: 2.5706, 6: 2.4469, 7: 2.3646, 8: 2.3060}
+            low, high = quantile[min(8, math.floor(freedom) + 1)], quantile[math.floor(freedom)]
+            [error] = [(top - bottom) / 2 for bottom, top in [map(float, difference[0].split("[")[1][:-1].split(", "))]]
+            assert float(difference[0].split(" [")[0]) == pytest.approx(mean(found) - value, abs=0.06)
+            assert low * math.sqrt(ours + theirs) - 0.06 <= error <= high * math.sqrt(ours + theirs) + 0.06
 
 
 def test_what_the_text_says_of_epochs_holds():
     for num_epochs in (8, 1):
-        shares = [float(block["share_below"]) for block in of_mosaic("isolated", num_epochs) if block["share_below"]]
+        blocks = of_mosaic("isolated", 14, num_epochs)
+        shares = [float(block["share_below"]) for block in blocks if block["share_below"]]
         members = f"{mean(shares):.2f}"
         assert members in PAGE and f"{len(shares)} members)" in PAGE
     alone = [
-        [float(each["share_below"] or 0) for each in of_mosaic("isolated", n) if each["share_below"]] for n in (1, 8)
+        [float(each["share_below"]) for each in of_mosaic("isolated", 14, n) if each["share_below"]] for n in (1, 8)
     ]
     assert mean(alone[0]) < mean(alone[1]) / 2
