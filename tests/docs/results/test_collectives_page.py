@@ -249,6 +249,16 @@ def test_a_sum_of_returns_is_that_of_all_members_and_differs_from_the_published_
             assert low * math.sqrt(ours + theirs) - 0.06 <= error <= high * math.sqrt(ours + theirs) + 0.06
 
 
+def test_goals_that_are_learned_in_no_seed_are_named():
+    for exchange, before in (("mosaic", "with MOSAIC, "), ("mosaic_no_similarity", "and without similarity ")):
+        best = defaultdict(float)
+        for block in of_mosaic(exchange, 28):
+            best[int(block["member"])] = max(best[int(block["member"])], float(block["final_return"]))
+        tasks = {int(block["member"]): block["task"] for block in of_mosaic(exchange, 28)}
+        named = ", ".join(f"`{tasks[member].removeprefix('goal')}`" for member in sorted(best) if best[member] < 0.5)
+        assert before + named in PAGE
+
+
 def test_what_the_text_says_of_epochs_holds():
     for num_epochs in (8, 1):
         blocks = of_mosaic("isolated", 14, num_epochs)
