@@ -10,6 +10,7 @@ from torch import nn
 from baselines.networks import Encoder
 from baselines.optimisers import StackedOptimiser, make_optimiser, stacked
 from baselines.together import sampled
+from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1
 
 SEEDS = (0, 3, 8)
@@ -126,3 +127,13 @@ def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generato
         chances = log_probs[number].softmax(dim=-1)
         assert torch.equal(written["action"][number], chances.multinomial(1, generator=alone).squeeze(-1))
         assert torch.equal(alone.get_state(), generators[number].get_state())
+
+
+def test_acting_and_learning_compute_the_same_log_probabilities(small_agent):
+    agent, env = small_agent("ppo", [ct_su_b1()]), CTGraphEnv([ct_su_b1()] * 16)
+
+    with torch.no_grad():
+        data = agent.policy(env.reset())
+        expected = agent.outputs(data)["log_probs"].gather(-1, data["action"].unsqueeze(-1)).squeeze(-1)
+
+    assert torch.equal(data["action_log_prob"], expected)
