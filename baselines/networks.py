@@ -15,7 +15,8 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, reset
+from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, reset
+from baselines.distinct import distinct, histories
 from ctgraph_rl.checks import require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
@@ -63,6 +64,14 @@ class EncoderModule(TensorDictModule):
         """Compute the features of any number of steps."""
         return self.module(*(data[key] for key in self.in_keys))
 
+    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
+        """Compute features of different frames, [n, num_features], and which of them each frame has, int64 [...]."""
+        num_dims = data["observation"].ndim - self.module.event_dims
+        inputs = [data[key].flatten(0, num_dims - 1) for key in self.in_keys]
+        examples, groups = distinct(inputs)
+        features = self.module(*(value.index_select(0, examples) for value in inputs))
+        return features, groups.view(data["observation"].shape[:num_dims])
+
 
 class RecurrentModule(TensorDictModuleBase):
     """An encoder with a cell behind it; writes ``memory``, and the cell's state under the cell's keys.
@@ -107,15 +116,27 @@ class RecurrentModule(TensorDictModuleBase):
 
         Features are computed once for frames with the same inputs.
         """
-        encoder, cell = self.encoder, self.cell
-        starts, own = data["is_init"].squeeze(-1), [value.flatten(0, 1) for value in self._own(data)]
+        inputs, groups, starts, state = self._sequences(data)
+        cell = self.cell
+        faster = cell.sequence if starts.is_cpu else partial(Cell.sequence, cell)  # others may make the host wait
+        return faster(inputs, groups, starts, state)
+
+    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
+        """Compute ``memory`` of different histories, [n, num_outputs], and which each frame has, [rows, steps]."""
+        inputs, groups, starts, state = self._sequences(data)
+        found = histories(groups, starts, state)
+        return self.cell.tree(inputs, found.branches, found.initial), found.of_frames
+
+    def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, State]:
+        """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
+        encoder, starts = self.encoder, data["is_init"].squeeze(-1)
         seen = [data[key].flatten(0, 1) for key in encoder.in_keys]
+        own = [value.flatten(0, 1) for value in self._own(data)]
         examples, groups = distinct([*seen, *own])
         seen, own = ([value.index_select(0, examples) for value in values] for values in (seen, own))
         inputs = joined(encoder.module(*seen), *own)
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
-        faster = cell.sequence if starts.is_cpu else partial(Cell.sequence, cell)  # others may make the host wait
-        return faster(inputs, groups.view_as(starts), starts, state)
+        return inputs, groups.view_as(starts), starts, state
 
     def zero_state(self, num_envs: int) -> TensorDict:
         """Return the state before the first step: the cell's zeros, and no last action or reward."""
@@ -156,31 +177,6 @@ def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
 def sequences_of(batch: Data, keys: Sequence[str]) -> dict[str, Tensor]:
     """Return inputs of a batch, [rows, steps, ...] each; of states that are not stored for each step the first one."""
     return {key: batch[key][:, :1] if key.startswith(UNSTORED) else batch[key] for key in keys}
-
-
-def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Group frames with the same inputs: in a task without noise, thousands show a few images.
-
-    Args:
-        inputs: tensors, [num_frames, ...] each.
-
-    Returns:
-        One frame of each group, int64 [num_groups], and the group of each frame, int64 [num_frames].
-    """
-    flat = [value.flatten(1) for value in inputs]
-    frames = torch.arange(len(flat[0]), device=flat[0].device)
-    if not frames.is_cpu:  # a GPU would have to wait for the search
-        return frames, frames
-    widths = [value.shape[1] for value in flat]
-    weights = torch.randn(sum(widths), generator=torch.Generator().manual_seed(0)).split(widths)
-    sums = torch.stack([value.float() @ part for value, part in zip(flat, weights, strict=True)]).sum(dim=0)
-    different, groups = sums.unique(return_inverse=True)
-    examples = frames.new_empty(len(different)).scatter_(0, groups, frames)
-    if len(examples) == len(frames):
-        return examples, groups
-    same = examples[groups]
-    differ = any((value != value.index_select(0, same)).count_nonzero() for value in flat)  # despite equal sums
-    return (frames, frames) if differ else (examples, groups)
 
 
 def require_weights(

@@ -66,6 +66,9 @@ class PolicyGradient(Learner):
         orthogonal_init: initialise linear layers with orthogonal weights, those of the heads a thousand times smaller,
             and biases of 0, as in the code of Ben-Iwhiwhu et al. 2023; False: as PyTorch does.
         cell: what remembers, a class of `baselines.cells` or a partial of one; None: an LSTM. Only with memory.
+        deduplicate: compute frames of a minibatch with the same inputs once, with memory those with the same history:
+            faster on a CPU where observations have no pixel noise and minibatches are large. Sums are rounded in
+            another order. A GPU computes all frames.
     """
 
     num_epochs = num_minibatches = 1
@@ -89,6 +92,7 @@ class PolicyGradient(Learner):
         compile: bool = False,
         orthogonal_init: bool = False,
         cell: MakeCell | None = None,
+        deduplicate: bool = False,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
         require(
@@ -97,7 +101,10 @@ class PolicyGradient(Learner):
             *one_of(OPTIMISERS, optimiser=optimiser),
             *positive(learning_rate=learning_rate, gamma=gamma, gae_lambda=gae_lambda),
             *fraction(gamma=gamma, gae_lambda=gae_lambda),
-            *true_or_false(normalize_advantage=normalize_advantage, orthogonal_init=orthogonal_init),
+            *true_or_false(
+                normalize_advantage=normalize_advantage, orthogonal_init=orthogonal_init, deduplicate=deduplicate
+            ),
+            (not (compile and deduplicate), "deduplicate must be false with compile=true, which needs fixed sizes"),
         )
         decay = gamma * gae_lambda
         rule = f"gamma * gae_lambda must be >= {SMALLEST_DECAY:g}, got {gamma!r} * {gae_lambda!r} = {decay:g}"
@@ -105,6 +112,7 @@ class PolicyGradient(Learner):
         no_cell = f"{type(self).__name__} has no memory and takes no cell: use agent=lstm_ppo, or leave the cell out"
         require((self.memory or cell is None, no_cell))
         self.cell = LSTM if cell is None else cell
+        self.deduplicate = deduplicate
         require_weights(observation_spec, hidden_size, num_layers, action_spec.space.n + 1, self.memory)
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
@@ -151,21 +159,27 @@ class PolicyGradient(Learner):
 
         The trunk runs once for actor and critic.
         """
-        outputs = self.outputs(batch)
+        outputs = self._distinct_outputs(batch) if self.deduplicate and batch["action"].is_cpu else self.outputs(batch)
         log_probs = outputs["log_probs"]
         return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 
     def outputs(self, data: Data) -> dict[str, Tensor]:
         """Compute log-probabilities of all actions and the value; see `Learner`."""
-        features = self.trunk.over_time(data)
+        return self._heads(self.trunk.over_time(data))
+
+    def _distinct_outputs(self, data: Data) -> dict[str, Tensor]:
+        """Compute `outputs` once for frames with the same inputs, or with memory the same history."""
+        features, which = self.trunk.of_distinct(data)
+        return {key: value[which] for key, value in self._heads(features).items()}
+
+    def _heads(self, features: Tensor) -> dict[str, Tensor]:
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
     def one_step(self, data: Data) -> dict[Any, Tensor]:
         """Compute `outputs` for one step of all rows, and with memory the next state; see `Learner`."""
         written = self.trunk.act(data)
         features = written.pop(self.features)
-        values = self.critic.module(features)
-        return {**written, "log_probs": log_probabilities(self.actor, features), "state_value": values}
+        return {**written, **self._heads(features)}
 
     def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
         """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""

@@ -55,6 +55,10 @@ class TrialTrunk(TensorDictModuleBase):
         """Compute ``memory`` at all steps of sequences [rows, steps]."""
         return self.trunk.over_time(self._inputs(data)[0])
 
+    def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
+        """Compute ``memory`` of different histories, and which of them each frame has; see `RecurrentModule`."""
+        return self.trunk.of_distinct(self._inputs(data)[0])
+
     def _inputs(self, data: Data) -> tuple[dict[str, Tensor], Tensor]:
         """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
         episode = data["trial"] + data["is_init"]

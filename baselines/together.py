@@ -31,6 +31,8 @@ def why_not_together(agent: Agent) -> str | None:
     """Return why agents like this one cannot act and learn as one batch; None if they can."""
     learner = _learner(agent)
     name = type(learner).__name__
+    if getattr(learner, "deduplicate", False):
+        return f"{name} with deduplicate=true cannot be vectorised over seeds"
     if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
         return f"{name} cannot be vectorised over seeds"
     if type(learner).learn is not Learner.learn or type(learner).gradient_step is not Learner.gradient_step:

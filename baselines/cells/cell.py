@@ -13,6 +13,10 @@ from ctgraph_rl.checks import require, true_or_false
 State = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
 
+Branches = Sequence[tuple[Tensor, Tensor]]
+"""Of the histories of each length: which of the one shorter each continues, or which state, and the group of its last
+input; int64 [num_histories] each."""
+
 PREVIOUS_ACTION, REWARD = "previous_action", "reward"
 """The keys of an agent's last action and reward."""
 
@@ -81,6 +85,24 @@ class Cell(nn.Module):
             output, state = self.step(inputs.index_select(0, group), reset(state, start))
             outputs.append(output)
         return torch.stack(outputs, dim=1)
+
+    def tree(self, inputs: Tensor, branches: Branches, state: State) -> Tensor:
+        """Compute the outputs at the ends of different histories; see `baselines.distinct.histories`.
+
+        Args:
+            inputs: [num_groups, num_inputs].
+            branches: the histories of each length.
+            state: the different states before a first step.
+
+        Returns:
+            [num_histories, num_outputs], the shortest first.
+        """
+        outputs = []
+        for shorter, groups in branches:
+            before = tuple(value.index_select(0, shorter) for value in state)
+            output, state = self.step(inputs.index_select(0, groups), before)
+            outputs.append(output)
+        return torch.cat(outputs)
 
 
 MakeCell = Callable[..., Cell]

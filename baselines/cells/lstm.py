@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Branches, Cell, State, zeros_like_weights
 from baselines.cells.segments import segments
 
 
@@ -44,6 +44,15 @@ class LSTM(Cell):
         h, c = (found.initial(value.squeeze(1)).unsqueeze(0) for value in state)
         memory = packed_lstm(self.lstm, inputs, groups.flatten()[found.frames], found.sizes, (h, c))
         return found.unpacked(memory).unflatten(0, starts.shape)
+
+    def tree(self, inputs: Tensor, branches: Branches, state: State) -> Tensor:
+        """See `Cell`; with one product of features and weights for each group."""
+        given, (h, c), memory = lstm_inputs(self.lstm, inputs), (value.squeeze(1) for value in state), []
+        for shorter, groups in branches:
+            before = (value.index_select(0, shorter) for value in (h, c))
+            h, c = lstm_step(self.lstm, given.index_select(0, groups), *before)
+            memory.append(h)
+        return torch.cat(memory)
 
 
 def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, state: State) -> Tensor:

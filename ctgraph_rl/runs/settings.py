@@ -26,9 +26,13 @@ LSTM = {
 
 WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
 
+POLICY_GRADIENT = ("a2c.A2C", "reinforce.Reinforce", "ppo.PPO", "ppo_count.PPOCount", "ppo_rnd.PPORND", *WITH_CELL[:2])
+
 ADDED: dict[str, dict[str, Any]] = {
     "run": {"portable": False, "protocol.guide_frames": None},
-    **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL},
+    **{f"baselines.{agent}": {"deduplicate": False} for agent in POLICY_GRADIENT},
+    **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL[2:]},
+    **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False} for agent in WITH_CELL[:2]},
     **{f"baselines.methods.mask_{name.lower()}.Mask{name}": {"backbone_seed": None} for name in ("RI", "LC", "BLC")},
     "curricula.from_axes": {"read_noise": 0, "read_rotation": 0, "random_graphs": None},
 }

@@ -82,18 +82,21 @@ def state_before(trunk: RecurrentModule) -> dict[str, torch.Tensor]:
 
 @every_cell
 @pytest.mark.parametrize("start_probability", [0.0, 0.3])
-def test_a_cell_and_its_gradients_are_the_same_step_by_step_and_over_sequences(name, start_probability):
+def test_a_cell_and_its_gradients_are_the_same_step_by_step_over_sequences_and_over_a_tree(name, start_probability):
     trunk = trunk_of(make(name, **OWN))
     starts = torch.rand(ROWS, STEPS, generator=torch.Generator().manual_seed(2)) < start_probability
     data, state = sequences(starts), state_before(trunk)
     by = torch.randn(ROWS, STEPS, OUTPUTS, dtype=torch.float64)
 
     stored = {key: value.unsqueeze(1) for key, value in state.items()}
-    found, expected = trunk.over_time(data | stored), step_by_step(trunk, data, state)
+    different, which = trunk.of_distinct(data | stored)
+    ways = (step_by_step(trunk, data, state), trunk.over_time(data | stored), different[which])
 
     weights = list(trunk.parameters())
-    gradients = [torch.autograd.grad(values, weights, by) if weights else () for values in (found, expected)]
-    torch.testing.assert_close((found, *gradients[0]), (expected, *gradients[1]), atol=1e-10, rtol=1e-10)
+    expected, *others = [(way, *(torch.autograd.grad(way, weights, by) if weights else ())) for way in ways]
+    for found in others:
+        torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-10)
+    assert (len(different) < ROWS * STEPS) == (start_probability > 0)
 
 
 @every_cell

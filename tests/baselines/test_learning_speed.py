@@ -17,9 +17,10 @@ from baselines import benchmark
 from baselines._roofline import Products
 from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
+from baselines.distinct import distinct
 from baselines.learner import functional_gradient_step
-from baselines.networks import distinct
 from baselines.optimisers import parts_of
+from baselines.together import why_not_together
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.benchmark import ladder as ladder_of_envs
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
@@ -128,6 +129,35 @@ def test_frames_that_differ_by_less_than_rounding_are_of_different_kinds():
     examples, kinds = distinct([values])
 
     assert torch.equal(values[examples][kinds], values)
+
+
+@pytest.mark.parametrize("name", ["a2c", "ppo", "ppo_count", "reinforce", "lstm_ppo", "rl2"])
+def test_losses_and_gradients_are_the_same_where_equal_frames_are_computed_once(small_agent, name):
+    agents = [small_agent(name, [ct_su_b1()], f"agent.deduplicate={once}").double() for once in ("false", "true")]
+    batch = batches(small_agent(name, [ct_su_b1()]), ct_su_b1(), 2)[1]
+    minibatch = {
+        key: value.double() if value.is_floating_point() else value
+        for key, value in learnt_from(small_agent(name, [ct_su_b1()]), batch)[0].items()
+    }
+
+    losses = [agent.loss(minibatch) for agent in agents]
+    totals = [sum(value for key, value in found.items() if key.startswith("loss_")) for found in losses]
+    gradients = [
+        torch.autograd.grad(total, list(agent.parameters())) for total, agent in zip(totals, agents, strict=True)
+    ]
+
+    assert len(agents[1].trunk.of_distinct(minibatch)[0]) < minibatch["action"].numel()
+    torch.testing.assert_close((losses[1], gradients[1]), (losses[0], gradients[0]), atol=1e-10, rtol=1e-10)
+
+
+def test_steps_whose_sizes_depend_on_data_are_neither_compiled_nor_stacked(small_agent):
+    with pytest.raises(Exception, match="deduplicate must be false with compile=true"):
+        small_agent("ppo", [ct_su_b1()], "agent.deduplicate=true", "agent.compile=true")
+
+    reason = why_not_together(small_agent("ppo", [ct_su_b1()], "agent.deduplicate=true"))
+
+    assert reason == "PPO with deduplicate=true cannot be vectorised over seeds"
+    assert why_not_together(small_agent("ppo", [ct_su_b1()])) is None
 
 
 STOCK_LOSSES = {

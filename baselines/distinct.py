@@ -1,0 +1,84 @@
+"""Frames with the same inputs and sequences with the same history, so that each is computed once.
+
+In a task without pixel noise, the thousands of frames of a minibatch show a few images, and the sequences of an agent
+with memory have a few histories: 21 in 2,048 frames of CT-SU-B1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from baselines.cells.cell import Branches, State
+from baselines.cells.segments import segments
+
+
+def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Group frames with the same inputs.
+
+    Args:
+        inputs: tensors, [num_frames, ...] each.
+
+    Returns:
+        One frame of each group, int64 [num_groups], and the group of each frame, int64 [num_frames].
+    """
+    flat = [value.flatten(1) for value in inputs]
+    frames = torch.arange(len(flat[0]), device=flat[0].device)
+    if not frames.is_cpu:  # a GPU would have to wait for the search
+        return frames, frames
+    widths = [value.shape[1] for value in flat]
+    weights = random_weights(sum(widths)).split(widths)
+    sums = torch.stack([value.float() @ part for value, part in zip(flat, weights, strict=True)]).sum(dim=0)
+    different, groups = sums.unique(return_inverse=True)
+    examples = frames.new_empty(len(different)).scatter_(0, groups, frames)
+    if len(examples) == len(frames):
+        return examples, groups
+    same = examples[groups]
+    differ = any((value != value.index_select(0, same)).count_nonzero() for value in flat)  # despite equal sums
+    return (frames, frames) if differ else (examples, groups)
+
+
+@cache
+def random_weights(count: int) -> Tensor:
+    """Return random numbers, float32 [count], always the same."""
+    return torch.randn(count, generator=torch.Generator().manual_seed(0))
+
+
+class Histories(NamedTuple):
+    """The different histories of sequences: a tree, in which each continues one that is a step shorter."""
+
+    initial: State
+    """The different states before a first step, [num_states, ...] each."""
+
+    branches: Branches
+    """The histories of each length; see `Cell.tree`."""
+
+    of_frames: Tensor
+    """The history of each frame, int64 [rows, steps]; the shortest have the first numbers."""
+
+
+def histories(groups: Tensor, starts: Tensor, state: State) -> Histories:
+    """Return the different histories of sequences, each from a reset or the first step on.
+
+    Args:
+        groups: the group of each frame's inputs, int64 [rows, steps].
+        starts: where the state is reset to zero, bool [rows, steps].
+        state: before the first step, already zero where it is reset there, [rows, ...] each.
+    """
+    found, flat, num_groups = segments(starts), groups.flatten(), int(groups.max()) + 1
+    states = [torch.cat([torch.zeros_like(value[:1]), value]) for value in state]
+    none = torch.zeros(len(starts) + 1, dtype=torch.int64)
+    examples, equal = distinct(states) if states else (none[:1], none)
+    last = torch.where(found.at_first, equal[found.rows + 1], equal[0])
+    of_frames, branches, count = torch.empty_like(flat), [], 0
+    for frames in found.frames.split(found.sizes.tolist()):
+        different, places = (last[: len(frames)] * num_groups + flat[frames]).unique(return_inverse=True)
+        branches.append((different.div(num_groups, rounding_mode="floor"), different % num_groups))
+        of_frames[frames] = places + count
+        last, count = places, count + len(different)
+    initial = tuple(value.index_select(0, examples) for value in states)
+    return Histories(initial, branches, of_frames.view_as(groups))
