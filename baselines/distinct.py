@@ -42,6 +42,13 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     return (frames, frames) if differ else (examples, groups)
 
 
+def renumbered(groups: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `distinct` does of some of its frames, from the groups that it gave them, int64 [num_frames]."""
+    different, numbers = groups.unique(return_inverse=True)
+    examples = torch.empty_like(different).scatter_(0, numbers, torch.arange(len(groups)))
+    return examples, numbers
+
+
 @cache
 def random_weights(count: int) -> Tensor:
     """Return random numbers, float32 [count], always the same."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any, cast
 
 import torch
@@ -16,13 +17,16 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
 from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, reset
-from baselines.distinct import distinct, histories
+from baselines.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
 
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
+
+GROUP = "group"
+"""The key of numbers of frames, int64, the same for frames with the same inputs; see `EncoderModule.groups`."""
 
 
 class Encoder(nn.Module):
@@ -64,13 +68,15 @@ class EncoderModule(TensorDictModule):
         """Compute the features of any number of steps."""
         return self.module(*(data[key] for key in self.in_keys))
 
+    def groups(self, data: Data) -> Tensor:
+        """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
+        inputs = [data[key] for key in self.in_keys]
+        return distinct([value.flatten(0, 1) for value in inputs])[1].view(inputs[0].shape[:2])
+
     def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
-        """Compute features of different frames, [n, num_features], and which of them each frame has, int64 [...]."""
-        num_dims = data["observation"].ndim - self.module.event_dims
-        inputs = [data[key].flatten(0, num_dims - 1) for key in self.in_keys]
-        examples, groups = distinct(inputs)
-        features = self.module(*(value.index_select(0, examples) for value in inputs))
-        return features, groups.view(data["observation"].shape[:num_dims])
+        """Compute features of different frames, [n, num_features], and which of them each has, int64 [num_frames]."""
+        examples, groups = renumbered(data[GROUP])
+        return self.module(*(data[key].index_select(0, examples) for key in self.in_keys)), groups
 
 
 class RecurrentModule(TensorDictModuleBase):
@@ -127,13 +133,20 @@ class RecurrentModule(TensorDictModuleBase):
         found = histories(groups, starts, state)
         return self.cell.tree(inputs, found.branches, found.initial), found.of_frames
 
+    def groups(self, data: Data) -> Tensor:
+        """Number the different inputs of frames, [rows, steps] of them; int64 [rows, steps]."""
+        return distinct([*chain(*self._read(data))])[1].view(data["is_init"].shape[:2])
+
+    def _read(self, data: Data) -> tuple[list[Tensor], list[Tensor]]:
+        """Return what the encoder reads at all frames, [rows * steps, ...] each, and what the cell reads beside it."""
+        seen = [data[key].flatten(0, 1) for key in self.encoder.in_keys]
+        return seen, [value.flatten(0, 1) for value in self._own(data)]
+
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, State]:
         """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
-        encoder, starts = self.encoder, data["is_init"].squeeze(-1)
-        seen = [data[key].flatten(0, 1) for key in encoder.in_keys]
-        own = [value.flatten(0, 1) for value in self._own(data)]
-        examples, groups = distinct([*seen, *own])
-        seen, own = ([value.index_select(0, examples) for value in values] for values in (seen, own))
+        encoder, starts, read = self.encoder, data["is_init"].squeeze(-1), self._read(data)
+        examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*chain(*read)])
+        seen, own = ([value.index_select(0, examples) for value in values] for values in read)
         inputs = joined(encoder.module(*seen), *own)
         state = reset([data[key][:, 0] for key in self.state_keys], starts[:, 0])
         return inputs, groups.view_as(starts), starts, state

@@ -16,6 +16,7 @@ from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
 from baselines.learner import Learner
 from baselines.networks import (
+    GROUP,
     ActorCritic,
     Data,
     actor,
@@ -159,7 +160,7 @@ class PolicyGradient(Learner):
 
         The trunk runs once for actor and critic.
         """
-        outputs = self._distinct_outputs(batch) if self.deduplicate and batch["action"].is_cpu else self.outputs(batch)
+        outputs = self._distinct_outputs(batch) if GROUP in batch else self.outputs(batch)
         log_probs = outputs["log_probs"]
         return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 
@@ -212,6 +213,8 @@ class PolicyGradient(Learner):
         if self.normalize_advantage:
             advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
         inputs = sequences_of(batch, [*self.trunk.in_keys, "action", "action_log_prob"])
+        if self.deduplicate and advantage.is_cpu:
+            inputs[GROUP] = self.trunk.groups(batch)
         return inputs | {"advantage": advantage, "value_target": target}
 
     def advantages(

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import Data, RecurrentModule, recurrent
+from baselines.networks import GROUP, Data, RecurrentModule, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 
@@ -55,6 +55,10 @@ class TrialTrunk(TensorDictModuleBase):
         """Compute ``memory`` at all steps of sequences [rows, steps]."""
         return self.trunk.over_time(self._inputs(data)[0])
 
+    def groups(self, data: Data) -> Tensor:
+        """Number the different inputs of frames, int64 [rows, steps]; see `RecurrentModule`."""
+        return self.trunk.groups(self._inputs(data)[0])
+
     def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute ``memory`` of different histories, and which of them each frame has; see `RecurrentModule`."""
         return self.trunk.of_distinct(self._inputs(data)[0])
@@ -63,7 +67,7 @@ class TrialTrunk(TensorDictModuleBase):
         """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
-        inputs = {key: data[key] for key in self.trunk.in_keys if key != "previous"}
+        inputs = {key: data[key] for key in (*self.trunk.in_keys, GROUP) if key != "previous" and key in data}
         action = one_hot(data["previous_action"], self.num_actions)
         previous = torch.cat([action, data["reward"]], dim=-1)
         return inputs | {"is_init": fresh, "previous": torch.where(fresh, 0.0, previous)}, episode

@@ -19,6 +19,7 @@ from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
 from baselines.distinct import distinct
 from baselines.learner import functional_gradient_step
+from baselines.networks import GROUP
 from baselines.optimisers import parts_of
 from baselines.together import why_not_together
 from ctgraph_rl import CTGraphEnv
@@ -137,16 +138,18 @@ def test_losses_and_gradients_are_the_same_where_equal_frames_are_computed_once(
     batch = batches(small_agent(name, [ct_su_b1()]), ct_su_b1(), 2)[1]
     minibatch = {
         key: value.double() if value.is_floating_point() else value
-        for key, value in learnt_from(small_agent(name, [ct_su_b1()]), batch)[0].items()
+        for key, value in learnt_from(small_agent(name, [ct_su_b1()], "agent.deduplicate=true"), batch)[0].items()
     }
+    grouped = dict(minibatch)
+    del minibatch[GROUP]
 
-    losses = [agent.loss(minibatch) for agent in agents]
+    losses = [agent.loss(given) for agent, given in zip(agents, (minibatch, grouped), strict=True)]
     totals = [sum(value for key, value in found.items() if key.startswith("loss_")) for found in losses]
     gradients = [
         torch.autograd.grad(total, list(agent.parameters())) for total, agent in zip(totals, agents, strict=True)
     ]
 
-    assert len(agents[1].trunk.of_distinct(minibatch)[0]) < minibatch["action"].numel()
+    assert len(agents[1].trunk.of_distinct(grouped)[0]) < minibatch["action"].numel()
     torch.testing.assert_close((losses[1], gradients[1]), (losses[0], gradients[0]), atol=1e-10, rtol=1e-10)
 
 
