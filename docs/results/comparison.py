@@ -32,6 +32,9 @@ MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 """The published comparison on its three curricula."""
 
 EXPERIMENTS = (*MASKS, "methods")
+RERUN = tuple(f"rerun/{name}" for name in EXPERIMENTS)
+"""Raw results of the rerun with more seeds, until all of it is there."""
+
 CONF = HERE.parent.parent / "conf" / "experiment"
 SOLVED = 0.9
 LEAST_ROOM = Fraction(1, 20)
@@ -242,13 +245,13 @@ def _solved(run: Curves, method: str) -> torch.Tensor:
 
 def expected(name: str) -> dict[str, list[str]]:
     """What an experiment sweeps."""
-    params = OmegaConf.load(CONF / f"{name}.yaml").hydra.sweeper.params
+    params = OmegaConf.load(CONF / f"{Path(name).name}.yaml").hydra.sweeper.params
     return {key: _choices(str(value)) for key, value in params.items()}
 
 
 def curricula_of(name: str) -> list[str]:
     """The curricula of an experiment: those that it sweeps, or the one that it chooses."""
-    defaults = OmegaConf.load(CONF / f"{name}.yaml").get("defaults", [])
+    defaults = OmegaConf.load(CONF / f"{Path(name).name}.yaml").get("defaults", [])
     chosen = [str(each[key]) for each in defaults for key in each if key == "override /curriculum"]
     return expected(name).get("curriculum", chosen)
 

@@ -40,7 +40,9 @@ def write(name: str, lines: Sequence[dict[str, Any]]) -> None:
     if not lines:
         raise ValueError(f"no raw results of {name}, whose file stays as it was: give the folder of its runs")
     columns = dict.fromkeys(column for line in lines for column in line)
-    with open(HERE / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
+    path = HERE / f"{name}.csv"
+    path.parent.mkdir(exist_ok=True)
+    with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(columns), restval=NOT_RECORDED)
         writer.writeheader()
         writer.writerows(lines)
