@@ -129,6 +129,15 @@ def never(exchange: str) -> str:
     return ", ".join(f"`{task.removeprefix('goal')}`" for task in failed) or "none"
 
 
+def most_apart() -> tuple[int, float]:
+    """Return the depth at which MOSAIC's sum of returns differs most from the published one, and by how much."""
+    members = {task: depth_of({"task": task}) for (task,) in groups(blocks("mosaic", "1", ALL), "task")}
+    apart = {}
+    for depth, values in by_depth("mosaic", ALL).items():
+        apart[depth] = [*members.values()].count(depth) * (fmean(values) - SHARED[depth - 2])
+    return max(apart.items(), key=lambda each: abs(each[1]))
+
+
 def welch(found: Sequence[float], value: float, half: float | None) -> tuple[float, float]:
     """Return Welch's 95 % interval of a mean less a published one, whose own interval is value +- half.
 
@@ -236,6 +245,8 @@ def texts() -> dict[str, str]:
         "never_shared": never("mosaic"),
         "never_any": never("mosaic_no_similarity"),
     }
+    depth, apart = most_apart()
+    found |= {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}
     for epochs in ("1", "8"):
         share, count = settled(epochs)
         found |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}

@@ -259,6 +259,19 @@ def test_goals_that_are_learned_in_no_seed_are_named():
         assert before + named in PAGE
 
 
+def test_the_depth_at_which_sums_differ_most_is_named():
+    published = (1.0, 0.99, 0.98, 0.95, 0.97, 0.91, 0.74, 0.58)
+    apart = {}
+    for depth in range(2, 10):
+        returns = defaultdict(list)
+        for block in at(depth, of_mosaic("mosaic", 28)):
+            returns[block["seed"]].append(float(block["final_return"]) - published[depth - 2])
+        apart[depth] = mean(map(sum, returns.values()))
+    most = max(apart, key=lambda depth: abs(apart[depth]))
+
+    assert f"published one at depth {most}, by {apart[most]:+.1f}." in PAGE
+
+
 def test_what_the_text_says_of_epochs_holds():
     for num_epochs in (8, 1):
         blocks = of_mosaic("isolated", 14, num_epochs)
