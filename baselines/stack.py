@@ -121,6 +121,21 @@ class Stack:
         bind = self.template.bind
         return vmap(lambda *given: bind(given[0], given[1]).outputs(given[2]))(self._tensors, self.others, data)
 
+    def acting_inputs(self, data: dict[Any, Tensor]) -> list[Tensor]:
+        """Return the tensors that `outputs` reads, in one order."""
+        return [*(tensor.detach() for tensor in self.kept.values()), *self.others.values(), *data.values()]
+
+    def traced_outputs(self, data: dict[Any, Tensor]) -> GraphModule:
+        """Return `outputs` as a graph of operations, a function of `acting_inputs`."""
+
+        def outputs(*given: Tensor) -> dict[str, Tensor]:
+            left, other = iter(given), copy(self)
+            other.kept = {number: next(left) for number in self.kept}
+            other.others = {key: next(left) for key in self.others}
+            return other.outputs({key: next(left) for key in data})
+
+        return make_fx(outputs, tracing_mode="fake")(*self.acting_inputs(data))
+
     def one_step(self, data: dict[Any, Tensor]) -> dict[Any, Tensor]:
         """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
         bind = self.template.bind

@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch._inductor import compile
+from torch.fx import GraphModule
 
 from baselines.learner import Learner, compiler_options
 from baselines.methods.method import AgentWithMethod
@@ -57,12 +58,13 @@ class Group:
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
         self.agents, self.generators = list(agents), list(generators)
         self.learners = [_learner(agent) for agent in agents]
-        self.is_stacked = self.learners[0].minibatch_size <= LARGEST_MINIBATCH
+        self.is_stacked = _gains_from_stacking(self.learners[0])
         self.most_at_once = _most_at_once(self.learners[0]) if self.learners[0].compiled_step else len(self.agents)
         self._template: Template | None = None
         self._acting: Stack | None = None
-        self._compiled: dict[str, Step] = {}
-        self._steps: dict[int, Step] = {}
+        self._compiled: dict[str, Compiled] = {}
+        self._steps: dict[int, Compiled] = {}
+        self._outputs: dict[tuple[torch.Size, ...], Compiled] = {}
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
@@ -86,6 +88,7 @@ class Group:
         """See `ctgraph_rl.agent.Agent`."""
         self._acting = self._template = None
         self._steps.clear()
+        self._outputs.clear()
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
@@ -102,11 +105,29 @@ class Group:
         if self._acting is None:
             self._acting = Stack(self.template, self.learners)
         keys = [key for key in self.learners[0].policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
-        outputs = self._acting.outputs({key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
+        outputs = self._act(self._acting, {key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
         written = self._explored(outputs) if "action_value" in outputs else sampled(outputs, self.generators)
         for key, value in written.items():
             data.set(key, value.flatten(0, 1))
         return data
+
+    def _act(self, stack: Stack, data: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Compute `Stack.outputs` by a graph of its operations, compiled where the agents say so.
+
+        Without it most of the time is spent on binding tensors and between operations.
+        """
+        shapes = tuple(value.shape for value in data.values())
+        inputs = stack.acting_inputs(data)
+        if shapes not in self._outputs:
+            graph = stack.traced_outputs(data)
+            self._outputs[shapes] = self._compile(graph, inputs) if self.learners[0].compiled_step else graph
+        return self._outputs[shapes](*inputs)
+
+    def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Compiled:
+        """Compile a graph, or return what was compiled of an equal one."""
+        if graph.code not in self._compiled:
+            self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
+        return self._compiled[graph.code]
 
     def _explored(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the best actions, and where an agent explores random ones."""
@@ -205,20 +226,27 @@ class Group:
         if first.compiled_step is None or batch["action"].shape[1] != first.minibatch_size:
             return stack.gradient_step(batch)
         if count not in self._steps:
-            graph = stack.traced(batch)
-            if graph.code not in self._compiled:
-                self._compiled[graph.code] = compile(graph, [*stack.inputs(batch)], compiler_options())
-            self._steps[count] = self._compiled[graph.code]
+            self._steps[count] = self._compile(stack.traced(batch), stack.inputs(batch))
         measured = self._steps[count](*stack.inputs(batch))
         stack.optimiser.num_steps += 1
         return measured
 
 
-Step = Callable[..., dict[str, Tensor]]
-"""A compiled gradient step of a `Stack`, a function of its `inputs`."""
+Compiled = Callable[..., dict[str, Tensor]]
+"""A compiled function of the tensors of a `Stack`, such as its gradient step, a function of its `inputs`."""
 
 CACHED_BYTES = 2**23
 """What a core keeps in its cache, of weights, gradients and moments."""
+
+
+def _gains_from_stacking(learner: Learner) -> bool:
+    """Return whether gradient steps of a stack take less time than those of each learner in turn.
+
+    Compiled steps of a stack with masks take longer: they write masked weights of all seeds to memory and read them
+    again, where the compiled step of one learner keeps its own in the cache.
+    """
+    masked = learner.trainable[0] is not learner.weights[0]
+    return learner.minibatch_size <= LARGEST_MINIBATCH and not (learner.compiled_step and masked)
 
 
 def _most_at_once(learner: Learner) -> int:
