@@ -36,7 +36,7 @@ AGENTS = {
     "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
 }
 
-COMPILED = [("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
+COMPILED = [("ppo", "ewc"), ("ppo_published", "finetune"), ("prioritized dqn", "finetune")]
 
 METHODS = ("scratch", "l2", "ewc", "ewc_published", "mask_ri", "mask_lc", "mask_blc")
 
@@ -221,8 +221,28 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
 
 
+@pytest.mark.parametrize(
+    ("name", "method"), [("ppo", "ewc"), ("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
+)
+def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(make, monkeypatch, name, method):
+    act, compared = Group._act, []
+
+    def checked(group, stack, data):
+        outputs = act(group, stack, data)
+        present = Stack(Template(group.learners[0]), group.learners).outputs(data)
+        assert outputs.keys() == present.keys()
+        compared.extend(torch.equal(outputs[key], present[key]) for key in present)
+        return outputs
+
+    monkeypatch.setattr(Group, "_act", checked)
+    make(name, method).learn()
+
+    assert len(compared) > 8
+    assert all(compared)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "method"), [("ppo", "ewc"), *COMPILED])
+@pytest.mark.parametrize(("name", "method"), COMPILED)
 def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeypatch, name, method):
     its = make(
         name, method, "agent.compile=true", curriculum=of(Block(ONE, 64), Block(THREE, 64), task_id="at_boundaries")
@@ -273,9 +293,18 @@ def in_double(stack: Stack) -> Stack:
     return Stack(Template(learners[0]), learners)
 
 
-def test_large_minibatches_are_learned_from_one_seed_after_the_other_by_the_agents_own_code(make, monkeypatch):
-    monkeypatch.setattr(together, "LARGEST_MINIBATCH", 0)
-    its = make("ppo", "ewc")
+@pytest.mark.parametrize(
+    ("name", "method", "largest", "settings"),
+    [
+        ("ppo", "ewc", 0, []),
+        pytest.param("ppo_published", "mask_lc", 512, ["agent.compile=true"], marks=pytest.mark.slow),
+    ],
+)
+def test_large_minibatches_and_compiled_masks_are_learned_one_seed_after_the_other_by_the_agents_own_code(
+    make, monkeypatch, name, method, largest, settings
+):
+    monkeypatch.setattr(together, "LARGEST_MINIBATCH", largest)
+    its = make(name, method, *settings)
 
     group, logs = its.learn()
 
