@@ -65,7 +65,7 @@ class Learner(nn.Module):
             *true_or_false(compile=compile),
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
-        self.compiled_step = compiled_gradient_step() if compile else None
+        self.compiled_step: Step | None = compiled(functional_gradient_step) if compile else None
         self._region: Region | None = None
         self.method = Hooks()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
@@ -244,16 +244,16 @@ MOST_COMPILED = 2**14
 
 
 @cache
-def compiled_gradient_step() -> Step:
-    """Return `functional_gradient_step`, compiled once for all learners of equal structure.
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a learner and tensors, compiled once for all learners of equal structure.
 
-    With small networks and minibatches nearly all time is spent between operations; a compiled step has no such gaps.
+    With small networks and minibatches nearly all time is spent between operations; compiled code has no such gaps.
     The compiler finds by itself whether a learner needs other code than those before: for another agent or method,
     other settings or sizes of tensors. A learner of the same structure, or the next task, uses what is there.
     """
     torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
     torch._dynamo.config.recompile_limit = torch._dynamo.config.accumulated_recompile_limit = MOST_COMPILED
-    return torch.compile(functional_gradient_step, fullgraph=True, dynamic=False, options=compiler_options())
+    return torch.compile(function, fullgraph=True, dynamic=False, options=compiler_options())
 
 
 def compiler_options() -> dict[str, Any]:

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch._inductor import compile
 from torch.fx import GraphModule
 
+from baselines.hooks import Hooks
 from baselines.learner import Learner, compiler_options
 from baselines.methods.method import AgentWithMethod
 from baselines.networks import Data
@@ -242,11 +243,12 @@ CACHED_BYTES = 2**23
 def _gains_from_stacking(learner: Learner) -> bool:
     """Return whether gradient steps of a stack take less time than those of each learner in turn.
 
-    Compiled steps of a stack with masks take longer: they write masked weights of all seeds to memory and read them
-    again, where the compiled step of one learner keeps its own in the cache.
+    Compiled steps of a stack with penalties or masks take longer: they write tensors of the size of all seeds' weights
+    to memory and read them again, where the compiled step of one learner keeps its own in the cache.
     """
-    masked = learner.trainable[0] is not learner.weights[0]
-    return learner.minibatch_size <= LARGEST_MINIBATCH and not (learner.compiled_step and masked)
+    method = type(learner.method)
+    plain = method.penalties is Hooks.penalties and method.transform_gradients is Hooks.transform_gradients
+    return learner.minibatch_size <= LARGEST_MINIBATCH and (plain or learner.compiled_step is None)
 
 
 def _most_at_once(learner: Learner) -> int:

@@ -23,7 +23,7 @@ from helpers.sweeping import UNLUCKY
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from baselines.learner import compiled_gradient_step
+from baselines.learner import compiled
 from ctgraph_rl import packages
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.runs import config, job
@@ -82,10 +82,10 @@ def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None
 
     def set_backend(backend: Any) -> None:
         monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
-        compiled_gradient_step.cache_clear()
+        compiled.cache_clear()
 
     yield set_backend
-    compiled_gradient_step.cache_clear()
+    compiled.cache_clear()
 
 
 @cache

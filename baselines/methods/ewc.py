@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.learner import total_loss
+from baselines.learner import Learner, compiled, total_loss
 from baselines.methods.importance import SampledImportance, learnt_steps, num_learnt
 from baselines.methods.weights import flat
 from baselines.networks import Data
@@ -68,9 +68,15 @@ class EWC(SampledImportance):
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 
     def _of_losses(self) -> Tensor:
-        squares = torch.zeros_like(self.importance)
+        squares, compiles = torch.zeros_like(self.importance), getattr(self.agent, "compiled_step", None) is not None
         for minibatch in self.samples.minibatches:
-            loss = total_loss(self.agent.loss(minibatch))
-            gradients = torch.autograd.grad(loss, self.weights.parameters, materialize_grads=True)
-            squares += flat(gradients).square() / max(num_learnt(minibatch), 1)
+            usual = compiles and len(minibatch["action"]) == self.agent.minibatch_size
+            add = compiled(add_squared_gradients) if usual else add_squared_gradients
+            add(self.agent, minibatch, squares, max(num_learnt(minibatch), 1))
         return squares
+
+
+def add_squared_gradients(agent: Learner, minibatch: Data, squares: Tensor, num_items: int) -> None:
+    """Add to ``squares``, [P], those of the gradients of an agent's losses on a minibatch, over its number of items."""
+    gradients = torch.autograd.grad(total_loss(agent.loss(minibatch)), agent.weights, materialize_grads=True)
+    squares += flat(gradients).square() / num_items

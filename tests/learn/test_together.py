@@ -36,7 +36,7 @@ AGENTS = {
     "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
 }
 
-COMPILED = [("ppo", "ewc"), ("ppo_published", "finetune"), ("prioritized dqn", "finetune")]
+COMPILED = [("ppo", "scratch"), ("ppo_published", "finetune"), ("prioritized dqn", "finetune")]
 
 METHODS = ("scratch", "l2", "ewc", "ewc_published", "mask_ri", "mask_lc", "mask_blc")
 
@@ -297,10 +297,11 @@ def in_double(stack: Stack) -> Stack:
     ("name", "method", "largest", "settings"),
     [
         ("ppo", "ewc", 0, []),
+        pytest.param("ppo_published", "ewc_published", 512, ["agent.compile=true"], marks=pytest.mark.slow),
         pytest.param("ppo_published", "mask_lc", 512, ["agent.compile=true"], marks=pytest.mark.slow),
     ],
 )
-def test_large_minibatches_and_compiled_masks_are_learned_one_seed_after_the_other_by_the_agents_own_code(
+def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_other_by_the_agents_own_code(
     make, monkeypatch, name, method, largest, settings
 ):
     monkeypatch.setattr(together, "LARGEST_MINIBATCH", largest)

@@ -137,6 +137,32 @@ def test_fisher_of_the_losses_is_the_sum_of_squared_gradients_by_the_frames_of_m
     torch.testing.assert_close(attached.method.importance, expected)
 
 
+@pytest.mark.slow
+def test_the_fisher_information_of_compiled_gradients_is_that_of_the_losses(compose, compile_by):
+    graphs: list[Any] = []
+    compile_by(lambda graph, *_, **__: graphs.append(graph) or graph)
+    settings = {**EWC_SETTINGS, "fisher": "loss", "num_samples": 40}
+    attached = with_method(compose, "ppo", EWC(coeff=1, **settings), TASKS, "agent.compile=true")
+    attached.start_task(0)
+    for batch in batches(attached, ONE, 2):
+        attached.learn(batch)
+    minibatches = attached.method.samples.minibatches
+    minibatches.append({key: value[:3] for key, value in minibatches[-1].items()})
+    before = len(graphs)
+
+    found = attached.method.task_importance()
+
+    assert len(minibatches) > 2
+    assert len(graphs) == before + 1
+    expected = torch.zeros(len(attached.method.weights))
+    for minibatch in minibatches:
+        total = sum(attached.agent.loss(minibatch)[key] for key in ("loss_objective", "loss_critic", "loss_entropy"))
+        gradients = torch.autograd.grad(total, attached.agent.weights)
+        squares = torch.cat([gradient.flatten() for gradient in gradients]).square()
+        expected += squares / len(minibatch["action"])
+    torch.testing.assert_close(found, expected)
+
+
 def test_mas_is_the_mean_sensitivity_of_the_squared_length_of_linear_outputs():
     attached, first, second = tiny(MAS(coeff=1, num_samples=100, heads="single")), seen(5, seed=1), seen(8, seed=2)
     attached.agent.output_keys = ("action_value",)
