@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from ctgraph_rl import Block, CTGraph, Curriculum, Evaluation, Observations, OneHot, Protocol, Task
+from ctgraph_rl import Block, CTGraph, Curriculum, Evaluation, Observations, OneHot, Protocol, RunLog, Task
 
 DECISION_ID = 2
 
@@ -91,3 +91,28 @@ class Told(Scripted):
 
     def policy_for(self, task: int):
         return self.policy
+
+
+class ScriptedGroup:
+    """Agents that act by a script, and keep the batches that each is given."""
+
+    def __init__(self, count: int, policy) -> None:
+        self.agents = [Told(policy, num_envs=8, num_steps=4) for _ in range(count)]
+        self.generators, self.policy = [], policy
+
+    def start_task(self, task=None) -> None:
+        pass
+
+    end_task = start_task
+
+    def learn(self, batch):
+        return [agent.learn(part) for agent, part in zip(self.agents, batch.chunk(len(self.agents)), strict=True)]
+
+
+def lines(log: RunLog) -> list[dict[str, Any]]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in log.measurements]
+
+
+def first_training(log: RunLog) -> dict[str, float]:
+    first = next(line for line in lines(log) if line["kind"] == "training")
+    return {key: value for key, value in first.items() if key != "kind"}

@@ -84,3 +84,16 @@ def saved_and_loaded(state: dict) -> dict:
 
 def parameters_equal(one, other) -> bool:
     return all(torch.equal(*pair) for pair in zip(one.parameters(), other.parameters(), strict=True))
+
+
+KINDS = {
+    "a2c": ["agent.optimiser=rmsprop", "agent.normalize_advantage=true"],
+    "reinforce": [],
+    "ppo": MINIBATCHES,
+    "ppo_count": [*MINIBATCHES, "agent.num_hash_bits=6"],
+    "ppo_rnd": MINIBATCHES,
+    "ppo_published": MINIBATCHES,
+    "dqn": REPLAY,
+    "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
+}
+"""Settings of agents whose seeds can be one batch."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
-from helpers.scripted import ONE, THREE, TWO, Told, decide, of
-from helpers.small_agents import MINIBATCHES, REPLAY, TINY, saved_and_loaded
+from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
+from helpers.small_agents import KINDS, TINY, saved_and_loaded
 
 from baselines import together
 from baselines.learner import total_loss
@@ -24,17 +24,6 @@ from ctgraph_rl.runs.train import new_agent, with_method
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode
 
 SEEDS = (0, 3, 8)
-
-AGENTS = {
-    "a2c": ["agent.optimiser=rmsprop", "agent.normalize_advantage=true"],
-    "reinforce": [],
-    "ppo": MINIBATCHES,
-    "ppo_count": [*MINIBATCHES, "agent.num_hash_bits=6"],
-    "ppo_rnd": MINIBATCHES,
-    "ppo_published": MINIBATCHES,
-    "dqn": REPLAY,
-    "prioritized dqn": [*REPLAY, "agent.priority_alpha=0.6", "agent.replay_on_task_change=keep"],
-}
 
 COMPILED = [("ppo", "scratch"), ("ppo_published", "finetune"), ("prioritized dqn", "finetune")]
 
@@ -73,24 +62,15 @@ class Together(NamedTuple):
 
 @pytest.fixture
 def make(compose):
-    """Makes a `Together` of an agent's name in `AGENTS`, a method and more settings."""
+    """Makes a `Together` of an agent's name in `KINDS`, a method and more settings."""
 
     def make(name: str = "a2c", method: str = "finetune", *overrides: str, curriculum=CURRICULUM) -> Together:
-        settings = [*TINY, *AGENTS[name], *overrides]
+        settings = [*TINY, *KINDS[name], *overrides]
         cfg = compose(f"agent={name.removeprefix('prioritized ')}", f"method={method}", *settings)
         make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), curriculum)
         return Together(make_agent, curriculum)
 
     return make
-
-
-def lines(log: RunLog) -> list[dict[str, Any]]:
-    return [{key: value for key, value in line.items() if key != "seconds"} for line in log.measurements]
-
-
-def first_training(log: RunLog) -> dict[str, float]:
-    first = next(line for line in lines(log) if line["kind"] == "training")
-    return {key: value for key, value in first.items() if key != "kind"}
 
 
 def states(group: Group) -> list[tuple[Any, torch.Tensor]]:
@@ -100,22 +80,6 @@ def states(group: Group) -> list[tuple[Any, torch.Tensor]]:
 
 alternating = decide(lambda data: 1 + data["step_count"].squeeze(-1) % 2)
 """Decisions that depend on the steps of the episode alone."""
-
-
-class ScriptedGroup:
-    """Agents that act by a script, and keep the batches that each is given."""
-
-    def __init__(self, count: int, policy) -> None:
-        self.agents = [Told(policy, num_envs=8, num_steps=4) for _ in range(count)]
-        self.generators, self.policy = [], policy
-
-    def start_task(self, task=None) -> None:
-        pass
-
-    end_task = start_task
-
-    def learn(self, batch):
-        return [agent.learn(part) for agent, part in zip(self.agents, batch.chunk(len(self.agents)), strict=True)]
 
 
 @pytest.mark.parametrize(
@@ -142,7 +106,7 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
     assert any(not torch.equal(one["observation"], other["observation"]) for one, other in pairs)
 
 
-@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in AGENTS), *(("ppo", m) for m in METHODS)])
+@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in KINDS), *(("ppo", m) for m in METHODS)])
 def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
     make, monkeypatch, name, method
 ):
@@ -205,7 +169,7 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     [
         ("a2c", "finetune"),
         ("ppo", "mask_lc"),
-        *(pytest.param(name, "finetune", marks=pytest.mark.slow) for name in AGENTS if name != "a2c"),
+        *(pytest.param(name, "finetune", marks=pytest.mark.slow) for name in KINDS if name != "a2c"),
         *(pytest.param("ppo", method, marks=pytest.mark.slow) for method in METHODS if method != "mask_lc"),
     ],
 )
