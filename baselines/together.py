@@ -63,9 +63,9 @@ class Group:
         self.most_at_once = _most_at_once(self.learners[0]) if self.learners[0].compiled_step else len(self.agents)
         self._template: Template | None = None
         self._acting: Stack | None = None
-        self._compiled: dict[str, Compiled] = {}
-        self._steps: dict[int, Compiled] = {}
-        self._outputs: dict[tuple[torch.Size, ...], Compiled] = {}
+        self._compiled: dict[str, Graph] = {}
+        self._steps: dict[int, Graph] = {}
+        self._outputs: Graph | None = None
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
@@ -87,9 +87,8 @@ class Group:
 
     def start_task(self, task: int | None = None) -> None:
         """See `ctgraph_rl.agent.Agent`."""
-        self._acting = self._template = None
+        self._acting = self._template = self._outputs = None
         self._steps.clear()
-        self._outputs.clear()
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
@@ -117,14 +116,13 @@ class Group:
 
         Without it most of the time is spent on binding tensors and between operations.
         """
-        shapes = tuple(value.shape for value in data.values())
         inputs = stack.acting_inputs(data)
-        if shapes not in self._outputs:
+        if self._outputs is None:
             graph = stack.traced_outputs(data)
-            self._outputs[shapes] = self._compile(graph, inputs) if self.learners[0].compiled_step else graph
-        return self._outputs[shapes](*inputs)
+            self._outputs = self._compile(graph, inputs) if self.learners[0].compiled_step else graph
+        return self._outputs(*inputs)
 
-    def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Compiled:
+    def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Graph:
         """Compile a graph, or return what was compiled of an equal one."""
         if graph.code not in self._compiled:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
@@ -233,8 +231,8 @@ class Group:
         return measured
 
 
-Compiled = Callable[..., dict[str, Tensor]]
-"""A compiled function of the tensors of a `Stack`, such as its gradient step, a function of its `inputs`."""
+Graph = Callable[..., dict[str, Tensor]]
+"""A graph of operations on the tensors of a `Stack`, compiled or not: of a gradient step, or of acting."""
 
 CACHED_BYTES = 2**23
 """What a core keeps in its cache, of weights, gradients and moments."""
@@ -243,7 +241,7 @@ CACHED_BYTES = 2**23
 def _gains_from_stacking(learner: Learner) -> bool:
     """Return whether gradient steps of a stack take less time than those of each learner in turn.
 
-    Compiled steps of a stack with penalties or masks take longer: they write tensors of the size of all seeds' weights
+    Graph steps of a stack with penalties or masks take longer: they write tensors of the size of all seeds' weights
     to memory and read them again, where the compiled step of one learner keeps its own in the cache.
     """
     method = type(learner.method)
