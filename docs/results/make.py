@@ -15,6 +15,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 import comparison
+import epochs
 import pairs
 import search
 from alone import INSTANCES, MEMORY, instances_change
@@ -302,7 +303,8 @@ def page() -> str:
 def lifelong_page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
-    return template.substitute(comparison.tables() | pairs.tables(), machines=machines(*comparison.EXPERIMENTS))
+    found = comparison.tables() | pairs.tables() | epochs.tables()
+    return template.substitute(found, machines=machines(*comparison.EXPERIMENTS))
 
 
 def draw(path: Path) -> None:

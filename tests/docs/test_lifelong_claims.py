@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -39,103 +40,99 @@ def _(t):
 
 @reads("masks_ct8_md")
 def _(t):
-    """It learns both tasks of depth 4, too, in every seed, the second at the price of `0000` and `00000`, and
-    both of depth 5 in three of five."""
-    return (
-        t.own("finetune")[:, 4:6].all()
-        and not t.ends("finetune")[:, 5, [4, 6]].any()
-        and t.own("finetune")[:, 6:].all(1).sum() == 3
-    )
+    """At the end of their blocks it has `0000` in 15 of 20 seeds, `0001` in 13, each time at the price of `0000` and
+    `00000`, `00000` in eight and `00001` in two."""
+    own = t.own("finetune")
+    both = own[:, 6:].all(1).sum() == 2  # as README says
+    return both and own.sum(0)[4:].tolist() == [15, 13, 8, 2] and not t.ends("finetune")[own[:, 5], 5][:, [4, 6]].any()
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """The other two solve neither; one ends with `01`, one with nothing."""
-    return t.own("finetune")[:, 6:].any(1).sum() == 3 and [n for n in t.names(t.known("finetune")) if len(n) < 2] == [
-        set(),
-        {"01"},
-    ]
+    """Fifteen seeds end with nothing; two end with `00`, `000`, `0000` and `00000`, two with `00`, `000`, `0000` and
+    `00001`, again four tasks that agree, and one with `01`."""
+    return Counter(map(frozenset, t.names(t.known("finetune")))) == {
+        frozenset(): 15,
+        frozenset({"00", "000", "0000", "00000"}): 2,
+        frozenset({"00", "000", "0000", "00001"}): 2,
+        frozenset({"01"}): 1,
+    }
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """The three end with `00`, `000`, `0000` and `00001`, again four tasks that agree."""
-    return t.names(t.known("finetune")).count({"00", "000", "0000", "00001"}) == 3
-
-
-@reads("masks_ct8_md")
-def _(t):
-    """What it gets in tasks that have not begun is 15 to 19 % of PPO's TPOT, and at most 5 % of the others'."""
-    return [round(100 * f(t.early_shares("finetune"))) for f in (min, max)] == [15, 19] and max(
-        max(t.early_shares(method)) for method in METHODS[1:]
-    ) <= 0.05
+    """What it gets in tasks that have not begun is 5 to 25 % of PPO's TPOT, up to 20 % of EWC's, and at most 7 % of
+    that of masks."""
+    least, most = (round(100 * f(t.early_shares("finetune"))) for f in (min, max))
+    return [least, most, *(round(100 * max(t.early_shares(method))) for method in ("ewc_published", "mask_ri"))] == [
+        5,
+        25,
+        20,
+        7,
+    ] and max(max(t.early_shares(method)) for method in MASKS) == max(t.early_shares("mask_ri"))
 
 
 @reads("masks_ct8_md")
 def _(t):
     """The paper's claim, that after depth 2 to 4 a linear combination of masks solves depth 5 and learning from
     scratch does not, holds here: Mask LC solves all eight tasks in every seed and forgets none; none of the
-    ten experts of depth 5 solves its task at the end."""
-    return t.own("mask_lc").all() and t.known("mask_lc").all() and not (t.experts[:, -1, 6:] >= MASTERED).any()
+    forty experts of depth 5 solves its task at the end."""
+    deep = t.experts[:, -1, 6:]
+    return t.own("mask_lc").all() and t.known("mask_lc").all() and deep.numel() == 40 and not (deep >= MASTERED).any()
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """(A greedy policy can be right by chance: one expert of `00000` has 1.00 in one evaluation of 20, and 0.00 in
+    """(A greedy policy can be right by chance: the experts of `00000` have 1.00 in 9 of 400 evaluations, and 0.00 in
     the others.)"""
-    return sorted(t.experts[:, :, 6].sum(1).tolist()) == [0, 0, 0, 0, 1]
+    return [int((t.experts[:, :, 6] == value).sum()) for value in (0, 1)] == [391, 9]
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """That nothing else gets there does not hold: Mask BLC solves depth 4 in every seed, `00000` in four of five and
-    `00001` in one, and PPO alone, as above, both in three, for the reason given there."""
-    return t.own("mask_blc").sum(0)[4:].tolist() == [5, 5, 4, 1] and t.own("finetune").sum(0)[6:].tolist() == [3, 3]
+    """That nothing else gets there does not hold: Mask BLC solves `0000` in 17 seeds, `0001` in ten, `00000` in four
+    and `00001` in none, and PPO alone, as above, `00000` in eight and `00001` in two, for the reason given there."""
+    return t.own("mask_blc").sum(0)[4:].tolist() == [17, 10, 4, 0] and t.own("finetune").sum(0)[6:].tolist() == [8, 2]
 
 
 @reads("masks_ct8_md")
 def _(t):
-    """Mask LC does it in every seed and keeps it; from Mask BLC and PPO on depth 5 it is not distinguishable with 5
-    seeds."""
+    """Mask LC does it in every seed and keeps it; on depth 5 each of the other methods does worse (p < 0.001,
+    corrected for four)."""
     deep = {method: t.own(method)[:, 6:].double().mean(1) for method in METHODS}
+    others = [deep[method] for method in METHODS if method != "mask_lc"]
+    worse = all(other.mean() < deep["mask_lc"].mean() for other in others)
+    return worse and max(t.corrected([t.p_value(deep["mask_lc"], other) for other in others])) < 0.001
+
+
+@reads("masks_ct8_md")
+def _(t):
+    """Mask RI, which shares nothing, solves `0000` in eight seeds, `0001` in one, and none of depth 5."""
+    return t.own("mask_ri").sum(0)[4:].tolist() == [8, 1, 0, 0]
+
+
+@reads("masks_ct8_md")
+def _(t):
+    """EWC learns the four tasks of depth 2 and 3, `0000` in five seeds, and nothing deeper."""
+    return t.own("ewc_published").sum(0).tolist() == [20, 20, 20, 20, 5, 0, 0, 0]
+
+
+@reads("masks_ct8_md")
+def _(t):
+    """It keeps them all but for `00` in one seed and `000` in another."""
+    lost = t.own("ewc_published") & ~t.known("ewc_published")
+    return [found for found in t.names(lost) if found] in ([{"00"}, {"000"}], [{"000"}, {"00"}])
+
+
+@reads("masks_ct8_md")
+def _(t):
+    """Task 1 shows why forward transfer leaves tasks out: one evaluation of 400 failed among its experts, and Mask LC
+    failed one of 20 in one seed, which would count -19 there and take its forward transfer from 0.98 to 0.84."""
     return (
-        [method for method in METHODS if t.own(method).all()] == ["mask_lc"]
-        and t.known("mask_lc").all()
-        and min(t.p_value(deep["mask_lc"], deep[other]) for other in ("mask_blc", "finetune")) > 0.05
-    )
-
-
-@reads("masks_ct8_md")
-def _(t):
-    """Mask RI, which shares nothing, solves at most one task of depth 4 and none of depth 5."""
-    return t.own("mask_ri")[:, 4:6].sum(1).max() == 1 and not t.own("mask_ri")[:, 6:].any()
-
-
-@reads("masks_ct8_md")
-def _(t):
-    """EWC learns the four tasks of depth 2 and 3, `0000` in two seeds, and nothing deeper."""
-    return t.own("ewc_published").sum(0).tolist() == [5, 5, 5, 5, 2, 0, 0, 0]
-
-
-@reads("masks_ct8_md")
-def _(t):
-    """It forgets most of them, `00` in three seeds of five by the end of the next block already; one seed knows `01`
-    at the end, which was lost in between and came back, the others nothing."""
-    return (
-        (~t.ends("ewc_published")[:, 1, 0]).sum() == 3
-        and sorted(map(sorted, t.names(t.known("ewc_published")))) == [[], [], [], [], ["01"]]
-        and not t.ends("ewc_published")[t.known("ewc_published")[:, 1], :, 1][:, 1:].all()
-    )
-
-
-@reads("masks_ct8_md")
-def _(t):
-    """Task 1 shows why forward transfer leaves tasks out: Mask LC failed one of 20 evaluations of it in two seeds,
-    which would count -4 each and take its forward transfer from 1.00 to 0.71."""
-    return (
-        sorted((t.stages("mask_lc")[:, 0] < MASTERED).sum(1).tolist()) == [0, 0, 0, 1, 1]
-        and (t.gain("mask_lc")[:, 0] / (1 - t.alone[0])).min() == pytest.approx(-4)
-        and [f"{value:.2f}" for value in t.transfer_of_mask_lc()] == ["1.00", "0.71"]
+        (t.experts[:, :, 0] < MASTERED).sum() == 1
+        and sorted((t.stages("mask_lc")[:, 0] < MASTERED).sum(1).tolist()) == [0] * 19 + [1]
+        and (t.gain("mask_lc")[:, 0] / (1 - t.alone[0])).min() == pytest.approx(-19)
+        and [f"{value:.2f}" for value in t.transfer_of_mask_lc()] == ["0.98", "0.84"]
     )
 
 

@@ -147,8 +147,9 @@ def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", CURRICULA)
 @pytest.mark.parametrize("name", AGENTS)
-def test_every_agent_goes_on_in_every_kind_of_curriculum_from_every_state(learner, name, kind):
-    check_some(learner(CURRICULA[kind], name))
+def test_every_agent_goes_on_in_every_kind_of_curriculum(learner, name, kind):
+    """From every state for one agent in every kind and for every agent in one kind; else from three."""
+    check_some(learner(CURRICULA[kind], name), None if name == "a2c" or kind == "announced" else 1)
 
 
 def test_a_state_may_be_used_again_for_resuming_does_not_change_it(learner):
