@@ -16,19 +16,19 @@ def eight(name: str) -> str:
 
 def by_epochs(name: str) -> str:
     """A line for each method: how many tasks it learned, and knows at the end, with 8 epochs and with one."""
-    rows = []
-    both = [groups(read(each), "method", "seed") for each in (eight(name), name)]
-    for method in comparison.expected(name)["method"]:
-        cells = []
-        for column in COLUMNS:
-            for of in both:
-                cells.append(_cell([lines for (who, _), lines in of.items() if who == method], column))
-        rows.append([f"`{method}`", *cells])
-    return table(["", *(f"{column}, {epochs}" for column in COLUMNS for epochs in ("8 epochs", "1 epoch"))], rows)
+    with_eight, with_one = (groups(read(each), "method") for each in (eight(name), name))
+    of = {"8 epochs": with_eight, "1 epoch": with_one}
+    heads = ["", *(f"{column}, {epochs}" for column in COLUMNS for epochs in of)]
+    rows = [
+        [f"`{method}`", *(_cell(of[epochs][method,], column) for column in COLUMNS for epochs in of)]
+        for method in comparison.expected(name)["method"]
+    ]
+    return table(heads, rows)
 
 
-def _cell(runs: list[Raw], column: str) -> str:
-    values = [comparison.scores(lines)[column] for lines in runs]
+def _cell(lines: Raw, column: str) -> str:
+    runs = list(groups(lines, "seed").values())
+    values = [comparison.scores(run)[column] for run in runs]
     return f"{mean_of(values, comparison.bounds(column, runs[0]))} (n = {len(runs)})"
 
 

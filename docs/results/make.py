@@ -304,7 +304,8 @@ def lifelong_page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
     found = comparison.tables() | pairs.tables() | epochs.tables()
-    return template.substitute(found, machines=machines(*comparison.EXPERIMENTS))
+    read_here = (*comparison.EXPERIMENTS, *map(epochs.eight, epochs.RUN_WITH_BOTH))
+    return template.substitute(found, machines=machines(*read_here))
 
 
 def draw(path: Path) -> None:

@@ -90,11 +90,6 @@ class Table:
         return statistics.compare(first.tolist(), second.tolist()).p_value
 
     @staticmethod
-    def corrected(p_values: list[float | None]) -> list[float | None]:
-        """P-values corrected for their number (Holm)."""
-        return statistics.holm(p_values)
-
-    @staticmethod
     def clear_pairs() -> int:
         """How many differences that the paper claims are distinguishable over the pairs of the three curricula."""
         corrected = statistics.holm([each.p_value for each in pairs.claims().values()])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
+from statistics import fmean
 
 import pytest
 from helpers.paths import CHECKOUT
@@ -34,13 +36,19 @@ def values(measured, epochs: int, method: str, column: str) -> list[float]:
     return [scores[column] for scores in measured[epochs, method]]
 
 
-def mean(found: list[float]) -> float:
-    return math.fsum(found) / len(found)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_line_has_both_columns_for_8_epochs_and_for_one(measured, method):
+    (line,) = re.findall(rf"\| `{method}` ((?:\| [^|]*\(n = \d+\) ){{4}})", PAGE)
+
+    shown = re.findall(r"\| ([\d.]+) [^|]*\(n = (\d+)\)", line)
+    columns = [(column, epochs) for column in ("tasks learned", "known at the end") for epochs in (8, 1)]
+    expected = [values(measured, epochs, method, column) for column, epochs in columns]
+    assert shown == [(f"{fmean(found):.2f}", str(len(found))) for found in expected]
 
 
 def test_ewc_keeps_what_it_learned_with_one_epoch_only(measured):
     one, eight = (values(measured, epochs, "ewc_published", "known at the end") for epochs in (1, 8))
-    learned = [mean(values(measured, epochs, "ewc_published", "tasks learned")) for epochs in (1, 8)]
+    learned = [fmean(values(measured, epochs, "ewc_published", "tasks learned")) for epochs in (1, 8)]
 
     assert (len(one), set(one), len(eight), set(eight)) == (20, {3, 4, 5}, 5, {0, 1})
     assert abs(learned[0] - learned[1]) <= 0.2
@@ -50,7 +58,7 @@ def test_ewc_keeps_what_it_learned_with_one_epoch_only(measured):
 
 def test_ppo_alone_has_less_with_one_epoch(measured):
     for column in ("while learning", "known at the end", "tasks learned"):
-        assert mean(values(measured, 1, "finetune", column)) < mean(values(measured, 8, "finetune", column))
+        assert fmean(values(measured, 1, "finetune", column)) < fmean(values(measured, 8, "finetune", column))
     assert "PPO alone has less with one epoch, while learning and at the end" in PAGE
 
 
