@@ -136,6 +136,7 @@ def _of_memory(tasks: tuple[Task, ...]) -> str:
     return f"Memory: needed for {which}, so only agents with memory can solve it: {with_memory}."
 
 
+@cache
 def _agents(memory: bool) -> str:
     return ", ".join(f"[`{e.name}`](../agents/{e.name}.md)" for e in catalogue("agent") if e.kind.memory == memory)
 

@@ -61,8 +61,7 @@ def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_rows", [1, 5, 16])
-@pytest.mark.parametrize("options", [None, {"cpp.simdlen": 1}])
+@pytest.mark.parametrize(("num_rows", "options"), [(5, None), (16, {"cpp.simdlen": 1})], ids=["vectors", "scalars"])
 def test_compiled_draws_are_the_same_words(num_rows, options):
     compiled = torch.compile(philox.draw, fullgraph=True, dynamic=False, options=options)
     wide = torch.compile(philox.randint_wide, fullgraph=True, dynamic=False, options=options)
@@ -76,8 +75,9 @@ def test_compiled_draws_are_the_same_words(num_rows, options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tasks", [FAMILIES["confounding"], FAMILIES["noise"]])
-def test_the_compiled_environment_gives_the_same_bits(tasks):
+def test_the_compiled_environment_gives_the_same_bits():
+    """Of one family, as it takes a minute; tests/core compiles a step of everything."""
+    tasks = FAMILIES["confounding"]
     eager, compiled = (CTGraphEnv(rows_of(tasks), check_actions=False) for _ in range(2))
     compiled.compile(warmup=2)
     actions = actions_of(tasks)

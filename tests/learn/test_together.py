@@ -266,8 +266,9 @@ def in_double(stack: Stack) -> Stack:
     ],
 )
 def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_other_by_the_agents_own_code(
-    make, monkeypatch, name, method, largest, settings
+    make, monkeypatch, compile_by, name, method, largest, settings
 ):
+    compile_by("eager")
     monkeypatch.setattr(together, "LARGEST_MINIBATCH", largest)
     its = make(name, method, *settings)
 

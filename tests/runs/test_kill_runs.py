@@ -26,7 +26,7 @@ def kill_runs(checkout: Path, *arguments: str) -> None:
 
 @pytest.mark.slow
 def test_runs_of_four_agents_that_are_killed_end_as_if_never_stopped(checkout):
-    kill_runs(checkout, "--kills", "8", "--agents", "a2c,dqn,lstm_ppo,rl2")
+    kill_runs(checkout, "--kills", "4", "--agents", "a2c,dqn,lstm_ppo,rl2")
 
 
 def start(run_dir: Path, checkout: Path) -> subprocess.Popen:
