@@ -66,11 +66,10 @@ class Table:
         """The goals that are mastered, for each seed."""
         return [{goal for goal, known in zip(self.goals, seed, strict=True) if known} for seed in mastered.tolist()]
 
-    def evaluations_per_failure(self) -> float:
-        """How many evaluations methods have for one that fails, from the first success on in each block."""
-        stages = torch.cat([self.stages(method).flatten(0, 1) for method in METHODS])
-        mastered = torch.cat([stage[int(stage.double().argmax()) + 1 :] for stage in stages >= MASTERED])
-        return len(mastered) / int((~mastered).sum())
+    def since_success(self, *methods: str) -> torch.Tensor:
+        """bool [N]: whether a task is mastered, at all evaluations that follow the first success in its block."""
+        stages = torch.cat([self.stages(method).flatten(0, 1) for method in methods])
+        return torch.cat([stage[int(stage.double().argmax()) + 1 :] for stage in stages >= MASTERED if stage.any()])
 
     def transfer_of_mask_lc(self) -> tuple[float, float]:
         """Its forward transfer on CT8 multi-depth: as in the table, and with the first task."""

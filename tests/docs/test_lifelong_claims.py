@@ -6,6 +6,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import pytest
@@ -136,83 +137,91 @@ def _(t):
 
 @reads("masks_ct8")
 def _(t):
-    """Every method finds every goal, and so do the experts; what differs is how much stays."""
-    return (
-        all((t.stages(method).amax(-1) >= MASTERED).all() for method in METHODS)
-        and (t.experts.amax(1) >= MASTERED).all()
-    )
+    """Mask RI, Mask BLC and EWC learn all eight tasks in every seed, and so do the experts."""
+    every = all(t.own(method).all() for method in ("mask_ri", "mask_blc", "ewc_published"))
+    return every and (t.experts[:, -1] >= MASTERED).all()
 
 
 @reads("masks_ct8")
 def _(t):
-    """Fine-tuning knows the last goal alone in every seed."""
-    return t.known("finetune").sum(0).tolist() == [0, 0, 0, 0, 0, 0, 0, 5]
+    """PPO alone misses `100`, the first goal with another first decision, in three seeds."""
+    return t.names(~t.own("finetune")) == [{"100"} if seed in (4, 8, 9) else set() for seed in range(10)]
 
 
 @reads("masks_ct8")
 def _(t):
-    """EWC knows the last two to seven, never the first."""
-    return sorted(t.known("ewc_published").sum(1).tolist())[::4] == [2, 7] and all(
-        seed == sorted(seed) and not seed[0] for seed in t.known("ewc_published").tolist()
-    )
+    """Mask LC misses six tasks in four seeds, `011` and `111` twice each."""
+    missed = [goals for goals in t.names(~t.own("mask_lc")) if goals]
+    goals = Counter(goal for of_seed in missed for goal in of_seed)
+    return len(missed) == 4 and goals == {"011": 2, "111": 2, "100": 1, "101": 1}
 
 
 @reads("masks_ct8")
 def _(t):
-    """Masks keep what they have, also by mistake: a learned policy fails a greedy evaluation now and then, about one
-    in 90 from the first success on in its block, and where that is the last one of a block, the mask stays
-    so."""
-    return round(t.evaluations_per_failure(), -1) == 90 and all(
-        torch.equal(t.known(method), t.own(method)) for method in MASKS
-    )
+    """Each of them was reached in no evaluation of its block."""
+    return not any((t.stages(method)[~t.own(method)] >= MASTERED).any() for method in ("finetune", "mask_lc"))
 
 
 @reads("masks_ct8")
 def _(t):
-    """The two tasks that masks miss, one of Mask LC and one of Mask BLC, had 1.00 in all other evaluations of their
-    block."""
-    return [int((~t.known(method)).sum()) for method in MASKS] == [1, 0, 1] and all(
-        (t.stages(method)[~t.known(method)][:, :-1] == 1).all() for method in MASKS
-    )
+    """At the end PPO alone knows the last goal alone in every seed; EWC and masks know all that they learned."""
+    last_alone = t.known("finetune").sum(0).tolist() == [0, 0, 0, 0, 0, 0, 0, 10]
+    return last_alone and all(torch.equal(t.known(method), t.own(method)) for method in METHODS[1:])
 
 
 @reads("masks_ct8")
 def _(t):
-    """The paper's first claim, that masks do better than EWC and PPO alone, holds of the means; its second, that a
-    combination of masks learns faster than new ones, does so too, by the mean return over all blocks."""
-    return t.claims_hold_of_the_means()
+    """A learned policy fails a greedy evaluation now and then, about one in 83 from the first success on in its block;
+    46 of all 78 failures are EWC's, one in 26."""
+    each = [t.since_success(*methods) for methods in (METHODS, ["ewc_published"])]
+    return [(int((~seen).sum()), round(len(seen) / int((~seen).sum()))) for seen in each] == [(78, 83), (46, 26)]
 
 
 @reads("masks_ct8")
 def _(t):
-    """Neither is distinguishable with 5 seeds, for no difference is; [the pairs of all three
-    curricula](#the-papers-claims-pair-by-pair) are."""
-    pairs = [(a, b) for a in METHODS for b in METHODS if a != b]
-    return min(t.p_value(t.areas(a).mean(1), t.areas(b).mean(1)) for a, b in pairs) > 0.05 and t.clear_pairs() == 8
+    """So the paper's first claim, that masks do better than EWC and PPO alone, does not hold here: EWC knows as much
+    as Mask RI and Mask BLC, and more than Mask LC."""
+    known = {method: t.known(method).sum() for method in METHODS}
+    return known["ewc_published"] == known["mask_ri"] == known["mask_blc"] > known["mask_lc"] > known["finetune"]
 
 
 @reads("masks_ct8")
 def _(t):
-    """Mask BLC gains 0.10 over the experts, Mask RI, which shares nothing, 0.01, and without the first task nothing."""
-    gains = [f"{t.gain(method).mean():.2f}" for method in ("mask_blc", "mask_ri")]
-    return gains == ["0.10", "0.01"] and t.gain("mask_ri")[:, 1:].mean() <= 0
+    """The second claim, that a combination of masks learns faster than new ones, holds of Mask BLC and not of Mask LC:
+    by the mean return over all blocks, Mask BLC, with 0.96, is better than each of the others (p < 0.03,
+    corrected for all ten pairs), and no other two are distinguishable; Mask RI has 0.87, Mask LC 0.83, PPO alone
+    0.82 and EWC 0.78."""
+    areas = {method: t.areas(method).mean(1) for method in METHODS}
+    corrected = statistics.holm([t.p_value(areas[a], areas[b]) for a, b in combinations(METHODS, 2)])
+    with_blc = [p for p, pair in zip(corrected, combinations(METHODS, 2), strict=True) if "mask_blc" in pair]
+    others = [p for p, pair in zip(corrected, combinations(METHODS, 2), strict=True) if "mask_blc" not in pair]
+    shown = [f"{areas[method].mean():.2f}" for method in ("mask_blc", "mask_ri", "mask_lc", *METHODS[:2])]
+    return max(with_blc) < 0.03 and min(others) > 0.05 and shown == ["0.96", "0.87", "0.83", "0.82", "0.78"]
 
 
 @reads("masks_ct8")
 def _(t):
-    """Mask LC learns like Mask BLC but for tasks 5 and 6, `100` and `101`: over the block of `101` its mean return
-    is 0.56, that of Mask BLC 1.00 and of the experts 0.80."""
-    return (
-        (t.areas("mask_lc") - t.areas("mask_blc")).mean(0)[[0, 1, 2, 3, 6, 7]].abs().max() <= 0.05 + 1e-12
-        and (t.areas("mask_lc") - t.areas("mask_blc")).mean(0)[[4, 5]].max() < -0.05
-        and [f"{v:.2f}" for v in (t.areas("mask_lc").mean(0)[5], t.areas("mask_blc").mean(0)[5], t.alone[5])]
-        == ["0.56", "1.00", "0.80"]
-    )
+    """The experts have 0.76."""
+    return f"{t.alone.mean():.2f}" == "0.76"
+
+
+@reads("masks_ct8")
+def _(t):
+    """Mask RI, which shares nothing, gains 0.11 over them, Mask BLC 0.20."""
+    return [f"{t.gain(method).mean():.2f}" for method in ("mask_ri", "mask_blc")] == ["0.11", "0.20"]
+
+
+@reads("masks_ct8")
+def _(t):
+    """Mask LC has the mean return of Mask BLC over the blocks of the first three tasks, and 0.13 to 0.28 less over
+    each of the others."""
+    less = (t.areas("mask_blc") - t.areas("mask_lc")).mean(0)
+    return less[:3].abs().max() <= 0.02 + 1e-12 and less[3:].min() >= 0.125 and less[3:].max() < 0.28
 
 
 @reads("masks_ct12")
 def _(t):
-    """As in CT8 every method finds every goal, and what differs is how much stays."""
+    """Every method finds every goal, and what differs is how much stays."""
     return all((t.stages(method).amax(-1) >= MASTERED).all() for method in METHODS)
 
 
@@ -252,7 +261,7 @@ def _(t):
 
 @reads("masks_ct12")
 def _(t):
-    """Both claims of the paper hold of the means, measured as above."""
+    """Both claims of the paper hold of the means, the second by the mean return over all blocks."""
     return t.claims_hold_of_the_means()
 
 
@@ -354,8 +363,8 @@ NO_DATA = {
     "How the paper's own runs did task by task is not known here.",
     "It begins a task with equal shares of old and new masks, Mask BLC with one half for the new one, which "
     "may be why.",
-    "In CT8, too, it is slowest in `101`.",  # see below
     "So the gain over experts, which has all tasks, says more here.",
+    "With 8 epochs it [forgets](#what-epochs-change).",  # tests/docs/results/test_epochs.py
 }
 """What explains, or is tested elsewhere."""
 
@@ -380,10 +389,6 @@ def sentences_of_the_readings() -> list[str]:
 @pytest.mark.parametrize(("table", "sentence"), [(table, each) for table, claims in CLAIMS.items() for each in claims])
 def test_what_is_read_from_a_table_holds_of_its_raw_results(tables, table, sentence):
     assert CLAIMS[table][sentence](tables[table])
-
-
-def test_mask_lc_is_slowest_in_the_sixth_task_of_ct8(tables):
-    assert tables["masks_ct8"].areas("mask_lc").mean(0).argmin() == 5
 
 
 def test_every_sentence_of_the_readings_is_tested():

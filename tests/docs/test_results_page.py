@@ -80,6 +80,10 @@ def test_a_threshold_does_not_hang_on_the_last_bit(make):
     assert 3 in comparison.full(experts)
 
 
+OF_OTHER_ROUNDING = {"masks_ct8": {"1": 1, "2": 3, "3": 1, "5": 2}}
+"""Evaluations of the first task that EWC, whose compiled steps are of one seed, has otherwise, by table and seed."""
+
+
 @pytest.mark.parametrize("name", ["masks_ct8_md", "masks_ct8", "masks_ct12"])
 def test_methods_that_must_learn_the_first_task_alike_share_its_results(make, name):
     first = {
@@ -88,8 +92,12 @@ def test_methods_that_must_learn_the_first_task_alike_share_its_results(make, na
     }
 
     for seed in {seed for _, seed in first}:
-        assert first["finetune", seed] == first["ewc_published", seed] == first["expert", seed]
+        assert first["finetune", seed] == first["expert", seed]
         assert first["mask_ri", seed] == first["mask_lc", seed] == first["mask_blc", seed]
+        others = [a != b for a, b in zip(first["finetune", seed], first["ewc_published", seed], strict=True)]
+        assert sum(others) == OF_OTHER_ROUNDING.get(name, {}).get(seed, 0)
+    said = "in four of ten seeds of CT8 one to three evaluations of the first task differ"
+    assert said in " ".join(make.LIFELONG.read_text(encoding="utf-8").split())
 
 
 @pytest.mark.parametrize("name", ["ct8_md", "ct8", "ct12", "fo_b1_4tasks", "fo_b1_4images", "fo_b1_depth2to5"])

@@ -90,9 +90,9 @@ def test_a_setting_that_one_choice_of_a_swept_group_lacks_is_refused_before_anyt
     [
         (
             ["experiment=masks_ct8"],
-            ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(5): add -m",
+            ",mask_lc,ewc_published,mask_ri,mask_blc seed=range(10): add -m",
         ),
-        (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(5): add -m"),
+        (["experiment=masks_ct8", "method=ewc"], "is a sweep, seed=range(10): add -m"),
         (["hydra.sweeper.status=true"], "hydra.sweeper.status=true lists a sweep's cells: add -m"),
     ],
 )
