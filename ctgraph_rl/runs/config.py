@@ -156,8 +156,8 @@ def check_values(cfg: DictConfig) -> None:
     require((isinstance(folder, str) and bool(folder), f"experts_dir must be the path of a folder, got {folder!r}"))
     for switch in ("experts", "report", "portable", "together"):
         require((isinstance(cfg[switch], bool), f"{switch} must be true or false, got {cfg[switch]!r}"))
-    alone = "together=true trains the seeds of a sweep as one batch: add -m and several seeds, such as seed=range(20)"
-    require((in_sweep() or not cfg.together, alone))
+    seeds = "add -m and several seeds, such as seed=range(20), or together=false for one run"
+    require((in_sweep() or not cfg.together, f"together=true trains the seeds of a sweep as one batch: {seeds}"))
     require(
         check_overwrite(cfg.overwrite),
         (cfg.resume in RESUME, f"resume must be one of {', '.join(RESUME)}, got {cfg.resume!r}"),

@@ -110,7 +110,8 @@ def test_a_sweep_without_m_is_refused(settings, message, learned, monkeypatch, c
 @pytest.mark.parametrize("prefix", ["", "++"])
 def test_one_cell_of_an_experiment_needs_no_m(learned, monkeypatch, prefix):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    monkeypatch.setattr(sys, "argv", ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3"])
+    words = ["ctgraph-rl", "experiment=masks_ct8", "method=ewc", f"{prefix}seed=3", "together=false"]
+    monkeypatch.setattr(sys, "argv", words)
     monkeypatch.setattr(run_module, "show", lambda *_: None)
 
     run_module.main()
