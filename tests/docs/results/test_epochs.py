@@ -1,4 +1,4 @@
-"""docs/results/lifelong.md, "What epochs change": what it says holds of the raw results."""
+"""docs/results/lifelong.md, "In short" and "What epochs change": what they say holds of the raw results."""
 
 from __future__ import annotations
 
@@ -32,6 +32,33 @@ def measured():
         yield found
         for name in ("epochs", "comparison", "pairs", "raw"):
             sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def by_curriculum():
+    """For each table the means over seeds and tasks of what methods know at the end and have while learning."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(str(FOLDER))
+        mastered = __import__("mastered")
+        tables = {name: mastered.Table(name) for name in mastered.GOALS}
+        yield {
+            name: {m: (table.known(m).double().mean().item(), table.areas(m).mean().item()) for m in METHODS}
+            for name, table in tables.items()
+        }
+        for name in ("mastered", "comparison", "pairs", "raw"):
+            sys.modules.pop(name, None)
+
+
+def test_in_short_says_on_which_curricula_the_papers_claims_hold(by_curriculum):
+    masks, short = [m for m in METHODS if "mask" in m], PAGE[: PAGE.index("Every seed that was run")]
+
+    more_than_ewc = {n for n, of in by_curriculum.items() if all(of[m][0] > of["ewc_published"][0] for m in masks)}
+    faster = {m: {n for n, of in by_curriculum.items() if of[m][1] > of["mask_ri"][1]} for m in ("mask_lc", "mask_blc")}
+
+    assert more_than_ewc == {"masks_ct8_md", "masks_ct12"} == faster["mask_lc"]
+    assert faster["mask_blc"] == set(by_curriculum)
+    assert "masks know more at the end than EWC holds of the means on CT8 multi-depth and CT12, and not on CT8" in short
+    assert "new ones holds of Mask BLC everywhere, and of Mask LC but for CT8" in short
 
 
 @pytest.fixture
