@@ -33,10 +33,6 @@ def lines(*evaluations):
     return [dict(zip(("block", "frames", "1", "2"), map(str, each), strict=True)) for each in evaluations]
 
 
-def test_the_page_is_what_its_raw_results_make(make):
-    assert make.lifelong_page() == make.LIFELONG.read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(("name", "num_tasks"), [("masks_ct8_md", 8), ("masks_ct8", 8), ("masks_ct12", 12)])
 def test_every_cell_of_the_published_comparison_has_one_curriculum_and_all_evaluations(comparison, name, num_tasks):
     cells = comparison.groups(comparison.read(name), "method", "seed")
