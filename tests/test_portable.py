@@ -37,7 +37,7 @@ if torch.backends.cpu.get_cpu_capability() != "AVX512":
     del EMULATIONS["avx512"]  # illegal instructions on this CPU
 
 LEARNERS = [
-    *({"agent": name} for name in ("dqn", "lstm_ppo")),
+    *({"agent": name} for name in ("ppo", "a2c", "dqn", "lstm_ppo")),
     {"agent": "ppo_published", "agent.num_minibatches": 8},
     {"agent": "ppo", "method": "mask_lc", "protocol.task_id": "one_hot"},
 ]

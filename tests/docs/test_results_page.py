@@ -85,15 +85,13 @@ OF_OTHER_ROUNDING = {"masks_ct8": {"1": 1, "2": 3, "3": 1, "5": 2}}
 
 
 @pytest.mark.parametrize("name", ["masks_ct8_md", "masks_ct8", "masks_ct12"])
-def test_methods_that_must_learn_the_first_task_alike_share_its_results(make, name):
+def test_ewc_has_the_results_of_ppo_on_the_first_task_but_for_rounding(make, name):
     first = {
         (method, seed): [line["1"] for line in lines if line["block"] in ("0", "1")]
         for (method, seed), lines in make.groups(make.read(name), "method", "seed").items()
     }
 
     for seed in {seed for _, seed in first}:
-        assert first["finetune", seed] == first["expert", seed]
-        assert first["mask_ri", seed] == first["mask_lc", seed] == first["mask_blc", seed]
         others = [a != b for a, b in zip(first["finetune", seed], first["ewc_published", seed], strict=True)]
         assert sum(others) == OF_OTHER_ROUNDING.get(name, {}).get(seed, 0)
     said = "in four of ten seeds of CT8 one to three evaluations of the first task differ"

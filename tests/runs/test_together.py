@@ -192,7 +192,7 @@ def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(mon
     [
         (
             ("seed=1", "together=true"),
-            "together=true trains the seeds of a sweep as one batch: add -m and",
+            "as one batch: add -m and several seeds, such as seed=range(20), or together=false for one run",
         ),
         (("-m", "seed=0,1", "together=[0,1]"), "together must be true or false, got [0, 1]"),
     ],
