@@ -254,7 +254,8 @@ def test_an_agent_that_goes_on_from_a_saved_state_begins_with_a_compiled_step(sm
 
 
 @pytest.mark.slow
-def test_a_loss_that_is_not_a_number_stops_a_compiled_agent_and_is_named(small_agent):
+def test_a_loss_that_is_not_a_number_stops_a_compiled_agent_and_is_named(small_agent, compile_by):
+    compile_by("eager")
     agent = small_agent("ppo", [ct_su_b1()], "agent.compile=true")
     first, second = batches(agent, ct_su_b1(), 2)
     agent.learn(first)

@@ -63,7 +63,7 @@ def within_specs(env: CTGraphEnv, data: TensorDictBase) -> bool:
     return all(spec.contains(data.select(*spec.keys())) for spec in specs)
 
 
-@examples(20)
+@examples(12)
 @given(batches(least=2), seeds, st.sampled_from([0, 1, 7, 2**32 - 4]))
 def test_any_row_of_any_batch_equals_its_task_alone(batch, seed, first_row):
     data = rollout(CTGraphEnv(batch, seed=seed, first_row=first_row), seed, 12)
@@ -77,7 +77,7 @@ def test_any_row_of_any_batch_equals_its_task_alone(batch, seed, first_row):
         assert torch.equal(alone["observation"], seen[..., :length]) and not seen[..., length:].any()
 
 
-@examples(20)
+@examples(12)
 @given(batches(), seeds)
 def test_the_optimal_policy_reaches_the_goal_of_any_task(batch, seed):
     env = CTGraphEnv(batch, seed=seed, check_actions=False)
@@ -93,7 +93,7 @@ def test_the_optimal_policy_reaches_the_goal_of_any_task(batch, seed):
         assert task.reward_std or total.item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-@examples(20)
+@examples(12)
 @given(batches(), seeds, st.integers(1, 12))
 def test_a_state_dict_of_any_moment_of_any_tasks_resumes_bit_exactly(batch, seed, moment):
     env = CTGraphEnv(batch, seed=seed, first_row=5)
@@ -148,7 +148,7 @@ def shows(task: Task, seen: torch.Tensor, shown_id: int) -> bool:
     return bool(fits.flatten(1).all(1).any())
 
 
-@examples(30)
+@examples(15)
 @given(batches(), seeds)
 def test_the_data_of_any_tasks_lie_within_the_specs_and_follow_the_papers_tree_step_by_step(batch, seed):
     env, rng, states = CTGraphEnv(batch, seed=seed), random.Random(seed), [(HOME, ())] * len(batch)
@@ -335,7 +335,7 @@ def test_a_wrong_action_is_refused_with_the_expected_spec_and_changes_nothing(se
     assert unchanged(env, before)
 
 
-@examples(20)
+@examples(12)
 @given(batches(least=2), seeds, st.integers(0, 8), st.lists(flips, min_size=4, max_size=4))
 def test_a_reset_of_any_rows_leaves_the_present_and_the_future_of_the_others_alone(batch, seed, steps, resets):
     mask, rng = torch.tensor([*resets[1 : len(batch)], True]), random.Random(seed)

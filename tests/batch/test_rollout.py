@@ -76,10 +76,10 @@ def test_compiled_draws_are_the_same_words(num_rows, options):
 
 @pytest.mark.slow
 def test_the_compiled_environment_gives_the_same_bits():
-    """Of one family, as it takes a minute; tests/core compiles a step of everything."""
+    """Captured and traced; tests/core compiles a step of everything to machine code."""
     tasks = FAMILIES["confounding"]
     eager, compiled = (CTGraphEnv(rows_of(tasks), check_actions=False) for _ in range(2))
-    compiled.compile(warmup=2)
+    compiled.compile(warmup=2, backend="aot_eager")
     actions = actions_of(tasks)
 
     with torch.no_grad():

@@ -48,7 +48,7 @@ def both(tasks, mode, **kwargs):
 def test_the_vector_environment_equals_sync_vector_env_step_for_step(kind, mode):
     ours, theirs = both([VARIED[kind]] * 4, mode)
 
-    played = [play(envs, 11, 150) for envs in (ours, theirs)]
+    played = [play(envs, 11, 100) for envs in (ours, theirs)]
 
     assert_equal(*played)
     assert any(result[2].sum() > 1 for result in played[0] if len(result) == 5)

@@ -133,11 +133,8 @@ def test_their_check_env_has_nothing_to_say_about_one_hot_observations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [ids, adapter])
-def test_ppo_learns_ct_fo_b1(make):
-    model = PPO(
-        "MlpPolicy", make("CT-FO-B1", 8), n_steps=128, batch_size=128, learning_rate=1e-3, ent_coef=0.01, seed=0
-    )
+def test_ppo_learns_ct_fo_b1():
+    model = PPO("MlpPolicy", ids("CT-FO-B1", 8), n_steps=128, batch_size=128, learning_rate=1e-3, ent_coef=0.01, seed=0)
 
     model.learn(10_240)
 
@@ -145,10 +142,11 @@ def test_ppo_learns_ct_fo_b1(make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [ids, adapter])
-def test_dqn_learns_ct_fo_b1(make):
+def test_dqn_learns_ct_fo_b1():
     schedule = {"learning_starts": 500, "exploration_fraction": 0.7, "target_update_interval": 200}
-    model = DQN("MlpPolicy", make("CT-FO-B1", 4), learning_rate=1e-3, gamma=0.9, buffer_size=20_000, seed=0, **schedule)
+    model = DQN(
+        "MlpPolicy", adapter("CT-FO-B1", 4), learning_rate=1e-3, gamma=0.9, buffer_size=20_000, seed=0, **schedule
+    )
 
     model.learn(10_000)
 
@@ -156,15 +154,14 @@ def test_dqn_learns_ct_fo_b1(make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [ids, adapter])
-def test_recurrent_ppo_learns_ct_su_b1(make):
+def test_recurrent_ppo_learns_ct_su_b1():
     """Training ends when the graph is solved: with more frames one seed in twelve forgets it again."""
     sizes = {"n_steps": 32, "batch_size": 128, "policy_kwargs": {"lstm_hidden_size": 32, "net_arch": [32]}}
     steps = {"learning_rate": 1e-3, "n_epochs": 4, "ent_coef": 0.02, "gamma": 0.95}
-    model = RecurrentPPO("MlpLstmPolicy", make("CT-SU-B1", 16), seed=0, **steps, **sizes)
+    model = RecurrentPPO("MlpLstmPolicy", adapter("CT-SU-B1", 16), seed=0, **steps, **sizes)
     solved = StopTrainingOnRewardThreshold(0.9)
 
-    model.learn(25_600, EvalCallback(make("CT-SU-B1", 1), solved, eval_freq=128, n_eval_episodes=20))
+    model.learn(25_600, EvalCallback(adapter("CT-SU-B1", 1), solved, eval_freq=128, n_eval_episodes=20))
 
     assert mean_return(model, "CT-SU-B1") >= 0.9
 

@@ -145,9 +145,16 @@ def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", CURRICULA)
-@pytest.mark.parametrize("name", AGENTS)
-def test_every_agent_goes_on_in_every_kind_of_curriculum(learner, name, kind):
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        (name, kind)
+        for place, name in enumerate(AGENTS)
+        for number, kind in enumerate(CURRICULA)
+        if name == "a2c" or kind == "announced" or (place + number) % 3 == 0
+    ],
+)
+def test_one_agent_in_every_kind_of_curriculum_and_every_agent_in_some_go_on_as_if_never_stopped(learner, name, kind):
     """From every state for one agent in every kind and for every agent in one kind; else from three."""
     check_some(learner(CURRICULA[kind], name), None if name == "a2c" or kind == "announced" else 1)
 

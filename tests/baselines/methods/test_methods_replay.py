@@ -333,7 +333,9 @@ def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(co
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "backend"), [*((name, "eager") for name in COMPILED), ("mask_ri", "inductor")])
+@pytest.mark.parametrize(
+    ("name", "backend"), [*((name, "eager") for name in ("cka_rl", "ewc", "packnet")), ("mask_lc", "inductor")]
+)
 def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, compile_by, name, backend):
     compile_by(backend)
     whole, resumed = (with_method(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
@@ -369,7 +371,7 @@ def test_tasks_and_agents_of_one_structure_share_a_compiled_step(compose, compil
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in COMPILED if name not in ("cka_rl", "mask_amsc")])  # 30 seconds each
+@pytest.mark.parametrize("name", ["clear", "ewc", "mask_lc"])  # up to 30 seconds each
 def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(compose, name):
     eager, compiled = two_tasks(compose, name), two_tasks(compose, name, "agent.compile=true")
 
