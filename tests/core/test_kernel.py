@@ -39,19 +39,32 @@ def test_the_kernel_is_compiled_once_into_a_folder_that_is_the_users_alone(own_c
     assert made.suffix == ".so" and own_cache.stat().st_mode & 0o777 == 0o700
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> bytes:
+    """The library, compiled once."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        cache = tmp_path_factory.mktemp("cache")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+        library.library.cache_clear()
+        library.library()
+    library.library.cache_clear()
+    (path,) = (cache / "ctgraph_rl").iterdir()
+    return path.read_bytes()
+
+
 @pytest.fixture
-def loaded(own_cache, monkeypatch) -> Path:
+def loaded(sound, own_cache, monkeypatch) -> Path:
     """The library, of which a changed copy fails the test instead of ending the process by SIGBUS when it is loaded."""
+    monkeypatch.setattr(library, "_compile", lambda source, compiler, made: made.write_bytes(sound))
     library.library()
     (path,) = own_cache.iterdir()
-    sound, load = path.read_bytes(), library.ctypes.CDLL
+    load = library.ctypes.CDLL
 
     def checked(name: str) -> object:
         assert Path(name).read_bytes() == sound, "a changed library was loaded"
         return load(name)
 
     monkeypatch.setattr(library.ctypes, "CDLL", checked)
-    monkeypatch.setattr(library, "_compile", lambda source, compiler, made: made.write_bytes(sound))
     library.library.cache_clear()
     return path
 
