@@ -6,7 +6,7 @@ import comparison
 from raw import Raw, groups, mean_of, read, table
 
 COLUMNS = ("tasks learned", "known at the end")
-RUN_WITH_BOTH = ("masks_ct8_md", "masks_ct8")
+RUN_WITH_BOTH = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 
 
 def eight(name: str) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import combinations
+
 import comparison
-import pairs
 import torch
 from raw import groups, read
 
@@ -76,37 +78,26 @@ class Table:
         transfer = (self.gain("mask_lc") / (1 - self.alone)).mean(0)
         return transfer[2:].mean().item(), transfer[[0, 2, 3, 4, 5, 6, 7]].mean().item()
 
-    def claims_hold_of_the_means(self) -> bool:
-        """Whether masks know more at the end than others, and combinations have more while learning than new masks."""
-        known = {method: self.known(method).double().mean() for method in METHODS}
-        learning = {method: self.areas(method).mean() for method in METHODS[2:]}
-        better = min(known[mask] for mask in METHODS[2:]) > max(known[other] for other in METHODS[:2])
-        return bool(better) and all(learning[mask] > learning["mask_ri"] for mask in ("mask_lc", "mask_blc"))
+    def mean_areas(self, methods: Sequence[str]) -> dict[str, float]:
+        """The mean return of each method over all blocks."""
+        return {method: self.areas(method).mean().item() for method in methods}
+
+    def pairs_of_areas(self, methods: Sequence[str]) -> dict[tuple[str, str], float]:
+        """The p-values of all pairs of methods by the mean return over all blocks, corrected for all of them."""
+        of = {method: self.areas(method).mean(1) for method in methods}
+        pairs = list(combinations(methods, 2))
+        corrected = statistics.holm([self.p_value(of[one], of[other]) for one, other in pairs])
+        return dict(zip(pairs, corrected, strict=True))
 
     @staticmethod
     def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
         """The p-value of the paired test of two methods, a number for each seed."""
         return statistics.compare(first.tolist(), second.tolist()).p_value
 
-    @staticmethod
-    def clear_pairs() -> int:
-        """How many differences that the paper claims are distinguishable over the pairs of the three curricula."""
-        corrected = statistics.holm([each.p_value for each in pairs.claims().values()])
-        return sum(p is not None and p <= 0.05 for p in corrected)
-
-    def beyond_beginnings(self) -> list[set[str]]:
-        """What fine-tuning on CT12 has at the end of each block of a goal of depth 3 beyond it and its beginning.
-
-        Raises:
-            ValueError: if it has not both.
-        """
-        more = []
-        for place, goal in enumerate(self.goals):
-            for known in self.names(self.ends("finetune")[:, place]) if len(goal) == 3 else []:
-                if not {goal, goal[:2]} <= known:
-                    raise ValueError(f"{goal} without itself or its beginning: {known}")
-                more.append(known - {goal, goal[:2]})
-        return more
+    def blocks_of_depth_3(self) -> list[tuple[str, set[str]]]:
+        """The goal of each block of depth 3 of fine-tuning on CT12, and all goals that it has at the end of it."""
+        places = [place for place, goal in enumerate(self.goals) if len(goal) == 3]
+        return [(self.goals[j], known) for j in places for known in self.names(self.ends("finetune")[:, j])]
 
 
 class ByAgent:

@@ -68,7 +68,9 @@ def test_the_draws_of_the_evaluation_have_their_error(make):
 def test_a_threshold_does_not_hang_on_the_last_bit(make):
     comparison = sys.modules["comparison"]
     experts = [
-        lines for (who, _), lines in make.groups(make.read("masks_ct12"), "method", "seed").items() if who == "expert"
+        lines
+        for (who, _), lines in make.groups(make.read("epochs/masks_ct12"), "method", "seed").items()
+        if who == "expert"
     ]
 
     areas = 1 - comparison.expert_areas(experts).mean(0)
