@@ -224,9 +224,9 @@ class Sweeper(Base):
         assert self.hydra_context is not None
         key = parsed.key_or_group
         plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(parsed.value(), dict)
-        may_choose_a_file = "." not in key  # which is slow to find out
-        is_file = may_choose_a_file and self.hydra_context.config_loader.get_group_options(key)
-        return plain and not is_file and not key.startswith("hydra")
+        may_be_group = "." not in key  # asking Hydra is slow
+        is_file = key.startswith("hydra") or (may_be_group and self.hydra_context.config_loader.get_group_options(key))
+        return plain and not is_file
 
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
         """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.

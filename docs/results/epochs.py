@@ -6,7 +6,6 @@ import comparison
 from raw import Raw, groups, mean_of, read, table
 
 COLUMNS = ("tasks learned", "known at the end")
-RUN_WITH_BOTH = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 
 
 def eight(name: str) -> str:
@@ -34,4 +33,4 @@ def _cell(lines: Raw, column: str) -> str:
 
 def tables() -> dict[str, str]:
     """What the template of the page names."""
-    return {f"{name}_epochs": by_epochs(name) for name in RUN_WITH_BOTH}
+    return {f"{name}_epochs": by_epochs(name) for name in comparison.MASKS}

@@ -304,7 +304,7 @@ def lifelong_page() -> str:
     """The page of the methods: its template with its tables."""
     template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
     found = comparison.tables() | pairs.tables() | epochs.tables()
-    read_here = (*comparison.EXPERIMENTS, *map(epochs.eight, epochs.RUN_WITH_BOTH))
+    read_here = (*comparison.EXPERIMENTS, *map(epochs.eight, comparison.MASKS))
     return template.substitute(found, machines=machines(*read_here))
 
 

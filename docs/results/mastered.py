@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import combinations
 
 import comparison
@@ -78,14 +77,14 @@ class Table:
         transfer = (self.gain("mask_lc") / (1 - self.alone)).mean(0)
         return transfer[2:].mean().item(), transfer[[0, 2, 3, 4, 5, 6, 7]].mean().item()
 
-    def mean_areas(self, methods: Sequence[str]) -> dict[str, float]:
+    def mean_areas(self) -> dict[str, float]:
         """The mean return of each method over all blocks."""
-        return {method: self.areas(method).mean().item() for method in methods}
+        return {method: self.areas(method).mean().item() for method in METHODS}
 
-    def pairs_of_areas(self, methods: Sequence[str]) -> dict[tuple[str, str], float]:
+    def pairs_of_areas(self) -> dict[tuple[str, str], float]:
         """The p-values of all pairs of methods by the mean return over all blocks, corrected for all of them."""
-        of = {method: self.areas(method).mean(1) for method in methods}
-        pairs = list(combinations(methods, 2))
+        of = {method: self.areas(method).mean(1) for method in METHODS}
+        pairs = list(combinations(METHODS, 2))
         corrected = statistics.holm([self.p_value(of[one], of[other]) for one, other in pairs])
         return dict(zip(pairs, corrected, strict=True))
 

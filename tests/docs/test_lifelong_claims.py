@@ -186,9 +186,9 @@ def _(t):
     by the mean return over all blocks, Mask BLC, with 0.96, is better than each of the others (p < 0.03,
     corrected for all ten pairs), and no other two are distinguishable; Mask RI has 0.87, Mask LC 0.83, PPO alone
     0.82 and EWC 0.78."""
-    corrected = t.pairs_of_areas(METHODS)
+    corrected = t.pairs_of_areas()
     with_blc, others = ([p for pair, p in corrected.items() if ("mask_blc" in pair) == has] for has in (True, False))
-    shown = [f"{t.mean_areas(METHODS)[method]:.2f}" for method in ("mask_blc", "mask_ri", "mask_lc", *METHODS[:2])]
+    shown = [f"{t.mean_areas()[method]:.2f}" for method in ("mask_blc", "mask_ri", "mask_lc", *METHODS[:2])]
     return max(with_blc) < 0.03 and min(others) > 0.05 and shown == ["0.96", "0.87", "0.83", "0.82", "0.78"]
 
 
@@ -254,17 +254,17 @@ def _(t):
 def _(t):
     """The second holds of Mask BLC again: by the mean return over all blocks, Mask BLC, with 0.99, is better than each
     of the others (p < 0.02, corrected for all ten pairs)."""
-    means = t.mean_areas(METHODS)
+    means = t.mean_areas()
     best = max(means, key=means.get) == "mask_blc" and f"{means['mask_blc']:.2f}" == "0.99"
-    return best and max(p for pair, p in t.pairs_of_areas(METHODS).items() if "mask_blc" in pair) < 0.02
+    return best and max(p for pair, p in t.pairs_of_areas().items() if "mask_blc" in pair) < 0.02
 
 
 @reads("masks_ct12")
 def _(t):
     """Mask RI has 0.91, Mask LC 0.89, EWC 0.88 and PPO alone 0.79; Mask RI and Mask LC are better than PPO alone (p <
     0.03), and no other two are distinguishable. The experts have 0.85."""
-    shown = [f"{t.mean_areas(METHODS)[m]:.2f}" for m in ("mask_ri", "mask_lc", "ewc_published", "finetune")]
-    others = {pair: p for pair, p in t.pairs_of_areas(METHODS).items() if "mask_blc" not in pair}
+    shown = [f"{t.mean_areas()[m]:.2f}" for m in ("mask_ri", "mask_lc", "ewc_published", "finetune")]
+    others = {pair: p for pair, p in t.pairs_of_areas().items() if "mask_blc" not in pair}
     clear = {pair: p for pair, p in others.items() if p <= 0.05}
     better = {("finetune", "mask_lc"), ("finetune", "mask_ri")}
     shown.append(f"{t.alone.mean():.2f}")

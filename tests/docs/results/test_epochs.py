@@ -23,7 +23,7 @@ def measured():
         monkeypatch.syspath_prepend(str(FOLDER))
         epochs, comparison, pairs = (__import__(name) for name in ("epochs", "comparison", "pairs"))
         found = {}
-        for table in epochs.RUN_WITH_BOTH:
+        for table in comparison.MASKS:
             for num, name in ((8, epochs.eight(table)), (1, table)):
                 for (method, _), lines in comparison.groups(comparison.read(name), "method", "seed").items():
                     if method in METHODS:
