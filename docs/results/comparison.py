@@ -32,8 +32,8 @@ MASKS = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 """The published comparison on its three curricula."""
 
 EXPERIMENTS = (*MASKS, "methods")
-RERUN = tuple(f"rerun/{name}" for name in EXPERIMENTS)
-"""Raw results of the rerun with more seeds, until all of it is there."""
+MORE_SEEDS = {"methods": {"ppo": 20}}
+"""Agents that were run with more seeds than their experiment sweeps, and how many."""
 
 CONF = HERE.parent.parent / "conf" / "experiment"
 SOLVED = 0.9
@@ -249,6 +249,13 @@ def expected(name: str) -> dict[str, list[str]]:
     return {key: _choices(str(value)) for key, value in params.items()}
 
 
+def cells_of(name: str) -> dict[tuple[str, ...], None]:
+    """The cells of an experiment and those with `MORE_SEEDS`: their values of what it sweeps, in order."""
+    swept = expected(name)
+    more = [{"agent": [agent], "seed": _choices(f"range({n})")} for agent, n in MORE_SEEDS.get(name, {}).items()]
+    return dict.fromkeys(cell for axes in ({}, *more) for cell in product(*(swept | axes).values()))
+
+
 def curricula_of(name: str) -> list[str]:
     """The curricula of an experiment: those that it sweeps, or the one that it chooses."""
     defaults = OmegaConf.load(CONF / f"{Path(name).name}.yaml").get("defaults", [])
@@ -265,16 +272,16 @@ def _choices(text: str) -> list[str]:
 
 def missing(name: str) -> str:
     """Which cells of an experiment have no raw results."""
-    swept = expected(name)
+    swept, wanted = expected(name), cells_of(name)
     there = set(groups(read(name), *swept))
-    lacking = [cell for cell in product(*swept.values()) if cell not in there]
+    lacking = [cell for cell in wanted if cell not in there]
     if not lacking:
         return "All cells were run."
     place = list(swept).index("seed")
     by_seed: dict[tuple[str, ...], list[str]] = {}
     for cell in lacking:
         by_seed.setdefault(cell[:place] + cell[place + 1 :], []).append(cell[place])
-    count = f"Not run yet: {len(lacking)} of {len(list(product(*swept.values())))} cells"
+    count = f"Not run yet: {len(lacking)} of {len(wanted)} cells"
     cells = "; ".join(f"{' '.join(cell)} (seeds {', '.join(seeds)})" for cell, seeds in by_seed.items())
     return f"{count}." if len(by_seed) > MOST_NAMED else f"{count}, {cells}."
 

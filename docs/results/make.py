@@ -339,8 +339,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     collecting = commands.add_parser("collect", help="raw results from runs")
-    compared = (*comparison.EXPERIMENTS, *comparison.RERUN)
-    names = ("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME, REWARDS_MET, *compared)
+    names = ("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME, REWARDS_MET, *comparison.EXPERIMENTS)
     collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
     collecting.add_argument("runs", type=Path, help="folder with runs")
     options = parser.parse_args()
@@ -348,7 +347,7 @@ def main() -> None:
         of = {
             "main_job": lambda name, runs: collect_main_job(runs),
             search.NAME: lambda name, runs: write(name, search.collect(runs)),
-            **dict.fromkeys(compared, comparison.collect),
+            **dict.fromkeys(comparison.EXPERIMENTS, comparison.collect),
         }
         try:
             of.get(options.name, collect)(options.name, options.runs)

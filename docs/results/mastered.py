@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import comparison
+import pairs
 import torch
 from raw import groups, read
 
@@ -107,9 +108,10 @@ class ByAgent:
         self.swept = comparison.expected("methods")
 
     def runs(self, axis: str, method: str, agent: str) -> list[Curves]:
-        """Runs of one cell."""
+        """Runs of one cell, in the order of their seeds."""
         cell = (f"fo_b1_{axis}", method, agent)
-        return [comparison.curves(lines) for key, lines in self.of.items() if key[:3] == cell]
+        found = {int(key[3]): lines for key, lines in self.of.items() if key[:3] == cell}
+        return [comparison.curves(lines) for _, lines in sorted(found.items())]
 
     def known(self, axis: str, method: str, agent: str) -> torch.Tensor:
         """bool [seeds, tasks]: what is mastered at the end."""
@@ -118,3 +120,7 @@ class ByAgent:
     def own(self, axis: str, method: str, agent: str) -> torch.Tensor:
         """bool [seeds, tasks]: what is mastered at the end of its block."""
         return torch.stack([run.ends[1:].diagonal() >= MASTERED for run in self.runs(axis, method, agent)])
+
+    def against_finetuning(self, agent: str) -> dict[str, statistics.Comparison]:
+        """Each method against fine-tuning with one agent on each curriculum."""
+        return pairs.against_finetuning([agent])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.oracles import fully_observable
+from helpers.small_agents import same
 from helpers.task_families import EVERY_KIND, batch, likely
-from helpers.with_methods import same
 from tensordict import TensorDict
 
 from ctgraph_rl import CTGraphEnv

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections import Counter
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
+from helpers.claims import Claims, readings, sentences
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl.metrics import MASTERED
@@ -18,18 +16,7 @@ from ctgraph_rl.report import statistics
 PAGE = CHECKOUT / "docs" / "results" / "lifelong.md"
 MASKS = ("mask_lc", "mask_ri", "mask_blc")
 METHODS = ("finetune", "ewc_published", *MASKS)
-CLAIMS: dict[str, dict[str, Callable[[Any], Any]]] = {}
-"""For each table, whether the sentences that read it hold of it."""
-
-
-def reads(table: str) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
-    """Make a claim of a function whose docstring is a sentence of the page, or some."""
-
-    def listed(holds: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        CLAIMS.setdefault(table, {})[" ".join((holds.__doc__ or "").split())] = holds
-        return holds
-
-    return listed
+reads = Claims()
 
 
 @reads("masks_ct8_md")
@@ -288,75 +275,6 @@ def _(t):
     return all((gain <= 0.02 + 1e-12) if len(goal) == 2 else (gain > 0.05 + 1e-12) for goal, gain in left.items())
 
 
-@reads("methods")
-def _(t):
-    """Between goals, and between image sets, there is nothing to transfer and much to forget: fine-tuning keeps
-    about one task of four, apart from LSTM-PPO on images; networks of a task's own (`scratch`, `mask_ri`)
-    keep all, and so, but for single seeds, does PPO with any method other than CLEAR."""
-    return (
-        all(
-            0.15 <= t.known(axis, "finetune", agent).double().mean() <= 0.35
-            for axis in ("4tasks", "4images")
-            for agent in t.swept["agent"]
-            if (axis, agent) != ("4images", "lstm_ppo")
-        )
-        and all(
-            t.known(axis, method, agent).all()
-            for axis in ("4tasks", "4images")
-            for method in ("scratch", "mask_ri")
-            for agent in t.swept["agent"]
-        )
-        and all(
-            (~t.known(axis, method, "ppo").all(1)).sum() <= 1
-            for axis in ("4tasks", "4images")
-            for method in t.swept["method"]
-            if method not in ("finetune", "clear")
-        )
-    )
-
-
-@reads("methods")
-def _(t):
-    """CLEAR, which needs neither ids nor boundaries, keeps most images and, but for A2C, about three goals of four."""
-    return min(t.known("4images", "clear", agent).double().mean() for agent in t.swept["agent"]) >= 0.7 and {
-        agent: 0.7 <= t.known("4tasks", "clear", agent).double().mean() <= 0.8 for agent in t.swept["agent"]
-    } == {"ppo": True, "a2c": False, "dqn": True, "lstm_ppo": True}
-
-
-@reads("methods")
-def _(t):
-    """A2C learns later tasks poorly where weights are held: the methods' strengths were chosen for PPO."""
-    return all(
-        t.own(axis, method, "a2c")[:, 2:].sum(0).max() <= 2
-        for axis in ("4tasks", "4images")
-        for method in ("l2", "ewc", "si", "mas", "packnet")
-    )
-
-
-@reads("methods")
-def _(t):
-    """Growing depth turns this round: depth 5 is found by what depth 2 to 4 taught, so what shares nothing between
-    tasks stops before it (39 of the 40 runs with `scratch` and `mask_ri`), and so does `l2`, which holds all
-    weights alike."""
-    return sum(
-        int((~t.own("depth2to5", method, agent)[:, -1]).sum())
-        for method in ("scratch", "mask_ri")
-        for agent in t.swept["agent"]
-    ) == 39 and not any(t.own("depth2to5", "l2", agent)[:, -1].any() for agent in t.swept["agent"])
-
-
-@reads("methods")
-def _(t):
-    """CLEAR, which holds behaviour and no weights, solves all four depths with every agent in every seed."""
-    return all(t.known("depth2to5", "clear", agent).all() for agent in t.swept["agent"])
-
-
-@reads("methods")
-def _(t):
-    """PPO does so without any method, the other agents in some seeds."""
-    return [int(t.known("depth2to5", "finetune", agent).all(1).sum()) for agent in t.swept["agent"]] == [5, 4, 1, 2]
-
-
 NO_DATA = {
     "The goals are nested and their trees share images: at each image that two of `00`, `000`, `0000` and `00000` "
     "share, the same actions are best (`ctgraph_rl.tasks.similarity.observation_agreement` is 1).",  # tests/tasks
@@ -376,23 +294,17 @@ def tables():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
         mastered = __import__("mastered")
-        yield {name: mastered.ByAgent() if name == "methods" else mastered.Table(name) for name in CLAIMS}
+        yield {name: mastered.Table(name) for name in reads.of}
         for name in ("mastered", "pairs", "comparison", "raw"):
             sys.modules.pop(name, None)
 
 
-def sentences(text: str) -> list[str]:
-    return re.split(r"(?<=\.)\s+(?=[A-Z(])|(?<=\.\))\s+", " ".join(text.split()))
-
-
-@pytest.mark.parametrize(("table", "sentence"), [(table, each) for table, claims in CLAIMS.items() for each in claims])
+@pytest.mark.parametrize(("table", "sentence"), reads.each())
 def test_what_is_read_from_a_table_holds_of_its_raw_results(tables, table, sentence):
-    assert CLAIMS[table][sentence](tables[table])
+    assert reads.of[table][sentence](tables[table])
 
 
 def test_every_sentence_of_the_readings_is_tested():
-    """Of those from "What came out." to the next figure."""
-    readings = re.findall(r"\*\*What came out\.\*\* (.*?)\n!\[", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    claimed = [sentence for claims in CLAIMS.values() for text in claims for sentence in sentences(text)]
+    masks = PAGE.read_text(encoding="utf-8").split("## Methods, agents and what changes between tasks")[0]
 
-    assert sorted(sentences(" ".join(readings))) == sorted([*claimed, *NO_DATA])
+    assert sorted(sentences(" ".join(readings(masks)))) == sorted([*reads.sentences(), *NO_DATA])

@@ -55,7 +55,7 @@ def test_five_runs_that_all_know_everything_leave_half_open(make):
     page = make.LIFELONG.read_text(encoding="utf-8").split("| fo_b1_4tasks |")[1].split("\n\n")[0]
 
     (row,) = [line for line in page.splitlines() if line.startswith("| `mask_lc` |")]
-    assert row.split("|")[2].strip() == "1.00 [0.48, 1]; 0.00 [-0.39, 0.39]"
+    assert row.split("|")[4].strip() == "1.00 [0.48, 1]; 0.00 [-0.39, 0.39]"
 
 
 def test_the_draws_of_the_evaluation_have_their_error(make):

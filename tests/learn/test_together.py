@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
-from helpers.small_agents import KINDS, TINY, saved_and_loaded
+from helpers.small_agents import BATCHED, TINY, saved_and_loaded
 
 from baselines import together
 from baselines.learner import total_loss
@@ -62,10 +62,10 @@ class Together(NamedTuple):
 
 @pytest.fixture
 def make(compose):
-    """Makes a `Together` of an agent's name in `KINDS`, a method and more settings."""
+    """Makes a `Together` of an agent's name in `BATCHED`, a method and more settings."""
 
     def make(name: str = "a2c", method: str = "finetune", *overrides: str, curriculum=CURRICULUM) -> Together:
-        settings = [*TINY, *KINDS[name], *overrides]
+        settings = [*TINY, *BATCHED[name], *overrides]
         cfg = compose(f"agent={name.removeprefix('prioritized ')}", f"method={method}", *settings)
         make_agent = with_method(target(cfg, "agent"), target(cfg, "method"), curriculum)
         return Together(make_agent, curriculum)
@@ -106,7 +106,9 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
     assert any(not torch.equal(one["observation"], other["observation"]) for one, other in pairs)
 
 
-@pytest.mark.parametrize(("name", "method"), [*((name, "finetune") for name in KINDS), *(("ppo", m) for m in METHODS)])
+@pytest.mark.parametrize(
+    ("name", "method"), [*((name, "finetune") for name in BATCHED), *(("ppo", m) for m in METHODS)]
+)
 def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
     make, monkeypatch, name, method
 ):
@@ -169,7 +171,7 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     [
         ("a2c", "finetune"),
         ("ppo", "mask_lc"),
-        *(pytest.param(name, "finetune", marks=pytest.mark.slow) for name in KINDS if name != "a2c"),
+        *(pytest.param(name, "finetune", marks=pytest.mark.slow) for name in BATCHED if name != "a2c"),
         *(pytest.param("ppo", method, marks=pytest.mark.slow) for method in METHODS if method != "mask_lc"),
     ],
 )

@@ -89,6 +89,14 @@ def test_what_was_not_run_is_named_by_method_and_seed(comparison, monkeypatch):
     assert comparison.missing("x") == "Not run yet: 4 of 6 cells, a (seeds 0, 2); b (seeds 0, 1)."
 
 
+def test_further_seeds_of_an_agent_are_cells_of_its_experiment(comparison, monkeypatch):
+    monkeypatch.setattr(comparison, "expected", lambda name: {"agent": ["a", "b"], "seed": ["0"]})
+    monkeypatch.setattr(comparison, "MORE_SEEDS", {"x": {"b": 3}})
+    monkeypatch.setattr(comparison, "read", lambda name: [{"agent": "a", "seed": "0"}, {"agent": "b", "seed": "1"}])
+
+    assert comparison.missing("x") == "Not run yet: 2 of 4 cells, b (seeds 0, 2)."
+
+
 def write_run(folder, num_frames, fingerprint="f"):
     folder.mkdir(parents=True)
     (folder / "metrics.json").write_text("{}")

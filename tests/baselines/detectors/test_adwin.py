@@ -10,8 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.scripted import ONE, of
-from helpers.small_agents import MINIBATCHES, TINY
-from helpers.with_methods import made
+from helpers.small_agents import MINIBATCHES, TINY, made
 
 from baselines.catalogue import catalogue
 from baselines.detectors.adwin import ADWIN, Returns, bound

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.scripted import TWO
-from helpers.small_agents import batches
-from helpers.with_methods import CURRICULUM, RATE, Tiny, same, seen, small, stay, weights_for, with_method
+from helpers.small_agents import CURRICULUM, RATE, Tiny, batches, same, seen, small, stay, weights_for, with_method
 from torch import Tensor
 from torch.testing import assert_close
 

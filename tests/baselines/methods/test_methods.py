@@ -11,8 +11,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, Scripted, of
-from helpers.small_agents import MINIBATCHES, REPLAY, TINY, saved_and_loaded
-from helpers.with_methods import made, weights_for
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, made, saved_and_loaded, weights_for
 
 from baselines.methods.importance import Samples
 from baselines.methods.method import Method, TaskMethod

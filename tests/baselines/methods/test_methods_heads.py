@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO
-from helpers.with_methods import stay, tiny, weights_for, with_method
+from helpers.small_agents import stay, tiny, weights_for, with_method
 
 from baselines.methods.ewc import EWC
 from baselines.methods.l2 import L2

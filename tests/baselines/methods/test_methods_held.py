@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.scripted import ONE
-from helpers.small_agents import batches
-from helpers.with_methods import RATE, TASKS, Tiny, seen, tiny, with_method
+from helpers.small_agents import RATE, TASKS, Tiny, batches, seen, tiny, with_method
 from tensordict import TensorDict
 from torch import Tensor
 

@@ -8,8 +8,20 @@ from typing import Any
 import pytest
 import torch
 from helpers.scripted import ONE, TWO
-from helpers.small_agents import GREEDY, batches
-from helpers.with_methods import CURRICULUM, RATE, TASKS, Tiny, same, seen, small, stay, weights_for, with_method
+from helpers.small_agents import (
+    CURRICULUM,
+    GREEDY,
+    RATE,
+    TASKS,
+    Tiny,
+    batches,
+    same,
+    seen,
+    small,
+    stay,
+    weights_for,
+    with_method,
+)
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import set_exploration_type

@@ -7,8 +7,7 @@ from copy import deepcopy
 import pytest
 import torch
 from helpers.scripted import ONE, THREE
-from helpers.small_agents import batches
-from helpers.with_methods import TASKS, same, small, stay, weights_for, with_method
+from helpers.small_agents import TASKS, batches, same, small, stay, weights_for, with_method
 
 from baselines.methods.method import AgentWithMethod
 from baselines.methods.packnet import FREE, PackNet

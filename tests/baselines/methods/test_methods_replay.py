@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.scripted import ONE, THREE, TWO, of
-from helpers.small_agents import batches, saved_and_loaded
-from helpers.with_methods import TASKS, same, small, stay, weights_for, with_method
+from helpers.small_agents import TASKS, batches, same, saved_and_loaded, small, stay, weights_for, with_method
 from torch import Tensor
 
 from baselines.learner import functional_gradient_step

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.scripted import ONE, TWO
-from helpers.small_agents import batches
-from helpers.with_methods import CURRICULUM, TASKS, Tiny, same, seen, stay, weights_for, with_method
+from helpers.small_agents import CURRICULUM, TASKS, Tiny, batches, same, seen, stay, weights_for, with_method
 from tensordict import TensorDict
 from torch.testing import assert_close
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, TWO, of
-from helpers.small_agents import TINY
-from helpers.with_methods import made
+from helpers.small_agents import TINY, made
 from torch import nn
 
 from baselines.catalogue import catalogue

@@ -11,9 +11,8 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, TWO, of
-from helpers.small_agents import MINIBATCHES, REPLAY, TINY, batches, saved_and_loaded
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, batches, made, saved_and_loaded, weights_for
 from helpers.sweeping import command_line
-from helpers.with_methods import made, weights_for
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
