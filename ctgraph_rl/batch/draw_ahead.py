@@ -53,7 +53,8 @@ class Draws:
         return self._at(tick + ahead, tick)
 
     def _at(self, tick: Tensor, present: Tensor) -> Words:
-        if not self._draws_ahead:
+        if not self._draws_ahead or torch.compiler.is_compiling():  # compiled: the step makes its own draws
+            self._left = 0
             return dynamics.words_of(tick, self._params, self._uses)
         if self._left == 0:
             self._draw(present)

@@ -9,6 +9,7 @@ from helpers.task_families import FAMILIES, MIXED
 from torchrl.envs import StepCounter, TransformedEnv
 
 from ctgraph_rl import CTGraphEnv, Rows, Steps, Task, rollout
+from ctgraph_rl.batch.draw_ahead import MAX_TICKS
 from ctgraph_rl.core import philox
 
 every_engine = pytest.mark.parametrize("kernel", ["off", "required"])
@@ -75,17 +76,26 @@ def test_compiled_draws_are_the_same_words(num_rows, options):
 
 
 @pytest.mark.slow
-def test_the_compiled_environment_gives_the_same_bits():
+@pytest.mark.parametrize(("kernel", "num_graphs"), [("off", 1), ("auto", 2)])  # another for the step after the kernel
+def test_the_compiled_environment_gives_the_same_bits_by_few_graphs_and_afterwards_without_them(kernel, num_graphs):
     """Captured and traced; tests/core compiles a step of everything to machine code."""
-    tasks = FAMILIES["confounding"]
-    eager, compiled = (CTGraphEnv(rows_of(tasks), check_actions=False) for _ in range(2))
-    compiled.compile(warmup=2, backend="aot_eager")
-    actions = actions_of(tasks)
+    tasks, graphs = FAMILIES["confounding"], []
+
+    def traced(graph, inputs):
+        graphs.append(graph)
+        return torch._dynamo.lookup_backend("aot_eager")(graph, inputs)
+
+    eager, compiled = (CTGraphEnv(rows_of(tasks), check_actions=False, kernel=kernel) for _ in range(2))
+    compiled.compile(warmup=2, backend=traced)
+    more_than_draws_ahead = actions_of(tasks, MAX_TICKS + 50)
 
     with torch.no_grad():
-        data, other = record(eager, actions), record(compiled, actions)
+        data, other = record(eager, more_than_draws_ahead), record(compiled, more_than_draws_ahead)
+        with torch.compiler.set_stance("force_eager"):
+            last = [record(env, actions_of(tasks, 10)) for env in (eager, compiled)]
 
-    assert (data == other).all()
+    assert (data == other).all() and (last[0] == last[1]).all()
+    assert len(graphs) == num_graphs
 
 
 @every_engine
