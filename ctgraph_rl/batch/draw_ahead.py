@@ -18,6 +18,8 @@ MAX_TICKS = 256
 class Draws:
     """The draws of rows, see `dynamics.Words`, for the ticks that they are at and those that follow.
 
+    A step that is compiled makes its own draws: a table would need another graph for each tick of it.
+
     Args:
         params: the rows' parameters.
         uses: what the rows have use for.

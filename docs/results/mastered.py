@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import comparison
@@ -124,3 +125,8 @@ class ByAgent:
     def against_finetuning(self, agent: str) -> dict[str, statistics.Comparison]:
         """Each method against fine-tuning with one agent on each curriculum."""
         return pairs.against_finetuning([agent])
+
+    def keeps_and_finds(self, methods: Sequence[str]) -> tuple[bool, list[int]]:
+        """Whether PPO with each method keeps all depths that it learned, and in how many seeds it learns the last."""
+        own, known = ([of("depth2to5", method, "ppo") for method in methods] for of in (self.own, self.known))
+        return all(map(torch.equal, own, known)), [int(each[:, -1].sum()) for each in own]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import sys
 
 import pytest
-import torch
 from helpers.claims import Claims, readings, sentences
 from helpers.paths import CHECKOUT
 
 from ctgraph_rl.report import statistics
 
 PAGE = CHECKOUT / "docs" / "results" / "lifelong.md"
-FINDS_DEPTH_5 = {"ewc": 13, "mask_lc": 10, "mask_blc": 7, "mas": 5, "packnet": 3, "si": 2}
 reads = Claims()
 
 
@@ -29,27 +28,17 @@ def _(t):
 @reads("methods")
 def _(t):
     """Between goals, and between image sets, there is nothing to transfer and much to forget: fine-tuning keeps
-    about one task of four, apart from LSTM-PPO on images; networks of a task's own (`scratch`, `mask_ri`)
-    keep all, and so, but for at most two seeds of twenty, does PPO with any method other than CLEAR."""
+    about one task of four, mostly the last, apart from LSTM-PPO on images; networks of a task's own
+    (`scratch`, `mask_ri`) end with all four tasks, and so does PPO with each method other than CLEAR in at least 18
+    of 20 seeds on each curriculum."""
+    cells = [(axis, agent) for axis in ("4tasks", "4images") for agent in t.swept["agent"]]
+    kept = [t.known(axis, "finetune", agent) for axis, agent in cells if (axis, agent) != ("4images", "lstm_ppo")]
+    others = [method for method in t.swept["method"] if method not in ("finetune", "clear")]
+    of_ppo = [int(t.known(axis, method, "ppo").all(1).sum()) for axis in ("4tasks", "4images") for method in others]
     return (
-        all(
-            0.15 <= t.known(axis, "finetune", agent).double().mean() <= 0.35
-            for axis in ("4tasks", "4images")
-            for agent in t.swept["agent"]
-            if (axis, agent) != ("4images", "lstm_ppo")
-        )
-        and all(
-            t.known(axis, method, agent).all()
-            for axis in ("4tasks", "4images")
-            for method in ("scratch", "mask_ri")
-            for agent in t.swept["agent"]
-        )
-        and all(
-            (~t.known(axis, method, "ppo").all(1)).sum() <= 2
-            for axis in ("4tasks", "4images")
-            for method in t.swept["method"]
-            if method not in ("finetune", "clear")
-        )
+        all(0.15 <= known.double().mean() <= 0.35 and 2 * known[:, 3].sum() > known.sum() for known in kept)
+        and all(t.known(axis, method, agent).all() for axis, agent in cells for method in ("scratch", "mask_ri"))
+        and min(of_ppo) == 18
     )
 
 
@@ -63,17 +52,17 @@ def _(t):
 
 @reads("methods")
 def _(t):
-    """A2C learns later tasks poorly where weights are held: the methods' strengths were chosen for PPO."""
-    return all(
-        t.own(axis, method, "a2c")[:, 2:].sum(0).max() <= 2
-        for axis in ("4tasks", "4images")
-        for method in ("l2", "ewc", "si", "mas", "packnet")
-    )
+    """Between goals A2C learns the third and the fourth task poorly, with methods that hold weights and without a
+    method, and always with networks of a task's own."""
+    learned = {method: t.own("4tasks", method, "a2c")[:, 2:].double().mean() for method in t.swept["method"]}
+    poorly = max(learned[method] for method in ("finetune", "l2", "ewc", "si", "mas", "packnet"))
+    return poorly <= 0.4 and learned["scratch"] == learned["mask_ri"] == 1
 
 
 @reads("methods")
 def _(t):
-    """Growing depth turns this round: depth 5 is found by what depth 2 to 4 taught, so what shares nothing between
+    """With growing depth there is much to transfer, and less to forget: depth 5 is found by what depth 2 to
+    4 taught, so what shares nothing between
     tasks stops before it (69 of the 70 runs with `scratch` and `mask_ri`), and so does `l2`, which holds all
     weights alike."""
     return sum(
@@ -97,35 +86,54 @@ def _(t):
 
 @reads("methods")
 def _(t):
-    """Where PPO alone does not find depth 5, it ends without depth 4, too, and in four seeds of six with nothing."""
+    """In four of the six other seeds PPO alone ends with no task solved, in two with depth 2 and 3."""
     known = t.known("depth2to5", "finetune", "ppo")
-    others = known[~t.own("depth2to5", "finetune", "ppo")[:, 3]]
-    return not others[:, 2:].any() and (len(others), int((~others.any(1)).sum())) == (6, 4)
+    others = known[~known.all(1)].tolist()
+    return sorted(others) == 4 * [[False] * 4] + 2 * [[True, True, False, False]]
 
 
 @reads("methods")
 def _(t):
-    """The methods that hold weights keep all that PPO learned, but it finds depth 5 in fewer seeds: in 13 with EWC, ten
-    with Mask LC, seven with Mask BLC, five with MAS, three with PackNet and two with SI."""
-    found = {method: t.own("depth2to5", method, "ppo") for method in FINDS_DEPTH_5}
-    kept = all(torch.equal(own, t.known("depth2to5", method, "ppo")) for method, own in found.items())
-    return kept and {method: int(own[:, 3].sum()) for method, own in found.items()} == FINDS_DEPTH_5
+    """With MAS, PackNet and SI it keeps all that it learned, but finds depth 5 in five, three and two seeds, fewer
+    than alone (p < 0.05, corrected for six methods)."""
+    return t.keeps_and_finds(("mas", "packnet", "si")) == (True, [5, 3, 2]) and max(fewer(t)[3:]) < 0.05
 
 
 @reads("methods")
 def _(t):
-    """By the mean return at the end no method is distinguishable from PPO alone there."""
+    """With EWC, Mask LC and Mask BLC it keeps all, too, and finds depth 5 in 13, ten and seven seeds, which 20 pairs
+    do not distinguish from 14."""
+    alone = int(t.own("depth2to5", "finetune", "ppo")[:, 3].sum())
+    found = t.keeps_and_finds(("ewc", "mask_lc", "mask_blc"))
+    return alone == 14 and found == (True, [13, 10, 7]) and min(fewer(t)[:3]) > 0.05
+
+
+def fewer(t):
+    """The p-values of six methods against PPO alone by depth 5 in its own block, corrected for six."""
+    alone, *others = (
+        t.own("depth2to5", method, "ppo")[:, 3].double().tolist()
+        for method in ("finetune", "ewc", "mask_lc", "mask_blc", "mas", "packnet", "si")
+    )
+    return statistics.holm([statistics.compare(other, alone).p_value for other in others])
+
+
+@reads("methods")
+def _(t):
+    """By the mean return at the end no method is distinguishable from PPO alone with growing depth: CLEAR is better in
+    six seeds and equal in the others, too few for its p-value."""
     found = t.against_finetuning("ppo")
-    corrected = statistics.holm([each.p_value for each in found.values()])
-    deep = [p for name, p in zip(found, corrected, strict=True) if name.startswith("fo_b1_depth2to5")]
-    return len(deep) == 11 and min(deep) > 0.05
+    corrected = dict(zip(found, statistics.holm([each.p_value for each in found.values()]), strict=True))
+    deep = [p for name, p in corrected.items() if name.startswith("fo_b1_depth2to5")]
+    clear = found["fo_b1_depth2to5, `clear`"]
+    return len(deep) == 11 and min(deep) > 0.05 and (clear.wins, clear.ties) == (6, 14) and clear.p_value > 0.025
 
 
 @reads("methods")
 def _(t):
-    """In each of seeds 0 to 4, all that were run at first, PPO alone solves all four depths; at a share of 14 in 20
-    five seeds do so in one of six cases."""
-    return t.known("depth2to5", "finetune", "ppo")[:5].all() and round(1 / (14 / 20) ** 5) == 6
+    """In each of seeds 0 to 4 PPO alone solves all four depths, as five seeds drawn from the twenty do in one of eight
+    cases: read five seeds with care."""
+    solved = t.known("depth2to5", "finetune", "ppo").all(1)
+    return solved[:5].all() and round(math.comb(len(solved), 5) / math.comb(int(solved.sum()), 5)) == 8
 
 
 @pytest.fixture(scope="module")
