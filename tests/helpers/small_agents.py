@@ -121,7 +121,7 @@ def small(compose, agent: str, tasks=TASKS, *overrides: str) -> Any:
 
 
 def with_method(compose, agent: str, method: Method, tasks=TASKS, *overrides: str) -> AgentWithMethod:
-    """A small agent with a method, which is told the ids of tasks that have a block each."""
+    """A small agent with a method. Each task has one block, and the method gets its id at the start of the block."""
     curriculum = method.prepare(of(*(Block(task, 160) for task in tasks), task_id="at_boundaries"))
     return method.attach(small(compose, agent, tasks, *overrides), curriculum)
 
