@@ -19,7 +19,7 @@ from torch import Tensor
 from baselines.networks import draw
 from baselines.optimisers import capturable
 from baselines.policy_gradient import PolicyGradient, generalized_advantages
-from baselines.together import Stack, Template
+from baselines.stack import Stack, Template
 from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.benchmark.ladder import WAYS, Run, Rung
 from ctgraph_rl.core.region import Region, captures

@@ -70,11 +70,11 @@ def functional_step(parts: OptimiserParts, gradients: list[Tensor]) -> None:
     state: dict[str, list[Tensor]] = {key: [each[key] for each in parts.state] for key in parts.state[0]}
     settings: dict[str, Any] = {**parts.settings, "foreach": False, "capturable": parameters[0].is_cuda}
     if parts.is_adam:  # compiled, PyTorch's functions need all lists by position
-        moments: tuple[list[Tensor], list, list] = (state["exp_avg"], state["exp_avg_sq"], [])
+        moments: tuple[list[Tensor], list[Tensor], list[Tensor]] = (state["exp_avg"], state["exp_avg_sq"], [])
         settings["beta1"], settings["beta2"] = settings.pop("betas")
         adam(parameters, gradients, *moments, state["step"], **settings)
     else:
-        averages: tuple[list[Tensor], list, list] = (state["square_avg"], [], [])
+        averages: tuple[list[Tensor], list[Tensor], list[Tensor]] = (state["square_avg"], [], [])
         rmsprop(parameters, gradients, *averages, state["step"], **settings)
 
 

@@ -47,7 +47,7 @@ class PrioritySampler(Sampler):
         index = torch.multinomial(chances, batch_size, replacement=True)
         return index, {"priority_weight": (chances[index] / chances.min()) ** -self.beta}
 
-    def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> dict | None:
+    def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> dict[str, Any] | None:
         """Set priorities, float32 [n], to at least 1e-6, so that every item can be drawn."""
         self.priorities[index] = priority.clamp(min=1e-6)
         self.most = torch.maximum(self.most, priority.max())

@@ -9,6 +9,9 @@ import sys
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
 
 LARGEST_INT = 2**63 - 1
 """Of an int64."""
@@ -183,7 +186,7 @@ def as_tuple(value: object) -> object:
     return value
 
 
-def require_all(kind: type, name: str, values: object) -> tuple:
+def require_all(kind: type[T], name: str, values: object) -> tuple[T, ...]:
     """The items of a list-like value, all of one kind.
 
     Raises:

@@ -20,7 +20,7 @@ from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
 from ctgraph_rl.core.graph import StateType
-from ctgraph_rl.core.tree import Swap
+from ctgraph_rl.core.tree import Swap, is_done
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
 
@@ -214,7 +214,7 @@ class CTGraphEnv(EnvBase):
         state = RowState(*(given[field].to(like.dtype) for field, like in zip(RowState._fields, present, strict=True)))
         nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
         kind, is_leaf = state.state_type, state.node >= self.first_leaf
-        running = (kind >= 0) & ~dynamics.is_done(state, self.rows.params.tree)
+        running = (kind >= 0) & ~is_done(state, self.rows.params.tree)
         misplaced = ((kind == StateType.DECISION) & is_leaf) | ((kind == StateType.END) & ~is_leaf)
         misplaced = misplaced | ((kind == StateType.HOME) & (state.node != 0))
         inside = (state.node >= 0) & (state.node < nodes) & (state.goal_leaf >= 0) & (state.goal_leaf < leaves)

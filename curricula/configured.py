@@ -94,13 +94,15 @@ def from_axes(
     return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
 
 
-def _choices(configuration: str, **given: Any) -> dict[str, tuple]:
+def _choices(configuration: str, **given: Any) -> dict[str, tuple[Any, ...]]:
     """The choices of each argument of `axes.random_tasks` for a graph; None: as configured."""
     graph = configured(configuration).graph
     return {f"{name}s": _several(getattr(graph, name) if value is None else value) for name, value in given.items()}
 
 
-def _deepest(configuration: str, branching_factor: Any, depth: int | Sequence[int] | None) -> tuple[Task, tuple]:
+def _deepest(
+    configuration: str, branching_factor: Any, depth: int | Sequence[int] | None
+) -> tuple[Task, tuple[Any, ...]]:
     """The configured task on its deepest graph, and all depths."""
     task = configured(configuration)
     depths = _several(task.graph.depth if depth is None else depth)
@@ -165,6 +167,6 @@ def _switch(switch: str | None, episodes: int) -> Switch | None:
     return None if switch is None else SWITCHES[switch](episodes)
 
 
-def _several(value: object) -> tuple:
+def _several(value: object) -> tuple[Any, ...]:
     listed = as_tuple(value)
     return listed if isinstance(listed, tuple) else (value,)

@@ -22,6 +22,7 @@ from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
+from curricula.order import OneOrMore
 
 PAPER = "Soltoggio et al. 2023, arXiv 2302.10887"
 
@@ -333,7 +334,7 @@ def _version(configuration: str, has_one_goal: bool = False) -> int:
     return 2 if configuration == "posr_b1" or (has_one_goal and KINDS[configuration] != "full") else 1
 
 
-def _curriculum(name: str, tasks: axes.OneOrMore, num_frames: int, version: int = 1) -> Curriculum:
+def _curriculum(name: str, tasks: OneOrMore, num_frames: int, version: int = 1) -> Curriculum:
     return axes.sequence(name, [tasks] if isinstance(tasks, Task) else tasks, num_frames, version, PAPER)
 
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from baselines.methods.finetune import Finetune
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.switch import ByEpisode
 
 

@@ -19,7 +19,8 @@ from baselines.detectors.seen import SUSPICION, Seen, Verdict
 from baselines.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block, Protocol
 
 if TYPE_CHECKING:
     from baselines.detectors.detector import Detector

@@ -113,7 +113,7 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
     def num_ids(x: Any, kind: StateType) -> int:
         return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
 
-    def table(values: list) -> Tensor:
+    def table(values: list[list[int]]) -> Tensor:
         return torch.tensor(values, device=bank_start.device).flatten()
 
     bank_start, angles = each(starts), max(map(_num_angles, tasks))
@@ -137,7 +137,7 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
     )
 
 
-def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[list], Tensor]) -> LegacyIndex:
+def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[list[list[int]]], Tensor]) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
     def level(task: Task, k: int) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState
+from ctgraph_rl.core.tree import is_done
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
@@ -129,7 +130,7 @@ def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
     for t in range(len(steps.action)):
         action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
         state = dynamics.advance(state, action, words, params, uses, absorbing=False)
-        done = dynamics.is_done(state, params.tree)
+        done = is_done(state, params.tree)
         steps.action[t], steps.reward[t], steps.done[t], steps.is_init[t + 1] = action, state.reward, done, done
         steps.outcome[t] = dynamics.arrivals(state, done, params)[0]
         state = dynamics.begin(state, done, params, uses)

@@ -19,6 +19,7 @@ from ctgraph_rl.core.dynamics import RowState, Shown
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.core.kernel import is_available, is_traced
 from ctgraph_rl.core.row_params import RowParams
+from ctgraph_rl.core.tree import is_done
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
@@ -219,9 +220,8 @@ class Rows(nn.Module):
     def _take_params(self) -> None:
         """Give each row the parameters of its task."""
         self.tables = self.tables.assigned(self.task)
-        tree, x, g = self.tables.of_rows()
         images = {"bank": self.bank, "noise_bank": self.noises, "normal_table": self.normal_table}
-        self._bind(RowParams(self.seed, self.row, tree, x, g, **images))
+        self._bind(RowParams(self.seed, self.row, *self.tables.of_rows(), **images))
 
     def _bind(self, params: RowParams) -> None:
         """Give both engines the parameters."""
@@ -343,7 +343,7 @@ class Rows(nn.Module):
     @property
     def is_done(self) -> Tensor:
         """bool [N]: rows whose episode is over."""
-        return dynamics.is_done(self.state, self.params.tree)
+        return is_done(self.state, self.params.tree)
 
     def check_actions(self, action: Tensor | None, mask: Tensor | None = None) -> None:
         """Refuse with a ValueError actions of a wrong shape, dtype or range, and steps of finished rows; see `step`."""

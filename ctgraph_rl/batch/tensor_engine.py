@@ -9,6 +9,7 @@ from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Shown
 from ctgraph_rl.core.row_params import RowParams, Uses
+from ctgraph_rl.core.tree import is_done
 
 
 class TensorEngine:
@@ -48,7 +49,7 @@ class TensorEngine:
         state = dynamics.advance(state, action, now, self.params, self.uses, absorbing=False)
         observation = dynamics.observe(state, then, self.params, self.uses)
         self._draws.move(state.tick, then)
-        return state, (observation, dynamics.is_done(state, self.params.tree))
+        return state, (observation, is_done(state, self.params.tree))
 
     def step_or_reset(self, state: RowState, action: Tensor, mask: Tensor) -> tuple[RowState, Shown]:
         """See `Rows.step_or_reset`."""

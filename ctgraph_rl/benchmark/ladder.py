@@ -24,6 +24,7 @@ from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Words
 from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.core.row_params import RowParams
+from ctgraph_rl.core.tree import is_done
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
 
@@ -157,7 +158,7 @@ def write_step(
         The next states, and their draws.
     """
     after = dynamics.advance(RowState(*state), action, words, params, uses, absorbing=False)
-    done, reward = dynamics.is_done(after, params.tree), after.reward
+    done, reward = is_done(after, params.tree), after.reward
     outcome = dynamics.arrivals(after, done, params)[0]
     after = dynamics.begin(after, done, params, uses)
     words = dynamics.words_of(after.tick, params, uses)

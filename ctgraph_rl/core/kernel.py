@@ -45,7 +45,7 @@ def is_traced() -> bool:
     """Return whether ``torch.compile``, ``torch.vmap`` or another transform looks on: it must see tensor code."""
     return (
         torch.compiler.is_compiling()
-        or torch.jit.is_tracing()
+        or torch.jit.is_tracing()  # type: ignore[attr-defined]  # which its module's __all__ lacks
         or torch._C._functorch.peek_interpreter_stack() is not None
         or torch._C._len_torch_dispatch_stack() > 0
     )

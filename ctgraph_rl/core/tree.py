@@ -97,7 +97,7 @@ def tree_params(
     )
 
 
-def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list:
+def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> list[list[list[list[int]]]]:
     """Return where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
 
     def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:

@@ -23,7 +23,8 @@ from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_
 from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.policies import RandomPolicy
-from ctgraph_rl.tasks.curriculum import Curriculum, Evaluation
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Evaluation
 from ctgraph_rl.tasks.task import Task
 
 

@@ -21,7 +21,8 @@ from ctgraph_rl.learn.collect import batches, make_env
 from ctgraph_rl.learn.evaluate import EPISODE_KEYS, Evaluator, episode_means
 from ctgraph_rl.learn.guide import Guide, guided_share
 from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.tasks.curriculum import Block, Curriculum
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block
 
 AT_THE_END = {"alarm", "rolled_back"}
 """Measurements of the end of a batch, which are 0 in its other parts."""

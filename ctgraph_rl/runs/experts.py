@@ -21,7 +21,8 @@ from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.checkpoints import Checkpoints
-from ctgraph_rl.tasks.curriculum import Block, Curriculum, Protocol
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block, Protocol
 from ctgraph_rl.tasks.task import Task
 
 RunDirs = Mapping[int, Path]
