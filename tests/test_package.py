@@ -65,6 +65,19 @@ def test_the_wheel_declares_version_licence_and_console_script(wheel):
     assert dict(scripts["console_scripts"]) == {"ctgraph-rl": "ctgraph_rl.cli:main"}
 
 
+def test_the_wheel_finds_its_agents_from_an_empty_directory(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    (tmp_path / "empty").mkdir()
+    env = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", "from ctgraph_rl.cli import main; main()", "agents"]
+
+    result = subprocess.run(command, cwd=tmp_path / "empty", env=env, capture_output=True, text=True)
+
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "lstm_ppo" in result.stdout
+
+
+@pytest.mark.slow
 def test_the_wheel_runs_from_an_empty_directory_and_writes_only_under_runs(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     (tmp_path / "empty").mkdir()

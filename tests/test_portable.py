@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -61,6 +62,24 @@ def results(folder: Path, *arguments: str, **variables: str) -> tuple[dict, list
     return about, measured, torch.load(folder / "out" / "agent.pt", weights_only=True)
 
 
+def test_a_portable_run_holds_torch_and_its_log_says_so(monkeypatch, tmp_path):
+    held = []
+    monkeypatch.setattr(portable, "_HELD", [])
+    monkeypatch.setattr(portable, "_has_variables", lambda: True)
+    monkeypatch.setattr(torch.backends.mkldnn, "set_flags", held.append)
+    library = SimpleNamespace(impl=lambda name, *_: held.append(name))
+    monkeypatch.setattr(torch.library, "Library", lambda *_: library)
+    command = [*SHORT, "agent=reinforce", "curriculum=ct2_interfering", "portable=true"]
+
+    assert command_line(monkeypatch, *command, f"hydra.run.dir={tmp_path}") == 0
+
+    about = lines(tmp_path)[0]
+    assert held == [False, "sqrt", "sqrt_"]
+    assert about["machine"] == f"{platform.machine()} portable"
+    assert about["config"]["portable"] is True and about["cpu"] == portable.cpu_model()
+
+
+@pytest.mark.slow
 def test_a_portable_run_says_so_whatever_variables_its_command_has(tmp_path):
     about, *_ = results(tmp_path / "run", "agent=a2c", "portable=true", **EMULATIONS["old"])
 

@@ -26,11 +26,9 @@ def test_a_pipe_that_breaks_elsewhere_is_an_error(monkeypatch):
 @pytest.mark.parametrize(
     "words",
     [
-        "",
         "agents",
-        "curricula",
         "run --help",
-        "results RUNS",
+        *(pytest.param(words, marks=pytest.mark.slow) for words in ("", "curricula", "results RUNS")),
     ],
 )
 def test_a_reader_that_goes_away_ends_a_command_quietly(checkout, tmp_path, words):

@@ -105,21 +105,28 @@ def test_an_unknown_word_is_refused_with_what_may_have_been_meant(call, runs, wo
     assert second.startswith("Commands: run, agents, board, collectives, compare, curricula, ")
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["", "--version", "curiculum", "agents", "methods", "curricula", "curricula list --format markdown", "agent=pp"],
-)
-def test_what_only_lists_imports_no_torch(checkout, tmp_path, words):
-    code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules, file=sys.stderr))"
-    code += "; from ctgraph_rl.cli import main; main()"
+LISTS = ("", "--version", "curiculum", "agents", "methods", "curricula", "curricula list --format markdown", "agent=pp")
+
+ONE_AFTER_THE_OTHER = """
+import sys
+from ctgraph_rl.cli import main
+from contextlib import suppress
+for words in sys.argv[1:]:
+    sys.argv = ["ctgraph-rl", *words.split()]
+    with suppress(SystemExit):
+        main()
+    print("ENDED", words, "torch" in sys.modules, flush=True)
+"""
+
+
+def test_what_only_lists_imports_no_torch(checkout, tmp_path):
     env = {**os.environ, "PYTHONPATH": str(checkout)}
+    command = [sys.executable, "-c", ONE_AFTER_THE_OTHER, *LISTS]
 
-    result = subprocess.run(
-        [sys.executable, "-c", code, *words.split()], cwd=tmp_path, env=env, capture_output=True, text=True
-    )
+    result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
 
-    assert result.stderr.splitlines()[-1] == "False"
-    assert result.stdout or result.returncode
+    ended = [line for line in result.stdout.splitlines() if line.startswith("ENDED")]
+    assert ended == [f"ENDED {words} False" for words in LISTS], result.stderr
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import subprocess
 import sys
 
 import pytest
 import torch
 from helpers.paths import CHECKOUT
 from helpers.small_agents import AGENTS
+from helpers.sweeping import command_line
 
 from baselines.__main__ import main
 from baselines.catalogue import catalogue
@@ -70,18 +69,18 @@ def test_the_page_has_every_member_of_the_protocol():
     assert [key for key in members if f"`{key}" not in TEXT] == []
 
 
-def test_an_outsiders_agent_is_one_file_and_one_yaml(tmp_path):
+def test_an_outsiders_agent_is_one_file_and_one_yaml(tmp_path, monkeypatch):
     (tmp_path / "my_conf" / "agent").mkdir(parents=True)
     (tmp_path / "my_agent.py").write_text(blocks("python")[0])
     (tmp_path / "my_conf" / "agent" / "mine.yaml").write_text(blocks("yaml")[0])
-    command = shlex.split(blocks("bash")[0])
-    env = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    start, *settings = blocks("bash")[0].split("ctgraph_rl.run ")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
 
-    result = subprocess.run(
-        [sys.executable, *command[1:], "hydra.run.dir=out"], cwd=tmp_path, env=env, capture_output=True, text=True
-    )
+    code = command_line(monkeypatch, *shlex.split(settings[0]), "hydra.run.dir=out")
+    del sys.modules["my_agent"]
 
-    assert result.returncode == 0, result.stderr
+    assert (code, start) == (0, "python -m ")
     training = RunLog.read(tmp_path / "out" / "run.jsonl").of_kind("training")
     assert training[-1]["frames"] == 4 * 4096
     assert all(abs(m["loss_policy"]) < 10 for m in training)

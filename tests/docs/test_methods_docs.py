@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
@@ -16,6 +14,7 @@ import pytest
 import torch
 from helpers.paths import CHECKOUT
 from helpers.small_agents import batches
+from helpers.sweeping import command_line
 from omegaconf import OmegaConf
 
 import curricula
@@ -141,18 +140,18 @@ def test_the_page_has_every_hook():
     assert [hook for hook in hooks if f"`{hook}(" not in TEXT] == []
 
 
-def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(tmp_path):
+def test_an_outsiders_method_is_one_file_and_one_yaml_and_its_agent_comes_back(tmp_path, monkeypatch):
     (tmp_path / "my_conf" / "method").mkdir(parents=True)
     (tmp_path / "my_method.py").write_text(blocks("python", OWN)[0])
     (tmp_path / "my_conf" / "method" / "l2_init.yaml").write_text(blocks("yaml", OWN)[0])
-    command = shlex.split(blocks("bash", OWN)[0])
-    env = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    start, *settings = blocks("bash", OWN)[0].split("ctgraph_rl.run ")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
 
-    result = subprocess.run(
-        [sys.executable, *command[1:], "hydra.run.dir=out"], cwd=tmp_path, env=env, capture_output=True, text=True
-    )
+    code = command_line(monkeypatch, *shlex.split(settings[0]), "hydra.run.dir=out")
+    del sys.modules["my_method"]
 
-    assert result.returncode == 0, result.stderr
+    assert (code, start) == (0, "python -m ")
     training = RunLog.read(tmp_path / "out" / "run.jsonl").of_kind("training")
     assert [m["frames"] for m in training] == [8192 * i for i in range(1, 5)]
     assert all(m["loss_method"] > 0 for m in training)

@@ -218,13 +218,19 @@ def test_the_console_script_knows_the_command(monkeypatch, capsys):
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals are of POSIX")
 
-IN_A_TERMINAL = """
-import termios
-before = termios.tcgetattr(0)
-from ctgraph_rl.visualize.play import main
-main(["CT-SU-B1", "--goal", "1.2"])
-print("RESTORED", termios.tcgetattr(0) == before)
-"""
+
+def play_in_a_terminal() -> None:
+    """Play in this process, which has a terminal as its standard streams, and say whether that is restored."""
+    import termios
+
+    os.environ.update(TERM="xterm-256color", COLORTERM="truecolor")
+    os.environ.pop("NO_COLOR", None)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
+    before = termios.tcgetattr(0)
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115, until the process ends
+    sys.stdout = sys.stderr = open(1, "w", closefd=False)  # noqa: SIM115, as above
+    main(["CT-SU-B1", "--goal", "1.2"])
+    print("RESTORED", termios.tcgetattr(0) == before, flush=True)
 
 
 @posix
@@ -251,10 +257,12 @@ def test_an_interrupt_ends_the_game_cleanly():
 
     child, terminal = pty.fork()
     if child == 0:
-        os.environ.update(TERM="xterm-256color", COLORTERM="truecolor", OMP_NUM_THREADS="1")
-        os.environ.pop("NO_COLOR", None)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # which is ignored where the tests run in the background
-        os.execv(sys.executable, [sys.executable, "-c", IN_A_TERMINAL])
+        code = 1
+        try:
+            play_in_a_terminal()
+            code = 0
+        finally:
+            os._exit(code)
     told = bytearray()
 
     def listen() -> None:
