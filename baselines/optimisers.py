@@ -120,7 +120,8 @@ class StackedOptimiser:
         state["step"] = torch.full((), 0.0 if self.is_adam else LATE, device=parameter.device)
         if states[0]:
             state |= {key: stacked([each[name] for each in states]) for key, name in self.moments.items()}
-            state |= {"step": states[0]["step"].clone()} if self.is_adam else {}
+            if self.is_adam:
+                state["step"] = torch.stack([each["step"] for each in states]).amax(dim=0)  # a seed that failed has 0
         return state
 
     def step(self, gradients: Iterable[Tensor], max_norm: float) -> Tensor:

@@ -143,6 +143,11 @@ def _learning(
     log = evaluator.log
     if saved is None:
         evaluator.evaluate_if_due(agent, 0)
+    elif saved["frames"] == curriculum.num_frames:  # nothing is collected any more: the rows may be those of a group
+        _restore_agent(saved, agent, env.device)
+        agent.end_task()
+        evaluator.evaluate_if_due(agent, saved["frames"])
+        return
     frames = 0 if saved is None else saved["frames"]
     for segment in segments(curriculum, frames):
         if frames == segment.start:
@@ -309,13 +314,23 @@ def _restore(saved: Mapping[str, Any], agent: Agent, env: CTGraphEnv) -> TensorD
     Raises:
         ValueError: if it is not one of this agent and curriculum.
     """
+    _restore_agent(saved, agent, env.device)
+    with saved_state_fits():
+        env.load_state_dict(saved["env"])
+    return TensorDict(saved["carried"], env.batch_size, device=env.device)
+
+
+def _restore_agent(saved: Mapping[str, Any], agent: Agent, device: torch.device) -> None:
+    """Restore the agent of a saved state, and the generator that it draws from.
+
+    Raises:
+        ValueError: if it is not one of this agent.
+    """
     with saved_state_fits():
         agent.load_state_dict(saved["agent"])
-        env.load_state_dict(saved["env"])
     torch.set_rng_state(saved["random"])
     if saved["random_cuda"] is not None:
-        torch.cuda.set_rng_state(saved["random_cuda"], env.device)
-    return TensorDict(saved["carried"], env.batch_size, device=env.device)
+        torch.cuda.set_rng_state(saved["random_cuda"], device)
 
 
 @contextmanager

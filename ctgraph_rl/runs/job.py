@@ -130,9 +130,9 @@ class Job:
         return agent, RunDirectory(run_dir, self._of_experts, saved, together, console=self._console)
 
     def learn_alone(self, alone: Curriculum, run_dirs: RunDirs) -> Failures:
-        """Let an agent learn a task alone, or resume what was begun so; what a group of seeds began begins again."""
+        """Let an agent learn a task alone, or resume what was begun so; what a group has half learned begins again."""
         agent, where = self.expert(alone, run_dirs[self.cfg.seed])
-        if is_of_group(where.run_dir):
+        if is_of_group(where.run_dir) and where.checkpoints.newest_frames != alone.num_frames:
             where.checkpoints.clear()
         self._train(alone, agent, where)
         return {}

@@ -170,6 +170,9 @@ def train(
     checkpoints = Checkpoints(run_dir / CHECKPOINTS) if checkpoints is None else checkpoints
     checkpoints.tidy()
     saved = checkpoints.newest()
+    if saved is not None and "failed" in saved:  # in a group that was stopped before it said so
+        checkpoints.clear()
+        raise FloatingPointError(saved["failed"])
     where = RunDirectory(run_dir, config, checkpoints, experts=experts, listeners=listeners, console=console)
     log = where.begin(curriculum, agent, saved)
     done = 0 if saved is None else saved["frames"]
@@ -264,9 +267,10 @@ def train_together(
     for number, ((directory, agent), log) in enumerate(zip(members, logs, strict=True)):
         if number in failed:
             log.close()
-            directory.checkpoints.clear()
         else:
             directory.finish(curriculum, agent, log)
+    for number in failed:  # last: the others could not be resumed beside a seed without a checkpoint
+        directories[number].checkpoints.clear()
     return failed
 
 

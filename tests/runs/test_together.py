@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -12,8 +13,9 @@ from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
 from baselines.together import Group
-from ctgraph_rl import RunLog
+from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
+from ctgraph_rl.log import run_log, sums, tables
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes
 from ctgraph_rl.runs import checkpoints, config, train
@@ -112,17 +114,47 @@ def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit(monkeypatch, method):
     assert all((run / "restarts.jsonl").exists() for run in runs())
 
 
-def test_a_group_that_was_stopped_while_it_wrote_results_writes_the_others(monkeypatch):
+def test_a_group_that_was_stopped_while_it_wrote_results_writes_the_others_down_to_the_last(monkeypatch):
     settings = (SEEDS, "together=true", *PPO)
     assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
 
-    with monkeypatch.context() as patch:
-        stop_after(patch, 1, train.RunDirectory, "finish")
-        assert sweep(patch, *settings) == 130
-    assert [(run / "metrics.json").exists() for run in runs()] == [True, False, False]
+    for finished in ([True, False, False], [True, True, False]):
+        with monkeypatch.context() as patch:
+            stop_after(patch, 1, train.RunDirectory, "finish")
+            assert sweep(patch, *settings) == 130
+        assert [(run / "metrics.json").exists() for run in runs()] == finished
     assert sweep(monkeypatch, *settings) == 0
 
     assert all(same(one, other) for one, other in zip(runs(), runs("whole"), strict=True))
+
+
+@pytest.mark.slow
+def test_a_group_that_meets_a_full_disk_at_a_file_of_its_results_is_resumed_bit_by_bit(monkeypatch):
+    settings = ("seed=0,1", *PPO)
+    assert sweep(monkeypatch, *settings, "together=true", "hydra.sweep.dir=whole") == 0
+    written: list[Path] = []
+
+    def write(path, content, synced=True):
+        written.append(path)
+        if len(written) == full_at:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        disk.write_whole(path, content, synced)
+
+    finish = train.RunDirectory.finish
+    for full_at, again in ((1, "together=true"), (6, "together=true"), (7, "together=false"), (12, "together=true")):
+        written.clear()
+        with monkeypatch.context() as patch:
+
+            def finish_on_a_full_disk(directory, *given, patch=patch):
+                for module in (train, run_log, tables, sums):
+                    patch.setattr(module, "write_whole", write)
+                finish(directory, *given)
+
+            patch.setattr(train.RunDirectory, "finish", finish_on_a_full_disk)
+            assert sweep(patch, *settings, "together=true", f"hydra.sweep.dir=full{full_at}") == 1
+
+        assert sweep(monkeypatch, *settings, again, f"hydra.sweep.dir=full{full_at}") == 0, written
+        assert all(same(one, other) for one, other in zip(runs(f"full{full_at}"), runs("whole"), strict=True))
 
 
 def test_seeds_that_were_begun_together_are_not_resumed_otherwise(monkeypatch, capsys):
@@ -169,15 +201,15 @@ def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(mon
 
     def spoiled(group, task=None):
         start(group, task)
-        group.learners[1].weights[0].data.fill_(torch.nan)
+        group.learners[0].weights[0].data.fill_(torch.nan)
 
     with monkeypatch.context() as patch:
         patch.setattr(Group, "start_task", spoiled)
         assert sweep(patch, *settings) == 1
     shown = capsys.readouterr().out
-    assert "2 done, 1 failed" in shown and "FloatingPointError: seed 1: loss_objective is nan in block 1" in shown
+    assert "2 done, 1 failed" in shown and "FloatingPointError: seed 0: loss_objective is nan in block 1" in shown
 
-    done, failed = [runs()[number] for number in (0, 2)], runs()[1]
+    done, failed = [runs()[number] for number in (1, 2)], runs()[0]
     assert all(same(run, Path("whole", run.relative_to("runs"))) for run in done)
     assert [name for name in ("metrics.json", "agent.pt", "checkpoints", "failed.txt") if (failed / name).exists()] == [
         "failed.txt"
@@ -185,6 +217,32 @@ def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(mon
     assert not any((run / "failed.txt").exists() for run in done)
     assert sweep(monkeypatch, *settings) == 0
     assert "together" not in first_line(failed) and not (failed / "failed.txt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("finished", [1, 2])
+def test_a_seed_that_failed_has_failed_also_where_its_group_was_stopped_before_it_said_so(
+    monkeypatch, capsys, finished
+):
+    settings = (SEEDS, "together=true", *PPO)
+    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
+    start = Group.start_task
+
+    def spoiled(group, task=None):
+        start(group, task)
+        group.learners[0].weights[0].data.fill_(torch.nan)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Group, "start_task", spoiled)
+        stop_after(patch, finished, train.RunDirectory, "finish")
+        assert sweep(patch, *settings) == 130
+    capsys.readouterr()
+
+    assert sweep(monkeypatch, *settings) == 1
+    shown = capsys.readouterr().out
+    assert "2 done, 1 failed" in shown and "FloatingPointError: seed 0: loss_objective is nan in block 1" in shown
+    assert not (runs()[0] / "metrics.json").exists()
+    assert all(same(one, other) for one, other in list(zip(runs(), runs("whole"), strict=True))[1:])
 
 
 @pytest.mark.parametrize(
