@@ -1,7 +1,7 @@
 """LSTM-PPO: clipped policy gradients with a recurrent trunk that actor and critic share.
 
-Schulman et al. 2017 (arXiv 1707.06347) on TorchRL's `LSTMModule` and `ClipPPOLoss`. Whole rows of a batch are the
-minibatches, so the trunk sees sequences in order, and its state is reset wherever ``is_init`` is set.
+Schulman et al. 2017 (arXiv 1707.06347). The loss has the values of TorchRL's `ClipPPOLoss`. Minibatches are whole rows
+of a batch, so the trunk sees sequences in order. Its state is reset wherever ``is_init`` is set.
 """
 
 from __future__ import annotations

@@ -5,10 +5,14 @@ network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2,
 divided by the standard deviation of its discounted returns. The bonus has a critic and a discount factor of its own,
 and its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
 
-Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Three things differ from
-the paper: predictor and random network have the same shape, the critic of the bonus shares no layer with the policy, so
-that lifelong-learning methods act on the policy alone, and each announced task starts with a new predictor, critic of
-the bonus and statistics.
+Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Five things differ from
+the paper:
+
+- Predictor and random network have the same shape.
+- The critic of the bonus shares no layer with the policy, so that lifelong-learning methods act on the policy only.
+- Predictor and critic of the bonus have their own optimiser and learning rate.
+- Each announced task starts with a new predictor, critic of the bonus and statistics.
+- Statistics of observations start with the first batch, not with steps of a random policy before training.
 
 Beside PPO's own, the agent holds 12 bytes for each weight of the predictor and of the bonus's critic, 4 for each of
 the random network, 16 for each pixel and 4 for each environment.

@@ -27,7 +27,8 @@ class PrioritySampler(Sampler):
     Args:
         num_items: capacity of the storage.
         alpha: exponent of the priorities.
-        beta: exponent of the weights, which correct for alpha.
+        beta: exponent of the weights, which correct for alpha. It is constant here; Schaul et al. raise it to 1 over
+            training.
     """
 
     def __init__(self, num_items: int, alpha: float, beta: float) -> None:

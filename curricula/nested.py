@@ -28,8 +28,8 @@ LRL = "github.com/DMIU-ShELL/LRL-Baselines (2026)"
 MOSAIC = "Nath et al. 2025, arXiv 2506.05577; github.com/DMIU-ShELL/MOSAIC"
 L2D2C = "github.com/DMIU-ShELL/L2D2-C"
 
-PATHS = {1: "01011010010", 2: "11010101101", 3: "00100110", 4: "10011100"}
-"""The consistent families; the first two go down to depth 11."""
+PATHS = {1: "01011010010101", 2: "11010101101110", 3: "00100110", 4: "10011100"}
+"""The consistent families; the first two go down to depth 14."""
 
 FOURTH_SKIPS_D5 = ["11", "110", "1101", "110111", "1101110", "11011100", "110111001"]
 
@@ -171,12 +171,30 @@ def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
         num_frames: frames per task.
         agent: the task of one agent alone, 0..19; None: all tasks one after the other, which is ours.
     """
-    everything = [*_family(1, deepest=11), *_family(2, deepest=11)]
-    tasks = _of_agent(everything, agent)
-    pool = [(family, depth) for family in (1, 2) for depth in range(2, 12)]
+    return _two_families("ct20", L2D2C, deepest=11, num_frames=num_frames, agent=agent)
+
+
+def mosaic_ladder(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
+    """The ladders of MOSAIC: two families with nested goals, depth 2 to 14, one after the other.
+
+    Two files, ct14_md_seed1 and ct14_md_seed2, hold the 13 tasks of a family each. The frames are those of MOSAIC's 28
+    tasks; when and how long tasks were evaluated is not known: our defaults.
+
+    Args:
+        num_frames: frames per task.
+        agent: the task of one agent alone, 0..25; None: all tasks one after the other, which is ours.
+    """
+    return _two_families("mosaic_ladder", MOSAIC, deepest=14, num_frames=num_frames, agent=agent)
+
+
+def _two_families(name: str, source: str, deepest: int, num_frames: int, agent: int | None) -> Curriculum:
+    """The first two families with the ids that all goals of their graphs have."""
+    tasks = _of_agent([*_family(1, deepest), *_family(2, deepest)], agent)
+    pool = [(family, depth) for family in (1, 2) for depth in range(2, deepest + 1)]
+    num_ids = sum(2**depth for _, depth in pool)
     made = tuple(one_wait_image(path, family) for family, path in tasks)
-    ids = pool_ids(tasks, pool)
-    return labelled("ct20", L2D2C, made, ids, num_task_ids=8184, num_frames=num_frames, evaluation=Evaluation())
+    evaluation = Evaluation()
+    return labelled(name, source, made, pool_ids(tasks, pool), num_ids, num_frames=num_frames, evaluation=evaluation)
 
 
 def _family(number: int, deepest: int = 8) -> list[Named]:
@@ -211,6 +229,7 @@ def _curriculum(
 
 
 _SKIPPING_D5 = (ct28_blocked_skips_d5, ct28_interleaved_skips_d5, ct28_mosaic_skips_d5, ct28_random_skips_d5)
-_OTHERS = (ct8_interleaved, ct10, ct14_half_1, ct14_half_2, ct14_md, ct20, ct28, ct28_one_branch, ct29_recovery)
-NAMED = {f.__name__: f for f in (*_SKIPPING_D5, *_OTHERS)}
+_SINGLE = (ct8_interleaved, ct10, ct14_half_1, ct14_half_2, ct14_md, ct28, ct28_one_branch, ct29_recovery)
+_TWO_FAMILIES = (ct20, mosaic_ladder)
+NAMED = {f.__name__: f for f in (*_SKIPPING_D5, *_SINGLE, *_TWO_FAMILIES)}
 """The curricula of this module by name."""

@@ -189,17 +189,7 @@ MISSING = (
     Missing(
         "ct36",
         "L2D2-C: 36 tasks on four graphs with branching factor 3, depth 2",
-        "two of the four environment files were not found, and the others have 8 images for 9 end states",
-    ),
-    Missing(
-        "ct134, each agent's order",
-        "L2D2-C: 135 agents",
-        "the order of 12 agents is known, and it is that of ct134; the others could not be read",
-    ),
-    Missing(
-        "ct16_64 and 32x32",
-        "L2D2-C: 64 slots of 12,800 frames over 16 tasks, and 32 tasks of 40,960 frames",
-        "only parts of the lists could be read, and they are random without a recorded seed",
+        "three of its four environment files have image seed 2: 36 ids stand for 18 tasks, and here a task has one id",
     ),
     Missing(
         "the RLlib baselines of L2D2-C",
@@ -207,9 +197,9 @@ MISSING = (
         "the environment redrew its goal every 5,000 episodes of a worker, in no fixed relation to the slots",
     ),
     Missing(
-        "the ladders of MOSAIC",
-        "ct28_md (4 agents x 10 depths), ct14_md_seed1 and ct14_md_seed2 (depths 2 to 14)",
-        "the files give goals without image seeds, and their environments were not found",
+        "ct28_md of MOSAIC",
+        "4 agents x 10 depths",
+        "its fourth path, 11011, is not in the pool of its environments; mosaic_ladder has the two ladders to depth 14",
     ),
     Missing(
         "ctwtf_half", "L2D2-C: 14 tasks of two families", "half of its indices are beyond its own pool of 1,016 tasks"

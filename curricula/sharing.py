@@ -56,12 +56,48 @@ def ct16(num_frames: int = 51_200, agent: int = 0) -> Curriculum:
 
 
 def ct134(num_frames: int = 51_200) -> Curriculum:
-    """CT134: 34 image seeds x four goals without the last two, in the order of the ids.
+    """CT134: 34 image seeds x four goals without the last two; all 135 agents learn them in the order of the ids.
 
     Args:
         num_frames: frames per task.
     """
     return _curriculum("ct134", range(134), 136, num_frames)
+
+
+CT16_64_ORDERS = """
+0251057fade7bab8770ae1a7e177323df40f304873b92e7f269a1e54f9cfd239
+3aeac4357e89a4eb6faac8390709acc5824ecf6ecd47c39d205b55e4f0cc1fb3
+5a393de87dbad2b7fb36aa444ce98859956b1677e867cd6d0e5833c0b0685d7c
+c7862d2108a9ac0e6a383833fb429ffbcda4185e63dec76783d5ff9284cef9fe
+f3f95a142246ddf83c15d9d24b151143a25110ce108c637cbf53d6b04ee513cc
+0a5882bf3622e83727e78d0aac99b0c25e5f93ba85ff7da182c7ed4e53d86608
+a27dbb870254544e1702435c0818d06826fccfaa4119e430983e335bcbedd50a
+8a9d09edab7b579d385b65e61e7bdda832a2d54edcf32aa07b68956c29d6cbb2
+3d7d8340fc061bd2bc227b93229d0757aa49e0c49bbbd41054d5f858e89b1eb3
+c5f44033053dd5d51aa3a047a338423f6353aa4c9fcb933d4e10f75f9bd80b44
+e18b8a73314d81e388265fdfe8c330a6742dfbcb2cbb6506be2c383596d58c64
+d78b1d05eb211c7f6bcb75973a618ca08c4d37231409210da53c44dc48b6a552
+"""
+"""The tasks of agents 1 to 12 in order, a hexadecimal digit each."""
+
+
+def ct16_64(num_frames: int | None = None, agent: int = 1, in_order: bool = False) -> Curriculum:
+    """CT16_64: 64 short blocks of the 16 tasks of CT16, each agent in its published order.
+
+    Agents 0 and 13 learn each task once, in the order of the ids, for four times as many frames.
+
+    Args:
+        num_frames: frames per block; None: what the agent had, 12,800, or 51,200 for agents 0 and 13.
+        agent: whose order, 0..13.
+        in_order: agent 1 learns the tasks in the order of the ids, four times over, as in the second published file.
+    """
+    once = "0123456789abcdef"
+    orders = [once, *CT16_64_ORDERS.split(), once]
+    if in_order:
+        orders[1] = once * 4
+    order = chosen("agent", agent, orders)
+    frames = 51_200 * len(once) // len(order) if num_frames is None else num_frames
+    return _curriculum("ct16_64", [int(digit, 16) for digit in order], 16, frames)
 
 
 class Rotations(NamedTuple):
@@ -77,7 +113,10 @@ ROTATIONS = {
     4: Rotations((0, 0, 1, 2, 3), (25_600,) * 5, 4),
     8: Rotations((*range(8), 0, 0), (25_600, 25_600, *(51_200,) * 8), 7400),
     16: Rotations((0, *range(16)), (12_800,) * 17, 16),
+    32: Rotations((0,) * 39, (40_960,) * 39, 32),
 }
+"""All 39 agents of 32 x 32 have one order. The settings say 40,960 frames; a copy in the logs says 25,600. The length
+of its task ids is not known; 32 is our choice."""
 
 
 def rotated(num_tasks: int, num_frames: int | None = None, agent: int = 0) -> Curriculum:
@@ -86,7 +125,7 @@ def rotated(num_tasks: int, num_frames: int | None = None, agent: int = 0) -> Cu
     Several versions of the files are public; others have other budgets.
 
     Args:
-        num_tasks: 2, 4, 8 or 16.
+        num_tasks: 2, 4, 8, 16 or 32.
         num_frames: frames per task; None: what the agent had.
         agent: whose order, counted from 0; the first ones are in the order of the ids.
     """
@@ -106,6 +145,7 @@ def _curriculum(name: str, numbers: Sequence[int], num_task_ids: int, num_frames
 
 NAMED = {
     "ct16": ct16,
+    "ct16_64": ct16_64,
     "ct134": ct134,
     **{f"l2d2c_{num_tasks}x{num_tasks}": partial(rotated, num_tasks) for num_tasks in ROTATIONS},
 }
