@@ -15,6 +15,7 @@ from torch import Tensor
 from ctgraph_rl import (
     CTGraph,
     CTGraphEnv,
+    Curriculum,
     Gradient,
     GroupedImages,
     Needle,
@@ -295,3 +296,9 @@ def likely(tasks: list[Task], num_steps: int, seed: int = 0) -> Tensor:
     largest = 1 + max(task.graph.branching_factor for task in tasks)
     other = rng.integers(0, largest, (num_steps, len(tasks)))
     return torch.from_numpy(np.where(rng.random(other.shape) < 0.9, np.stack(best, 1), other))
+
+
+def listing(curriculum: Curriculum) -> list[str]:
+    """The blocks as image seed and goal, counted from 0 as the labs do."""
+    tasks = [task for block in curriculum.blocks for task in block.tasks]
+    return [f"{task.image_seed}:{''.join(str(decision - 1) for decision in task.goal)}" for task in tasks]
