@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from baselines.hooks import Hooks
 from baselines.networks import Data
 from baselines.optimisers import OptimiserParts, capturable, functional_step, parts_of
-from ctgraph_rl.checks import at_least_one, positive, require, true_or_false
+from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
 MOST_PASSES = 10**6
@@ -25,7 +25,7 @@ LARGEST_WEIGHT = 1e12
 """Beyond this a network has diverged, and its outputs soon overflow."""
 
 
-class Learner(nn.Module):
+class Learner(TakesNumbers, nn.Module):
     """A module with an optimiser, from which agents derive; the defaults are those of an agent without memory.
 
     Args:

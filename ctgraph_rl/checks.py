@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 import os
+import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from difflib import get_close_matches
+from functools import wraps
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 LARGEST_INT = 2**63 - 1
 """Of an int64."""
@@ -88,6 +95,90 @@ def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bo
         return math.isfinite(value) and low <= value <= high
     except OverflowError:  # an integer beyond float64
         return False
+
+
+def plain(value: Any, whole: bool = False) -> Any:
+    """Return numbers and arrays of NumPy, torch and other libraries as Python's own; anything else unchanged.
+
+    Args:
+        value: a number, an array, or a list, tuple or dict of such.
+        whole: return a float without a fraction as an int, as ``1e5`` on the command line is one.
+    """
+    try:
+        return _plain(value, whole)
+    except (ArithmeticError, RecursionError, RuntimeError, TypeError, ValueError):  # has no value, or none of Python
+        return value
+
+
+def _plain(value: Any, whole: bool) -> Any:
+    kind = type(value)
+    if kind is bool:
+        return value
+    if kind in (list, tuple):
+        return kind(_plain(item, whole) for item in value)
+    if kind is dict:
+        return {key: _plain(item, whole) for key, item in value.items()}
+    if hasattr(kind, "tolist"):
+        return _plain(value.tolist(), whole)
+    if hasattr(kind, "__index__"):
+        return operator.index(value)
+    if not hasattr(kind, "__float__"):
+        return value
+    number = float(value)
+    return int(number) if whole and number.is_integer() and abs(number) <= LARGEST_INT else number
+
+
+def make_fields_plain(instance: Any) -> None:
+    """Replace the numbers and arrays in the fields of a frozen dataclass by plain ones, see `plain`."""
+    for each in (field for field in fields(instance) if field.init):
+        value = getattr(instance, each.name)
+        found = plain(value, whole=_is_whole(each.type))
+        if found is not value:
+            object.__setattr__(instance, each.name, found)
+
+
+def takes_numbers(function: Function) -> Function:
+    """Give a function plain numbers, see `plain`, for arguments that are annotated as numbers and those of ``**``."""
+    parameters = signature(function).parameters
+    names = list(parameters)
+    wholes = {name: _is_whole(each.annotation) for name, each in parameters.items() if _is_number(each)}
+    takes_others = any(each.kind == Parameter.VAR_KEYWORD for each in parameters.values())
+
+    @wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        given = list(args)
+        for place, name in enumerate(names[: len(given)]):
+            if name in wholes:
+                given[place] = plain(given[place], wholes[name])
+        for name, value in kwargs.items():
+            if name in wholes or (takes_others and name not in parameters):
+                kwargs[name] = plain(value, wholes.get(name, False))
+        return function(*given, **kwargs)
+
+    return called  # type: ignore[return-value]
+
+
+class TakesNumbers:
+    """The base of classes whose constructors take numbers of NumPy and torch, too, see `takes_numbers`."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            cls.__init__ = takes_numbers(cls.__init__)  # type: ignore[method-assign]
+
+
+def _is_number(parameter: Parameter) -> bool:
+    words = _words(parameter.annotation)
+    return bool(words & {"int", "float", "bool"}) and not words & {"Tensor", "Callable"}
+
+
+def _is_whole(annotation: object) -> bool:
+    """Return whether an annotation says an integer, or else several; goals and other lists of integers are none."""
+    return annotation is int or (str(annotation).startswith("int") and "float" not in _words(annotation))
+
+
+def _words(annotation: object) -> set[str]:
+    return set(re.findall(r"\w+", str(annotation)))
 
 
 def as_path(name: str, value: object) -> Path:
@@ -177,12 +268,10 @@ def true_or_false(**values: object) -> list[tuple[bool, str]]:
 
 
 def as_tuple(value: object) -> object:
-    """A list-like value as a tuple (yaml has only lists); anything else unchanged."""
+    """A list-like value as a tuple of plain values (yaml has only lists); anything else unchanged."""
+    value = plain(value)
     if isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict, set, frozenset)):
-        try:
-            return tuple(value)
-        except TypeError:  # an array without dimensions
-            return value
+        return tuple(map(plain, value))
     return value
 
 

@@ -13,9 +13,9 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
-from ctgraph_rl.batch.rows import Rows, seed_rule
+from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.batch.specs import checked_num_ids, specs_of
-from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.checks import require, require_all, takes_numbers
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
@@ -78,6 +78,9 @@ class CTGraphEnv(EnvBase):
 
     _supports_set_state = True
 
+    set_seed = takes_numbers(EnvBase.set_seed)
+
+    @takes_numbers
     def __init__(
         self,
         tasks: Iterable[Task],
@@ -385,7 +388,6 @@ class CTGraphEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
-        require(seed_rule(seed))
         self.rows.set_seed(seed)  # type: ignore[arg-type]
 
 

@@ -25,7 +25,7 @@ from ctgraph_rl.batch.assignment import numbers_in
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.text_render import as_text
-from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.checks import as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.protocol import MOST_ROWS
@@ -61,6 +61,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
 
     metadata = _RENDERING
 
+    @takes_numbers
     def __init__(
         self,
         task: Task | str | None = None,
@@ -86,6 +87,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         (self._next_number,) = numbers_in(self.task_pool, [task])
 
     @torch.inference_mode()
+    @takes_numbers
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
@@ -95,7 +97,6 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             seed: start the random stream of (seed, row 0), in [0, 2**63); None: continue the present one.
             options: without use.
         """
-        seed = _plain(seed)
         require(_seed_rule(seed))
         super().reset(seed=seed)
         if self._next_number != self._number:
@@ -158,6 +159,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
 
     metadata = _RENDERING
 
+    @takes_numbers
     def __init__(
         self,
         num_envs: int = 1,
@@ -198,6 +200,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         self._next_numbers = numbers
 
     @torch.inference_mode()
+    @takes_numbers
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
@@ -295,9 +298,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
 
     def _seeds_of(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
         """A seed or None for every row, from what `reset` is given."""
-        seed = _plain(seed)
         seeds: Any = (None,) * self.num_envs if seed is None else as_tuple(seed)
-        seeds = tuple(map(_plain, seeds)) if isinstance(seeds, tuple) else seeds
         if isinstance(seed, int) and is_int(seed, 0):
             super().reset(seed=seed)
             seeds = tuple(range(seed, seed + self.num_envs))
@@ -350,11 +351,6 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     choices = [choice.value for choice in AutoresetMode]
     require((mode in choices or mode in list(AutoresetMode), f"autoreset_mode must be one of {choices}, got {mode!r}"))
     return AutoresetMode(mode)
-
-
-def _plain(seed: Any) -> Any:
-    """NumPy's integers as Python's."""
-    return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def _seed_rule(seed: object) -> tuple[bool, str]:

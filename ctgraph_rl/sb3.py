@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
 
 try:
@@ -35,6 +35,7 @@ class SB3VecEnv(VecEnv):
         (256, 1, 12, 12)
     """
 
+    @takes_numbers
     def __init__(self, num_envs: int, task: Any = None, **kwargs: Any) -> None:
         self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)

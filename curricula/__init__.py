@@ -10,11 +10,11 @@ import json
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from inspect import getdoc, signature
+from inspect import getdoc, signature, unwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.checks import nearest
+from ctgraph_rl.checks import nearest, takes_numbers
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
@@ -69,7 +69,7 @@ def summary(name: str) -> str:
     Raises:
         ValueError: for an unknown name; lists the choices.
     """
-    function = _function(name)
+    function = unwrap(_function(name))
     return (getdoc(getattr(function, "func", function)) or "").split("\n")[0]
 
 
@@ -84,7 +84,7 @@ def _function(name: str) -> Callable[..., Curriculum]:
 @cache
 def _named() -> dict[str, Callable[..., Curriculum]]:
     tables = (import_module(f"curricula.{module}").NAMED for module in _MODULES)
-    return {name: function for table in tables for name, function in table.items()}
+    return {name: takes_numbers(function) for table in tables for name, function in table.items()}
 
 
 def __getattr__(name: str) -> Any:

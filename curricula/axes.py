@@ -15,7 +15,7 @@ from functools import partial
 from math import prod
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all, takes_numbers
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
@@ -46,6 +46,7 @@ def all_goals(tasks: OneOrMore) -> Tasks:
     return goals_sharing(tasks, 0)
 
 
+@takes_numbers
 def given_goals(tasks: OneOrMore, goals: Iterable[Sequence[int]]) -> Tasks:
     """Each task with each of the goals.
 
@@ -59,6 +60,7 @@ def given_goals(tasks: OneOrMore, goals: Iterable[Sequence[int]]) -> Tasks:
     return each(tasks, lambda task: [replace(task, goal=goal) for goal in listed])
 
 
+@takes_numbers
 def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
     """Every goal that shares its first decisions with the task's own, in lexicographic order.
 
@@ -77,6 +79,7 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
     return each(tasks, vary)
 
 
+@takes_numbers
 def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
     """Different goals drawn uniformly; the same ones for all tasks whose graphs have one shape.
 
@@ -97,6 +100,7 @@ def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
 # input distribution
 
 
+@takes_numbers
 def image_seeds(tasks: OneOrMore, seeds: Iterable[int]) -> Tasks:
     """Each task with the image sets of other seeds."""
     listed = require_all(int, "seeds", seeds)
@@ -114,6 +118,7 @@ def image_sets(tasks: OneOrMore, sets: Iterable[ImageSet]) -> Tasks:
     return each(tasks, lambda task: [replace(task, images=images) for images in listed])
 
 
+@takes_numbers
 def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = ("wait", "decision", "end")) -> Tasks:
     """Each task with the images of some kinds of states moved to higher ids of the same image set.
 
@@ -137,6 +142,7 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
     return each(tasks, vary)
 
 
+@takes_numbers
 def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decision",)) -> Tasks:
     """Each task, and again with images never seen before for some kinds of states; the others keep theirs.
 
@@ -159,6 +165,7 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
     return each(tasks, vary)
 
 
+@takes_numbers
 def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) -> Tasks:
     """Each task with images that vary whenever they are read; see `Observations`.
 
@@ -174,6 +181,7 @@ def read_variation(tasks: OneOrMore, read_noise: int, read_rotation: int = 0) ->
 # shape
 
 
+@takes_numbers
 def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) -> Tasks:
     """The graph of each task cut to other depths, every one with the id ranges of the deepest: no image changes role.
 
@@ -194,6 +202,7 @@ def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) 
     return each(tasks, vary)
 
 
+@takes_numbers
 def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
     """Each task with other branching factors; the task is the widest, whose id ranges serve all."""
     listed = require_all(int, "factors", factors)
@@ -207,6 +216,7 @@ def branching_factors(tasks: OneOrMore, factors: Iterable[int]) -> Tasks:
     return each(tasks, vary)
 
 
+@takes_numbers
 def wait_probs(tasks: OneOrMore, probs: Iterable[float]) -> Tasks:
     """Each task with other wait probabilities, in [0, 1)."""
     listed = tuple(probs)
@@ -216,6 +226,7 @@ def wait_probs(tasks: OneOrMore, probs: Iterable[float]) -> Tasks:
 # observability
 
 
+@takes_numbers
 def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int = 100) -> Tasks:
     """Each task as more or less of its state is seen.
 
@@ -230,6 +241,7 @@ def observability(tasks: OneOrMore, kinds: Iterable[str], num_wait_images: int =
     return each(tasks, lambda task: [reshaped(task, task.graph, kind, task.goal, num_wait_images) for kind in listed])
 
 
+@takes_numbers
 def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wait_images: int = 100) -> Task:
     """A task on another graph, observed in one of the ways of `observability`; all else stays."""
     observations = observations_of(graph, kind, num_wait_images)
@@ -240,6 +252,7 @@ def reshaped(task: Task, graph: CTGraph, kind: str, goal: Sequence[int], num_wai
 # random graphs
 
 
+@takes_numbers
 def random_tasks(
     num_tasks: int,
     seed: int,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.checks import as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
 from ctgraph_rl.tasks.task import Task
@@ -23,6 +23,7 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
 }
 
 
+@takes_numbers
 def from_axes(
     configuration: str = "su_b1",
     branching_factor: int | Sequence[int] | None = None,

@@ -21,7 +21,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from ctgraph_rl.checks import is_int, is_shallow, require
+from ctgraph_rl.checks import is_int, is_shallow, require, takes_numbers
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
@@ -41,6 +41,7 @@ ORDERS = ("default", "interleaved")
 LABEL_MODES = ("global_task_id", "curriculum_index", "explicit")
 
 
+@takes_numbers
 def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], name: str | None = None) -> Curriculum:
     """The curriculum that a meta-JSON file describes, on environments as the authors' implementation has them.
 

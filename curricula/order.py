@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 
-from ctgraph_rl.checks import as_tuple, is_int, require, require_all
+from ctgraph_rl.checks import as_tuple, is_int, require, require_all, takes_numbers
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Switch
@@ -60,18 +60,21 @@ def interleave(*sequences: OneOrMore) -> Tasks:
     return tuple(task for turn in rounds for task in turn if task is not None)
 
 
+@takes_numbers
 def repeat(tasks: OneOrMore, times: int) -> Tasks:
     """Each task several times in a row: A A B B."""
     require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
     return each(tasks, lambda task: [task] * times)
 
 
+@takes_numbers
 def cycle(tasks: OneOrMore, times: int) -> Tasks:
     """The whole sequence several times: A B A B."""
     require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
     return as_tasks(tasks) * times
 
 
+@takes_numbers
 def shuffle(tasks: OneOrMore, seed: int) -> Tasks:
     """The tasks in an order drawn uniformly from a seed, an integer >= 0."""
     return tuple(shuffled(as_tasks(tasks), seed))
@@ -82,6 +85,7 @@ def reverse(tasks: OneOrMore) -> Tasks:
     return as_tasks(tasks)[::-1]
 
 
+@takes_numbers
 def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]:
     """Tasks to train and tasks to hold out, drawn without replacement; both keep their order.
 
@@ -101,6 +105,7 @@ def split(tasks: OneOrMore, num_held_out: int, seed: int) -> tuple[Tasks, Tasks]
     return rest, tuple(everything[i] for i in sorted(held_out))
 
 
+@takes_numbers
 def sequence(
     name: str,
     tasks: Iterable[OneOrMore],

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from ctgraph_rl.checks import require, true_or_false
+from ctgraph_rl.checks import TakesNumbers, require, true_or_false
 
 State = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
@@ -21,7 +21,7 @@ PREVIOUS_ACTION, REWARD = "previous_action", "reward"
 """The keys of an agent's last action and reward."""
 
 
-class Cell(nn.Module):
+class Cell(TakesNumbers, nn.Module):
     """What an agent remembers with: it reads features, step after step, and writes what the heads read.
 
     A class that derives from it defines `state_keys`, `zeros` and `step`, and `sequence` where there is a faster way

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from baselines.detectors.seen import Seen, Verdict
 from baselines.methods.self_labelled import SelfLabelled
-from ctgraph_rl.checks import at_least_one, is_int, require
+from ctgraph_rl.checks import TakesNumbers, at_least_one, is_int, require
 
 if TYPE_CHECKING:
     from ctgraph_rl.agent import Method
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 
-class Detector:
+class Detector(TakesNumbers):
     """Judges from what the learner sees whether the task is still that of the present label.
 
     Labels are 0, 1, 2, ... in the order in which they are opened. `baselines.methods.self_labelled.SelfLabelled` calls

@@ -11,12 +11,12 @@ from tensordict import TensorDictBase
 
 from baselines.methods.masks import Masks
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import at_least_one, fraction, require
+from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, require
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import Fields, Message
 
 
-class Exchange:
+class Exchange(TakesNumbers):
     """An exchange without messages, from which others derive: each member learns alone.
 
     Args:

@@ -18,11 +18,11 @@ from baselines.hooks import Hooks
 from baselines.learner import Learner
 from baselines.methods.weights import Weights
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import TakesNumbers, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
-class Method(Hooks):
+class Method(TakesNumbers, Hooks):
     """A method that does nothing, from which others derive: the agent is fine-tuned on one task after the other."""
 
     stackable = False

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.task import Task
 
@@ -53,6 +53,7 @@ Line = tuple[Mark, Mark]
 Places = dict[int, Mark]
 
 
+@takes_numbers
 def render(
     tasks: Sequence[Task], state_type: Tensor, node: Tensor, goal_leaf: Tensor, observation: Tensor, size: int = 192
 ) -> Tensor:

@@ -12,7 +12,7 @@ from ctgraph_rl.batch.assignment import Assignment, goal_leaves, numbers_in
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_tables, shared_bank
 from ctgraph_rl.batch.tensor_engine import TensorEngine
-from ctgraph_rl.checks import is_int, require, require_all
+from ctgraph_rl.checks import TakesNumbers, is_int, plain, require, require_all, takes_numbers
 from ctgraph_rl.core import dynamics, philox
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import RowState, Shown
@@ -27,7 +27,7 @@ from ctgraph_rl.tasks.task import Task
 T = TypeVar("T")
 
 
-class Rows(nn.Module):
+class Rows(TakesNumbers, nn.Module):
     """A batch of CT-graphs without TorchRL or Gymnasium: one task, one random stream and one state per row.
 
     ``state`` is replaced at every step and never written into, so references to it stay valid. Its fields are buffers:
@@ -83,7 +83,7 @@ class Rows(nn.Module):
         kernel: str = "auto",
     ) -> None:
         tasks = require_all(Task, "tasks", tasks)
-        pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
+        self.pool = tuple(dict.fromkeys(tasks if task_pool is None else require_all(Task, "task_pool", task_pool)))
         self.num_rows = len(tasks)
         require(
             seed_rule(seed),
@@ -94,15 +94,14 @@ class Rows(nn.Module):
         device = None if device is None else checked_device(device)
         super().__init__()
         self.kernel = kernel
-        self.pool = pool
-        self.max_branching = max(task.graph.branching_factor for task in pool)
+        self.max_branching = max(task.graph.branching_factor for task in self.pool)
         self.register_buffer("seed", torch.tensor([seed], device=device))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
-        bank = shared_bank(pool, self.num_rows, noise_bank)
+        bank = shared_bank(self.pool, self.num_rows, noise_bank)
         no_images = bank.images.new_empty(0, *bank.shape)
         self._bank, self.image_shape = bank._replace(images=no_images, noises=no_images), bank.shape
-        self.white = max(int(white_level(task.images)) for task in pool)
+        self.white = max(int(white_level(task.images)) for task in self.pool)
         self.register_buffer("bank", bank.images.to(device), persistent=False)
         self.register_buffer("noises", bank.noises.to(device), persistent=False)
         self.register_buffer("normal_table", philox.normal_table().to(device), persistent=False)
@@ -251,19 +250,20 @@ class Rows(nn.Module):
         ``goal_leaf`` changes and ``tasks`` does not: `set_tasks` and `set_seed` go back to the tasks' own goals.
 
         Args:
-            goals: for every row its decisions in 1..b, or the numbers of end states, int64 [N].
+            goals: for every row its decisions in 1..b, also as [N, d]; or the numbers of end states, int64 [N].
 
         Raises:
             ValueError: if a goal is not one of its row's tree.
         """
-        if not isinstance(goals, Tensor):
-            goals = torch.tensor(goal_leaves(self.tasks, goals), device=self.device)
+        if not isinstance(goals, Tensor) or goals.ndim == 2:
+            goals = torch.tensor(goal_leaves(self.tasks, plain(goals)), device=self.device)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
         outside = (goals < 0) | (goals >= self.params.g.num_leaves)
         require((not outside.any(), f"goals must be end states of the rows' trees, got {goals[outside][:5].tolist()}"))
         self.goal_leaf = goals.to(self.device, copy=True)
 
+    @takes_numbers
     def set_seed(self, seed: int) -> None:
         """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))

@@ -10,7 +10,7 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from ctgraph_rl.batch.params import observation_shape
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, plain, require
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_RUNNING
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.protocol import MOST_IDS
@@ -60,7 +60,7 @@ def checked_num_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | Non
     if task_ids is None:
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
         return 0
-    ids = list(task_ids.values()) if isinstance(task_ids, Mapping) else [task_ids]
+    ids = plain(list(task_ids.values())) if isinstance(task_ids, Mapping) else [task_ids]
     by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
     require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
     needed = max(ids) + 1

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from fractions import Fraction
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, takes_numbers
 
 WAIT_ACTION = 0
 """The action A^0 that leaves a wait state; decisions are the actions 1..b."""
@@ -55,6 +55,7 @@ class CTGraph:
     wait_prob: float = 0.0
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         b, d, p = self.branching_factor, self.depth, self.wait_prob
         shape_ok = is_int(b, 2) and is_int(d, 1)
         # 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
@@ -87,6 +88,7 @@ class CTGraph:
         """|S|, home and fail included."""
         return self.num_wait_states + self.num_decision_states + self.num_end_states + 2
 
+    @takes_numbers
     def first_node(self, level: int) -> int:
         """Return the first node after ``level`` decisions, (b^level - 1) / (b - 1); nodes are heap indices."""
         return (self.branching_factor**level - 1) // (self.branching_factor - 1)
@@ -99,6 +101,7 @@ class CTGraph:
         """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
         return (node - 1) % self.branching_factor + 1
 
+    @takes_numbers
     def nodes_to(self, node: int) -> tuple[int, ...]:
         """Return the nodes from the root 0 to ``node``, both included."""
         nodes = [node]
@@ -106,10 +109,12 @@ class CTGraph:
             nodes.append(self.parent(nodes[-1]))
         return tuple(reversed(nodes))
 
+    @takes_numbers
     def path(self, node: int) -> tuple[int, ...]:
         """Return the decisions, in 1..b, that lead from the root to ``node``: its goal, if it is an end state."""
         return tuple(map(self.decision, self.nodes_to(node)[1:]))
 
+    @takes_numbers
     def node_at(self, path: Iterable[int]) -> int:
         """Return the node that the decisions of ``path`` lead to from the root."""
         node = 0
@@ -117,6 +122,7 @@ class CTGraph:
             node = self.branching_factor * node + decision
         return node
 
+    @takes_numbers
     def leaf_of(self, goal: Iterable[int]) -> int:
         """Return the number of the end state that d decisions lead to: its base-b digits are the decisions less 1."""
         return self.node_at(goal) - self.num_decision_states
@@ -166,6 +172,7 @@ class CTGraph:
         """
         return (self.depth + 1) / (1 - self.wait_prob) + self.depth + 1
 
+    @takes_numbers
     def episode_length_prob(self, length: int) -> float:
         """P(rho = length): one step at home, d decisions, and d + 1 wait states left with probability 1 - p per step.
 

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import at_least_one, require, require_all
+from ctgraph_rl.checks import at_least_one, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.lifelong import Learned, OfferCheckpoint, Progress, learning, saved_state_fits
 from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT, Fields, Mail, Message
@@ -98,6 +98,7 @@ class Member:
     random: Tensor = field(default_factory=torch.get_rng_state)
 
 
+@takes_numbers
 def learn_collective(
     members: Sequence[Member],
     exchange: Exchange,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.checks import require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
@@ -29,6 +29,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 @torch.no_grad()
+@takes_numbers
 def evaluate(
     policy: Policy | nn.Module,
     tasks: Sequence[Task],

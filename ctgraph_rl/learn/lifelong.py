@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import batches, make_env
@@ -50,6 +50,7 @@ class Progress(Protocol):
         ...
 
 
+@takes_numbers
 def learn_curriculum(
     curriculum: Curriculum,
     agent: Agent,

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import Policy, make_env
@@ -69,6 +70,7 @@ def why_not_together(curriculum: Curriculum) -> str | None:
     return "its blocks change the tasks of all rows at once" if shared else None
 
 
+@takes_numbers
 def learn_together(
     curriculum: Curriculum,
     group: Group,

@@ -20,7 +20,7 @@ from itertools import product
 
 import numpy as np
 
-from ctgraph_rl.checks import fraction, is_int, positive, require
+from ctgraph_rl.checks import fraction, is_int, positive, require, takes_numbers
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds, gaffke, median_ranks, scipy, student, within_bounds
 
 LEVEL = 0.95
@@ -93,6 +93,7 @@ class Comparison:
     holm: float | None = None
 
 
+@takes_numbers
 def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Estimate:
     """Return the mean with Gaffke's interval where both bounds are known, else with Student's.
 
@@ -130,6 +131,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
     return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
 
 
+@takes_numbers
 def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate:
     """Return the share of seeds that solved a task, with the exact interval of Clopper and Pearson.
 
@@ -146,6 +148,7 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     return Estimate(sum(known) / len(known), low=low, high=high, n=len(known), n_undefined=missing, method=method)
 
 
+@takes_numbers
 def median_time(times: Values, level: float = LEVEL) -> Estimate:
     """Return the median of times with the interval of its order statistics.
 
@@ -169,6 +172,7 @@ def median_time(times: Values, level: float = LEVEL) -> Estimate:
     return Estimate(centre, low=low, high=high, n=n, n_undefined=missing, method=method, reason=reason)
 
 
+@takes_numbers
 def interquartile_mean(
     values: Sequence[Values],
     level: float = LEVEL,
@@ -247,6 +251,7 @@ def of_two_groups(
     return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
 
 
+@takes_numbers
 def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> Comparison:
     """Return the paired comparison of two agents.
 
@@ -285,6 +290,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
+@takes_numbers
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:
     """Seeds of each agent that a t-test needs to find a difference of means with a given power.
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ctgraph_rl.agent import Agent, Method
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.disk import is_writable
@@ -172,6 +172,7 @@ class Job:
             yield [tracker]
 
 
+@takes_numbers
 def make_agent(
     name: str,
     curriculum: Curriculum,
@@ -215,7 +216,7 @@ def make_agent(
     names = {"agent": name, "method": method, "detector": detector}
     cfg = config.with_names(names, None if config_dir is None else Path(config_dir))
     cfg.seed, cfg.device = cfg.seed if seed is None else seed, cfg.device if device is None else str(device)
-    for group, values in (("agent", settings), ("method", method_settings or {})):
+    for group, values in (("agent", settings), ("method", plain(method_settings or {}))):
         cfg[group] = {**cfg[group], **values}
     config.check_values(cfg)
     prepare_torch(cfg)

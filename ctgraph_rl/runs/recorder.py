@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.record.loggers.common import Logger
 
-from ctgraph_rl.checks import as_path, is_int, is_json_object, require, true_or_false
+from ctgraph_rl.checks import as_path, is_int, is_json_object, plain, require, takes_numbers, true_or_false
 from ctgraph_rl.disk import made_folder, sync_folders
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, as_policy, by_slices
@@ -98,6 +98,7 @@ class Recorder:
         torch.Size([5, 4])
     """
 
+    @takes_numbers
     def __init__(
         self,
         curriculum: Curriculum,
@@ -111,6 +112,7 @@ class Recorder:
         logger: str | Callable[[Path], Logger] | None = None,
         checkpoint_seconds: float = SECONDS,
     ) -> None:
+        about = plain(about)
         writes = run_dir is not None or not (overwrite or resume or logger is not None)
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
@@ -190,6 +192,7 @@ class Recorder:
             self._tracker = Tracker(make_logger, run_dir, dict(flat(self._about["config"])))
             self.log.listeners.append(self._tracker)
 
+    @takes_numbers
     def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
 
@@ -227,6 +230,7 @@ class Recorder:
         """All numbers of frames after which the protocol wants an evaluation."""
         return self.curriculum.moments
 
+    @takes_numbers
     def evaluate(
         self, policy: Any = None, frames: int = 0, policy_for: Callable[[int], Any] | None = None
     ) -> dict[str, float]:
@@ -260,6 +264,7 @@ class Recorder:
         self._evaluated = frames
         return {m["label"]: m["return_mean"] for m in self.log.measurements[before:]}
 
+    @takes_numbers
     def training(self, frames: int, **values: Any) -> None:
         """Log what was measured while training since the last time, or the start of the block.
 
@@ -272,7 +277,7 @@ class Recorder:
             ValueError: for frames out of order or beyond the curriculum, and values that are no numbers.
         """
         last = self.curriculum.num_frames
-        numbers = {name: _number(value) for name, value in values.items()}
+        numbers = {name: plain(value) for name, value in values.items()}
         no_numbers = [name for name, value in numbers.items() if not isinstance(value, (int, float, type(None)))]
         taken = sorted({"kind", "block", "seconds"} & set(values))
         require(
@@ -334,11 +339,6 @@ class Recorder:
 def _is_code(code: object) -> bool:
     listed = code is None or isinstance(code, (list, tuple))
     return listed and all(isinstance(each, (type, FunctionType)) for each in code or ())  # type: ignore[attr-defined]
-
-
-def _number(value: Any) -> Any:
-    """A scalar of NumPy, torch or JAX as a number of Python; anything else as it is."""
-    return value.item() if getattr(value, "shape", None) == () and hasattr(value, "item") else value
 
 
 def adapt(policy: Any, greedy: bool, num_actions: int, shows_ids: bool = False) -> Policy:

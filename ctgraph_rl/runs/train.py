@@ -17,7 +17,7 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import as_path, is_json_object, require, require_memory
+from ctgraph_rl.checks import as_path, is_json_object, require, require_memory, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
@@ -122,6 +122,7 @@ def with_method(make_agent: MakeAgent, make_method: Callable[[], Method], curric
     )
 
 
+@takes_numbers
 def train(
     curriculum: Curriculum,
     agent: Agent,

@@ -12,7 +12,7 @@ from inspect import signature
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import did_you_mean, is_int, require
+from ctgraph_rl.checks import did_you_mean, is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -22,6 +22,7 @@ OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
 """How much of its state a task shows; see `observations_of`."""
 
 
+@takes_numbers
 def ct_graph(
     branching_factor: int = 2,
     depth: int = 2,
@@ -50,6 +51,7 @@ def ct_graph(
     return Task(graph, (1,) * depth if goal is None else goal, observations, images)
 
 
+@takes_numbers
 def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Observations:
     """Return observations with ids from 2 on: waits, decisions, ends where states have their own, else decisions first.
 
@@ -158,6 +160,7 @@ class UnknownFieldError(ValueError, TypeError):
     """
 
 
+@takes_numbers
 def make_task(task: Task | str | None = None, config: Json | None = None, **changes: Any) -> Task:
     """A task from what ``gymnasium.make`` is given.
 

@@ -14,7 +14,7 @@ from itertools import accumulate
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import as_path, as_tuple, is_int, require
+from ctgraph_rl.checks import as_path, as_tuple, is_int, make_fields_plain, require
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, write_curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
@@ -59,6 +59,7 @@ class Curriculum:
     protocol: Protocol = field(default_factory=Protocol)
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         object.__setattr__(self, "blocks", as_tuple(self.blocks))
         blocks = self.blocks
         only_blocks = isinstance(blocks, tuple) and bool(blocks) and all(isinstance(each, Block) for each in blocks)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from itertools import combinations
 
-from ctgraph_rl.checks import as_tuple, is_int, require, true_or_false
+from ctgraph_rl.checks import as_tuple, is_int, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
@@ -62,6 +62,7 @@ class Observations:
     cue_wraps: bool = False
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         ranges = [field.name for field in fields(self) if field.name.endswith("_ids")]
         for name in ranges:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))

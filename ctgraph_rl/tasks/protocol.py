@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, is_dataclass
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, one_of, require, true_or_false
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, make_fields_plain, one_of, require, true_or_false
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
 
@@ -46,6 +46,7 @@ class Block:
     switch: Switch | None = None
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         tasks = (self.tasks,) if isinstance(self.tasks, Task) else as_tuple(self.tasks)
         object.__setattr__(self, "tasks", tasks)
         only_tasks = isinstance(tasks, tuple) and bool(tasks) and all(isinstance(task, Task) for task in tasks)
@@ -106,6 +107,7 @@ class Evaluation:
     held_out: tuple[Task, ...] = ()
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         n, per_row = self.num_episodes, self.episodes_per_row
         held_out = (self.held_out,) if isinstance(self.held_out, Task) else as_tuple(self.held_out)
         object.__setattr__(self, "held_out", held_out)
@@ -170,6 +172,7 @@ class Protocol:
     guide_frames: int = field(default=0, metadata={"added": True})
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
         ids = as_tuple(self.task_ids)
         object.__setattr__(self, "task_ids", ids)

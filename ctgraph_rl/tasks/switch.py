@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, require, true_or_false
+from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.philox import randint
 
 MOST_EPISODES = 2**31
@@ -53,6 +53,7 @@ class ByEpisode:
     together: bool = False
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
@@ -75,6 +76,7 @@ class AtRandom:
     together: bool = False
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         holds = is_real(self.prob, 0, 1) and self.prob > 0
         require((holds, f"prob must be in (0, 1], got {self.prob!r}"), *true_or_false(together=self.together))
         object.__setattr__(self, "prob", float(self.prob))
@@ -100,6 +102,7 @@ class Drift:
     together: bool = False
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:

@@ -9,7 +9,17 @@ from typing import Any, Self
 
 from torch import Tensor
 
-from ctgraph_rl.checks import as_path, as_tuple, is_int, is_real, one_of, require, true_or_false
+from ctgraph_rl.checks import (
+    as_path,
+    as_tuple,
+    is_int,
+    is_real,
+    make_fields_plain,
+    one_of,
+    require,
+    takes_numbers,
+    true_or_false,
+)
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.tasks import reference, values
@@ -85,6 +95,7 @@ class Task:
     swapped_branches: tuple[tuple[int, ...], tuple[int, int]] | None = field(default=None, metadata={"added": True})
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         self._check_parts()
         object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
@@ -130,6 +141,7 @@ class Task:
         """
         return cls(**reference.read_task(path_or_dict, goal))
 
+    @takes_numbers
     def to_json(self, path: str | PathLike[str] | None = None, general_seed: int = 1) -> dict[str, Any]:
         """This task as a configuration file of the authors' implementation, with the keys of 2023.
 
@@ -221,10 +233,12 @@ class Task:
         """Number of the end state with the goal: its base-b digits are the decisions, the first one leading."""
         return self.graph.leaf_of(self.goal)
 
+    @takes_numbers
     def optimal_value(self, gamma: float) -> float:
         """The best expected discounted return from the home state; see `values.optimal_value`."""
         return values.optimal_value(self, gamma)
 
+    @takes_numbers
     def policy_value(self, policy: Tensor, gamma: float = 1.0) -> float:
         """The expected discounted return of action probabilities per observation id; see `values.policy_value`."""
         return values.policy_value(self, policy, gamma)

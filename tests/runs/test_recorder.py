@@ -135,7 +135,7 @@ def test_a_missing_evaluation_makes_what_needs_it_undefined():
     ("arguments", "message"),
     [
         ({"policy": table(1), "frames": 37}, "frames must be an integer in 0..36, the curriculum's, got 37"),
-        ({"policy": table(1), "frames": 1.0}, "frames must be an integer"),
+        ({"policy": table(1), "frames": 1.5}, "frames must be an integer"),
         ({"policy": None}, "give either policy or policy_for"),
         ({"policy": 3}, "policy must be a function, or an object with predict, got int"),
         ({"policy": lambda a, b: a}, "not 2 arguments"),

@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, require, require_memory
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
 from ctgraph_rl.core.rotation import rotate
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
@@ -48,6 +48,7 @@ class PaperImages(SquareImages):
     size: int = 12
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         most = len(BLUEPRINT_LEVELS) ** (BLUEPRINT_SIZE**2)
         require(
             (is_int(self.num_images, 1, most), f"num_images must be in 1..{most} (3**16), got {self.num_images!r}"),
@@ -98,6 +99,7 @@ class GroupedImages(SquareImages):
     cells: int = BLUEPRINT_SIZE
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         object.__setattr__(self, "groups", as_tuple(self.groups))
         groups = self.groups
         groups_ok = isinstance(groups, tuple) and bool(groups) and all(is_int(size, 1) for size in groups)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, make_fields_plain, require
 from ctgraph_rl.core.rotation import rotations
 from ctgraph_rl.tasks.images.image_set import resize
 
@@ -42,6 +42,7 @@ class ImageFile:
     shape: tuple[int, ...] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         object.__setattr__(self, "path", str(self.path))
         classes, instances, side = _read(self.path).shape[:3]
         size = side if self.size is None else self.size

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import is_int, make_fields_plain, require
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class OneHot:
     white = 1
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require((is_int(self.num_images, 1), f"num_images must be an integer >= 1, got {self.num_images!r}"))
 
     @property

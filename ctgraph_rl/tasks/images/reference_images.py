@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, require, require_memory
+from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
 
@@ -51,6 +51,7 @@ class ReferenceImages(SquareImages):
     size = BLUEPRINT_SIZE * _PIXELS_PER_CELL
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require(
             _num_images_rule(self.num_images),
             (is_int(self.seed, 0, MAX_SEED), f"image seed must be in [0, 2**32), got {self.seed!r}"),
@@ -96,6 +97,7 @@ class ReferenceOneHot:
     cue_element = True
 
     def __post_init__(self) -> None:
+        make_fields_plain(self)
         require(_num_images_rule(self.num_images))
 
     @property
