@@ -23,7 +23,7 @@ version = release = __version__
 repository = PROJECT.get("urls", {}).get("Repository", "")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "generate", "llms"]
-exclude_patterns = ["_build", "results/*template.md"]
+exclude_patterns = ["_build", "results/templates"]
 templates_path: list[str] = []
 nitpicky = True
 

@@ -219,8 +219,8 @@ class Rows(TakesNumbers, nn.Module):
     def _take_params(self) -> None:
         """Give each row the parameters of its task."""
         self.tables = self.tables.assigned(self.task)
-        images = {"bank": self.bank, "noise_bank": self.noises, "normal_table": self.normal_table}
-        self._bind(RowParams(self.seed, self.row, *self.tables.of_rows(), **images))
+        images = (self.bank, self.noises, self.normal_table)
+        self._bind(RowParams(self.seed, self.row, *self.tables.of_rows(), *images))
 
     def _bind(self, params: RowParams) -> None:
         """Give both engines the parameters."""

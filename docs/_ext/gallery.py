@@ -50,7 +50,7 @@ TITLES = {
 
 MAKE, REPORT = "python docs/results/make.py", "ctgraph-rl report runs/su_b1_4tasks --agent LSTMPPO=LSTM-PPO"
 RESULTS = {
-    "main_job.png": ("A graph, and the performance matrix of LSTM-PPO", "python docs/results/hero.py"),
+    "main_job.png": ("A graph, and the performance matrix of LSTM-PPO", MAKE),
     "main_job-training.png": ("LSTM-PPO learns four goals one after the other", REPORT),
     "main_job-transfer.png": ("Its performance matrix, and what each block changed", REPORT),
     "baselines_b1.png": ("Six agents on four configurations", MAKE),

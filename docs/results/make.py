@@ -1,366 +1,122 @@
-"""Makes baselines.md, lifelong.md and figures from the raw results beside this file; and raw results from runs.
+"""Makes the pages of results and their figures from the raw results beside this file; and raw results from runs.
 
-``python docs/results/make.py`` makes the pages. ``python docs/results/make.py collect NAME RUNS`` writes NAME.csv: for
-each run under the folder RUNS, what its trained agent gets on its task in 1,000 greedy and 1,000 sampled episodes; for
-``rewards_met``, how often it met the goal's reward while learning.
+``python docs/results/make.py`` makes all pages but ``statistics``, whose simulations take long; with a NAME it makes
+one. ``make.py collect TABLE RUNS`` writes TABLE.csv from the runs under the folders RUNS. Tables of methods and of
+collectives grow under ``runs/results``, which git ignores, and are written once, when all of their runs are there.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import math
+from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from string import Template
-from typing import TYPE_CHECKING, Any
-
-import comparison
-import epochs
-import pairs
-import search
-from alone import INSTANCES, MEMORY, instances_change
-from raw import HERE, Raw, groups, machine_of, machines, mean_of, read, share_of, table, write
-
-if TYPE_CHECKING:
-    from ctgraph_rl import Task
-
-if TYPE_CHECKING:
-    from ctgraph_rl.runs.load import Trained
-
-PAGE = HERE / "baselines.md"
-LIFELONG = HERE / "lifelong.md"
-AGENTS = ("baselines_b1", "baselines_fo_b2", "depth_ladder")
-"""Tables of agents that each learned one task."""
-
-SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
-"""The configurations of which each goal was learned alone."""
-
-BY_FIVES = (INSTANCES, MEMORY)
-"""Tables that only have cells of five seeds that finished, as they may be collected before all are run."""
-
-RND = ("rnd_depth", "rnd_co_b1")
-"""Tables of PPO with random network distillation, beside those of other agents on the same tasks."""
-
-REWARDS_MET = "rewards_met"
-OLDER = "ppo_published"
-"""The agent of which cells of the depth ladder were of an earlier revision."""
-
-EPISODES = 1000
-SEED = 2023
-"""Of the episodes, the same for all agents."""
-
-
-def collect(name: str, folder: Path) -> None:
-    """Write the raw results of all runs under a folder; a run that did not finish is a line with its reason."""
-    from rich.progress import track
-
-    runs = sorted(path.parent for path in folder.rglob("run.jsonl") if "experts" not in path.parts)
-    measure = rewards_met if name == REWARDS_MET else measured
-    lines = [measure(run) for run in track(runs, f"{len(runs)} runs")]
-    lines.sort(
-        key=lambda line: [str(line[key]) for key in ("configuration", "depth", "task", "agent")] + [line["seed"]]
-    )
-    write(name, five_seeds(lines) if name in BY_FIVES else lines)
-
-
-def five_seeds(lines: Raw) -> Raw:
-    """Return the lines of cells of which five seeds finished."""
-    done = groups([line for line in lines if not line["failed"]], "configuration", "task", "agent")
-    return [line for cell in done.values() if len(cell) >= search.SEEDS for line in cell]
-
-
-def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
-    """The part of a line that says what was learned by whom."""
-    (task,) = trained.curriculum.tasks
-    about = trained.log.of_kind("run")[0]
-    configured = about["config"]["curriculum"]
-    return {
-        "configuration": configured.get("configuration", trained.curriculum.name),
-        "depth": task.graph.depth,
-        "task": ".".join(map(str, task.goal)),
-        "agent": run_dir.name.split("-seed")[0],
-        "seed": trained.seed,
-        "frames": trained.frames,
-        "fingerprint": trained.curriculum.fingerprint,
-        **machine_of(about),
-    }
-
-
-def rewards_met(run_dir: Path) -> dict[str, Any]:
-    """One line: what was learned by whom, the finished episodes of training, and those that reached the goal."""
-    from ctgraph_rl import load
-
-    trained = load(run_dir)
-    episodes, rates = trained.log.training("episodes"), trained.log.training("success_rate")
-    goals = (episodes * rates.nan_to_num(0)).round().sum()
-    return {**who_learned(run_dir, trained), "episodes": int(episodes.sum()), "rewards_met": int(goals)}
-
-
-def measured(run_dir: Path) -> dict[str, Any]:
-    """One line: what was learned by whom, and the mean return and success of the trained agent."""
-    from ctgraph_rl import evaluate, load
-
-    failed = run_dir / "failed.txt"
-    trained = load(run_dir)
-    (task,) = trained.curriculum.tasks
-    line = who_learned(run_dir, trained)
-    for way, greedy in (("greedy", True), ("sampled", False)):
-        how = {"seed": SEED, "greedy": greedy, "initial_state": trained.agent.initial_state}
-        ends = evaluate(trained.policy_for(task), [task], EPISODES, **how, curriculum=trained.curriculum)
-        line[f"{way}_return"] = round(ends["episode_reward"].double().mean().item(), 6)
-        line[f"{way}_success"] = (ends["outcome"] == 3).double().mean().item()
-    finished = (run_dir / "metrics.json").exists()
-    reason = failed.read_text(encoding="utf-8").strip() if failed.exists() else "not finished"
-    return {**line, "failed": "" if finished else reason}
-
-
-def cell(lines: Raw, column: str, bounds: tuple[float, float] = (0.0, 1.0)) -> str:
-    """Mean over seeds with its interval; seeds that failed are counted, not averaged."""
-    return mean_of([None if line.get("failed") else float(line[column]) for line in lines], bounds)
-
-
-def by_goal(raw: Raw, configuration: str, title: str = "") -> str:
-    """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
-    from baselines.catalogue import catalogue
-    from ctgraph_rl.tasks.values import open_loop_ceiling
-
-    kinds = {agent.name: agent.kind for agent in catalogue("agent")}
-    of = groups([line for line in raw if line["configuration"] == configuration], "agent", "task")
-    goals = sorted({goal for _, goal in of})
-    names = [name for name in kinds if any(agent == name for agent, _ in of)]
-    rows = []
-    for remembers in (False, True):
-        for name in (name for name in names if kinds[name].memory is remembers):
-            rows.append([f"`{name}`", *(both_ways(of.get((name, goal), []), configuration, goal) for goal in goals)])
-        if not remembers and rows:
-            exact = (", ".join(ceilings(configuration, goal)) for goal in goals)
-            rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
-            blind = (open_loop_ceiling(task_of(configuration, goal)) for goal in goals)
-            rows.append(["*ceiling without observations*", *(f"*{value:.2f}*" for value in blind)])
-    return table([title or configuration, *(f"goal {goal}" for goal in goals)], rows)
-
-
-def remembering() -> Raw:
-    """The cells of agents with memory, those of LSTM-PPO on the same goals first."""
-    others = read(MEMORY)
-    goals = {(line["configuration"], line["task"]) for line in others}
-    known = [line for line in read("baselines_b1") if line["agent"] == "lstm_ppo"]
-    return [line for line in known if (line["configuration"], line["task"]) in goals] + others
-
-
-def memory_tables() -> str:
-    """A table for each configuration on which other agents with memory were run."""
-    raw = remembering()
-    return "\n\n".join(by_goal(raw, name) for name in dict.fromkeys(line["configuration"] for line in raw))
-
-
-def both_ways(lines: Raw, configuration: str, goal: str) -> str:
-    """Mean return of the greedy and of the sampled policy, with its interval and the error of the evaluation."""
-    from ctgraph_rl.report.intervals import Bounds
-
-    if not lines:
-        return ""
-    task, found = task_of(configuration, goal), []
-    bounds = Bounds(*task.return_bounds, noisy=task.reward_std > 0)
-    for way in ("greedy", "sampled"):
-        found.append(cell(lines, f"{way}_return", bounds) + evaluation_error(lines, f"{way}_success", task))
-    return ", ".join(found)
-
-
-def evaluation_error(lines: Raw, column: str, task: Task) -> str:
-    """The standard error of a mean return over `EPISODES` episodes, binomial and of the rewards' noise, from 0.005 on.
-
-    All seeds and agents are evaluated by the same draws, so that more seeds do not make it smaller.
-    """
-    rate = sum(float(line[column]) for line in lines) / len(lines)
-    error = math.sqrt((rate * (1 - rate) * task.goal_reward**2 + task.reward_std**2) / EPISODES)
-    return f" ±{error:.2f}" if error >= 0.005 else ""
-
-
-def task_of(configuration: str, goal: str) -> Task:
-    """The task of a configuration and a goal."""
-    from ctgraph_rl.tasks.configurations import CONFIGURATIONS
-
-    name = "CT-" + configuration.upper().replace("_", "-")
-    return CONFIGURATIONS[name](goal=tuple(map(int, goal.split("."))))
-
-
-def ceilings(configuration: str, goal: str) -> list[str]:
-    """The best mean return without memory, of a policy that always does the same and of any."""
-    task = task_of(configuration, goal)
-    return [f"{task.memoryless_ceiling(deterministic):.2f}" for deterministic in (True, False)]
-
-
-def ladder(raw: Raw) -> str:
-    """A line for each agent, a column for each depth: seeds that solved it; and how often chance finds the goal."""
-    import curricula
-    from ctgraph_rl.tasks.values import random_frames_to_goal
-
-    of = groups(raw, "agent", "depth")
-    depths = sorted({depth for _, depth in of}, key=int)
-    chance = []
-    for depth in depths:
-        alone = curricula.load("single_task", depth=int(depth))
-        chance.append(f"{alone.num_frames / random_frames_to_goal(alone.tasks[0]):.2g}")
-    rows = [["*goals that random actions find*", *chance]]
-    for agent in dict.fromkeys(agent for agent, _ in of):
-        each = [of.get((agent, depth), []) for depth in depths]
-        rows.append([f"`{agent}`", *map(solved, each)])
-    return table(["", *(f"depth {depth}" for depth in depths)], rows)
-
-
-def solved(lines: Raw) -> str:
-    """How many seeds have a greedy success of at least 0.9, and the mean return."""
-    if not lines:
-        return ""
-    share = share_of([float(line["greedy_success"]) >= 0.9 for line in lines])
-    return f"{share}; {cell(lines, 'greedy_return')}"
-
-
-def main_job(raw: Raw) -> str:
-    """The performance matrix of the main job, mean over seeds."""
-    of = groups(raw, "block", "label")
-    blocks, tasks = (list(dict.fromkeys(line[key] for line in raw)) for key in ("block", "label"))
-    rows = [[block, *(cell(of[block, task], "return_mean") for task in tasks)] for block in blocks]
-    return table(["after block", *tasks], rows)
-
-
-def collect_main_job(folder: Path) -> None:
-    """Write the evaluations of all runs of the main job under a folder."""
-    from ctgraph_rl.log.files import LOG
-    from ctgraph_rl.log.run_log import RunLog
-
-    lines = []
-    for run in sorted(folder.rglob("evaluations.csv")):
-        kept, (about,) = (
-            ("seed", "block", "frames", "label", "return_mean"),
-            RunLog.read(run.parent / LOG).of_kind("run"),
-        )
-        with open(run, newline="", encoding="utf-8") as file:
-            lines += [{**{key: line[key] for key in kept}, **machine_of(about)} for line in csv.DictReader(file)]
-    write("main_job", lines)
-
-
-def learned_and_met() -> dict[str, str]:
-    """What the page says of A2C on CT-FO-B2: seeds that learned each goal, by sampled episodes, and rewards met."""
-    solved = [line for line in read("baselines_fo_b2") if line["agent"] == "a2c"]
-    met = groups(read(REWARDS_MET), "task")
-    found = {}
-    for task, lines in groups(solved, "task").items():
-        goal, counts = task[0].replace(".", ""), [int(line["rewards_met"]) for line in met[task]]
-        found[f"learned_{goal}"] = f"{sum(float(line['sampled_success']) >= 0.9 for line in lines)} of {len(lines)}"
-        found[f"met_{goal}"] = f"{min(counts)} to {max(counts)}"
-    return found
-
-
-def verdicts() -> dict[str, str]:
-    """Return what the page says first of instances, of other agents with memory and of the search."""
-    depth_2 = [line for line in read(search.NAME) if line["depth"] == "2"]
-    found = search.searching(depth_2)
-    return {
-        "instances_change": instances_change(),
-        "searching": f"{sum(found)} of {len(found)}",
-    }
-
-
-def rerun() -> dict[str, str]:
-    """What the page says of the cells that were run again, and of those of an earlier revision."""
-    again = read("reruns")
-    changed = [line for line in again if line["agent"] == OLDER and line["table"] == "depth_ladder"]
-    others = [line for line in again if line not in changed]
-    cells = [line for line in read("depth_ladder") if line["agent"] == OLDER]
-    return {
-        "rerun": str(len(others)),
-        "rerun_equal": str(sum(line["equal"] == line["numbers"] for line in others)),
-        "changed": f"{len(changed)} of {len(cells)}",
-    }
-
-
-def page() -> str:
-    """The page: the template with its tables."""
-    on_depths, on_co_b1 = map(read, RND)
-    small = read("baselines_b1") + on_co_b1
-    tables = {name: by_goal(small, name) for name in SMALL}
-    instances = read(INSTANCES)
-    tables |= {f"{name}_instances": by_goal(instances, name, f"{name}, instances") for name in SMALL}
-    tables |= {"memory": memory_tables(), "observability": search.observability_table()}
-    tables |= {f"search_{depth}": search.search_table(depth) for depth in (2, 3)}
-    tables |= {
-        "fo_b2": by_goal(read("baselines_fo_b2"), "fo_b2"),
-        "depth_ladder": ladder(read("depth_ladder") + on_depths),
-    }
-    template = Template((HERE / "template.md").read_text(encoding="utf-8"))
-    return template.substitute(
-        tables,
-        main_job=main_job(read("main_job")),
-        machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME),
-        **learned_and_met(),
-        **verdicts(),
-        **rerun(),
-    )
-
-
-def lifelong_page() -> str:
-    """The page of the methods: its template with its tables."""
-    template = Template((HERE / "lifelong_template.md").read_text(encoding="utf-8"))
-    found = comparison.tables() | pairs.tables() | epochs.tables()
-    read_here = (*comparison.EXPERIMENTS, *map(epochs.eight, comparison.MASKS))
-    return template.substitute(found, machines=machines(*read_here))
-
-
-def draw(path: Path) -> None:
-    """Every seed of every agent on every goal of the four small configurations, beside the ceilings without memory."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    raw = read("baselines_b1")
-    configurations = list(dict.fromkeys(line["configuration"] for line in raw))
-    agents = list(dict.fromkeys(line["agent"] for line in raw))
-    figure, panels = pyplot.subplots(1, len(configurations), figsize=(2.6 * len(configurations), 2.8), sharey=True)
-    for axes, configuration in zip(panels, configurations, strict=True):
-        for place, agent in enumerate(agents):
-            of = [line for line in raw if (line["configuration"], line["agent"]) == (configuration, agent)]
-            for line in of:
-                goal = sorted({other["task"] for other in of}).index(line["task"])
-                where = place - 0.3 + 0.2 * goal
-                axes.plot(where, float(line["greedy_return"]), "o", color="black", markersize=2.5, alpha=0.5)
-                axes.plot(where, float(line["sampled_return"]), "x", color="tab:orange", markersize=3.5, alpha=0.7)
-        axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right", fontsize=7)
-        axes.set_title("CT-" + configuration.upper().replace("_", "-"), fontsize=9)
-    panels[0].set_ylabel("mean return")
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
-
-
-def main() -> None:
-    """See above."""
+from typing import Any
+
+PAGES = {
+    "baselines": "studies.baselines.page",
+    "board": "studies.board",
+    "collectives": "studies.collectives.page",
+    "lifelong": "studies.lifelong.page",
+    "memory": "studies.memory.page",
+    "no_labels": "studies.no_labels.page",
+}
+"""Pages, and the modules that make them."""
+
+APART = {"statistics": "studies.coverage", "together": "studies.together"}
+"""What is made by its name alone: the page of intervals, and the table of docs/how-to/sweeps.md, which is printed."""
+
+OF_AGENTS = ("main_job", "baselines_b1", "baselines_fo_b2", "depth_ladder")
+OF_METHODS = ("masks_ct8_md", "masks_ct8", "masks_ct12", "methods")
+
+TABLES = {
+    **dict.fromkeys(OF_AGENTS, "studies.baselines.runs"),
+    **dict.fromkeys(("rnd_depth", "rnd_co_b1", "baselines_b1_instances", "memory_b1"), "studies.baselines.runs"),
+    **dict.fromkeys(("rl2_search", "rewards_met"), "studies.baselines.runs"),
+    **dict.fromkeys(OF_METHODS, "studies.lifelong.runs"),
+    "memory_cells": "studies.memory.page",
+    "collectives": "studies.collectives.runs",
+    "no_labels": "studies.no_labels.runs",
+    "together_fo_b1": "studies.together",
+}
+"""Tables of raw results, and the modules that collect them."""
+
+GROWING = (*OF_METHODS, "collectives")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Do what the command line says; errors are one message."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        options.run(options)
+    except (OSError, KeyError, ValueError) as error:
+        parser.error(str(error))
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python docs/results/make.py", description=__doc__)
-    commands = parser.add_subparsers(dest="command")
-    collecting = commands.add_parser("collect", help="raw results from runs")
-    names = ("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME, REWARDS_MET, *comparison.EXPERIMENTS)
-    collecting.add_argument("name", choices=names, help="of the table, as its experiment's")
-    collecting.add_argument("runs", type=Path, help="folder with runs")
-    options = parser.parse_args()
-    if options.command == "collect":
-        of = {
-            "main_job": lambda name, runs: collect_main_job(runs),
-            search.NAME: lambda name, runs: write(name, search.collect(runs)),
-            **dict.fromkeys(comparison.EXPERIMENTS, comparison.collect),
-        }
-        try:
-            of.get(options.name, collect)(options.name, options.runs)
-        except (OSError, ValueError) as error:
-            parser.error(str(error))
-        return
-    PAGE.write_text(page(), encoding="utf-8")
-    draw(HERE / "baselines_b1.png")
-    LIFELONG.write_text(lifelong_page(), encoding="utf-8")
-    for name in comparison.MASKS:
-        if read(name):
-            comparison.draw(name, HERE / f"{name}.png")
-    comparison.draw_by_agent(HERE / "methods.png")
+    parser.set_defaults(run=lambda options: _make(*PAGES.values()))
+    commands = parser.add_subparsers(metavar="NAME")
+    for name, module in {**PAGES, **APART}.items():
+        commands.add_parser(name).set_defaults(run=lambda options, module=module: _make(module))
+
+    collecting = commands.add_parser("collect", help="write a table of raw results from runs")
+    collecting.add_argument("table", choices=TABLES, help="as its experiment's name")
+    collecting.add_argument("runs", type=Path, nargs="+", help="folders with runs")
+    collecting.add_argument("--add", action="store_true", help="keep the stored cells that are not under the folders")
+    collecting.set_defaults(run=_collect)
+
+    comparing = commands.add_parser("reruns", help="compare runs with the raw results of the same cells")
+    comparing.add_argument("table", choices=[*OF_AGENTS, *OF_METHODS], help="of raw results")
+    comparing.add_argument("runs", type=Path, help="folder with runs")
+    comparing.set_defaults(run=lambda options: _module("studies.reruns").compare(options.table, options.runs))
+
+    submitting = commands.add_parser("submit", help="make submissions to the board from runs of the track small")
+    submitting.add_argument("runs", type=Path, help="folder with run directories")
+    submitting.add_argument("commit", help="of the code that ran them")
+    submitting.add_argument("--given", default="", help="ends the names of submissions, such as -at_boundaries")
+    submitting.set_defaults(run=_submit)
+
+    measuring = commands.add_parser("gpu", help="measure a GPU within half an hour, into gpu.json and its page")
+    measuring.add_argument("--minutes", type=float, default=28.0, help="of all parts; the tests have at most a third")
+    measuring.add_argument("--seconds", type=float, default=1.0, help="least time of a measurement")
+    measuring.add_argument("--rows", type=int, nargs="+", default=[65536, 262144], help="of the environment")
+    measuring.add_argument("--envs", type=int, nargs="+", default=[256, 4096, 65536], help="of one agent")
+    measuring.add_argument("--together", type=int, nargs="+", default=[64, 1024], help="seeds of one job")
+    measuring.set_defaults(run=lambda options: _module("studies.gpu").measure(options))
+    return parser
+
+
+def _module(name: str) -> Any:
+    """Return a module of a study, which is imported when it is needed: most import PyTorch."""
+    return import_module(name)
+
+
+def _make(*modules: str) -> None:
+    """Make pages and their figures."""
+    for name in modules:
+        _module(name).make()
+
+
+def _collect(options: argparse.Namespace) -> None:
+    """Write a table from runs.
+
+    Raises:
+        ValueError: for ``--add`` with a table that does not grow.
+    """
+    collect = _module(TABLES[options.table]).collect
+    if options.table in GROWING:
+        collect(options.table, options.runs, options.add)
+    elif options.add:
+        raise ValueError(f"--add is for {', '.join(GROWING)}; {options.table} is of all runs under its folders")
+    else:
+        collect(options.table, options.runs)
+
+
+def _submit(options: argparse.Namespace) -> None:
+    """Submit the runs of a folder."""
+    _module("studies.board").submit_all(options.runs, options.commit, options.given)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 
 import pytest
@@ -291,12 +290,9 @@ NO_DATA = {
 
 @pytest.fixture(scope="module")
 def tables():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
-        mastered = __import__("mastered")
-        yield {name: mastered.Table(name) for name in reads.of}
-        for name in ("mastered", "pairs", "comparison", "raw"):
-            sys.modules.pop(name, None)
+    from studies.lifelong import mastered
+
+    return {name: mastered.Table(name) for name in reads.of}
 
 
 @pytest.mark.parametrize(("table", "sentence"), reads.each())

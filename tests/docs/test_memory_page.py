@@ -6,7 +6,6 @@ import csv
 import itertools
 import re
 import shlex
-import sys
 from collections import defaultdict
 
 import pytest
@@ -32,13 +31,9 @@ Lines = list[dict[str, str]]
 
 @pytest.fixture(scope="module")
 def cells():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        before = set(sys.modules)
-        yield __import__("memory_cells")
-        for name in set(sys.modules) - before:
-            if name == "raw" or name.startswith("memory_"):
-                del sys.modules[name]
+    from studies.memory import page
+
+    return page
 
 
 @pytest.fixture(scope="module")

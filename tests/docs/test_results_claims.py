@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import product
 
 import pytest
@@ -25,11 +24,9 @@ RESULTS, LIFELONG, README = words("docs/results/baselines.md"), words("docs/resu
 
 @pytest.fixture(scope="module")
 def make():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
-        yield __import__("make")
-        for name in ("make", "alone", "as_alone", "comparison", "epochs", "raw", "reruns", "search"):
-            sys.modules.pop(name, None)
+    from studies.baselines import page
+
+    return page
 
 
 def test_each_seed_of_the_main_job_knows_the_goal_of_the_last_block_alone(make):
@@ -78,7 +75,8 @@ def test_a2c_on_fo_b2_learns_one_goal_in_some_seeds_and_meets_the_other(make):
 
 
 def test_instances_cost_nothing_greedily_and_serve_dqn_as_dice(make):
-    alone = sys.modules["alone"]
+    from studies.baselines import instances as alone
+
     greedy, sampled = alone.changes("greedy"), alone.changes("sampled")
     two = {key for key in greedy if key[0] != "fo_b1" and key[1] in ("1.2", "2.1")}
 
@@ -116,7 +114,8 @@ def test_the_experiment_of_instances_is_that_of_constant_images_with_noise_and_r
 
 
 def test_rl2_searches_as_the_best_policy_does_at_depth_2_in_four_of_five_seeds(make):
-    search = sys.modules["search"]
+    from studies.baselines import search
+
     lines = [line for line in make.read(search.NAME) if line["depth"] == "2"]
     seeds = {
         seed: [float(line["greedy_success"]) for line in each] for (seed,), each in make.groups(lines, "seed").items()
@@ -152,10 +151,12 @@ def test_the_other_agents_with_memory_solve_what_they_were_run_on_in_every_seed(
 
 
 def test_a_seed_or_cell_that_is_missing_is_no_table(make, monkeypatch):
-    search, lines = sys.modules["search"], make.read("baselines_b1_instances")
+    from studies.baselines import runs, search
+
+    lines = make.read("baselines_b1_instances")
 
     assert search.whole([{"seed": str(seed)} for seed in (0, 1, 2, 3, 3)]) == []
-    assert make.five_seeds(lines[:4]) == [] and make.five_seeds(lines[:7]) == lines[:5]
+    assert runs.five_seeds(lines[:4]) == [] and runs.five_seeds(lines[:7]) == lines[:5]
     monkeypatch.setattr(search, "read", lambda name: [])
     assert search.search_table(3) == "Depth 3 has no five seeds yet."
 
@@ -166,14 +167,16 @@ def test_rewards_met_are_those_of_the_runs_of_the_table(make):
     assert of["rewards_met"] == of["baselines_fo_b2"]
 
 
-def test_rewards_are_counted_over_all_training_intervals(make, monkeypatch, tmp_path):
+def test_rewards_are_counted_over_all_training_intervals(monkeypatch, tmp_path):
+    from studies.baselines import runs
+
     log = RunLog()
     for episodes, rate in ((4, 0.25), (0, float("nan")), (10, 0.3)):
         log.append("training", block=1, frames=8, episodes=episodes, success_rate=rate)
     monkeypatch.setattr("ctgraph_rl.load", lambda run_dir: type("Trained", (), {"log": log}))
-    monkeypatch.setattr(make, "who_learned", lambda run_dir, trained: {"agent": "a2c"})
+    monkeypatch.setattr(runs, "who_learned", lambda run_dir, trained: {"agent": "a2c"})
 
-    assert make.rewards_met(tmp_path) == {"agent": "a2c", "episodes": 14, "rewards_met": 4}
+    assert runs.rewards_met(tmp_path) == {"agent": "a2c", "episodes": 14, "rewards_met": 4}
 
 
 def test_a2c_ends_near_a_policy_that_always_does_the_same_on_posr_b1(make):
@@ -276,15 +279,18 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     assert "but for seed 2 of depth 4, which had not learned and now has, and seed 1 of depth 5" in RESULTS
 
 
-def test_a_cell_that_was_run_again_takes_the_place_of_its_line(make, monkeypatch, tmp_path):
-    reruns, written = __import__("reruns"), []
+def test_a_cell_that_was_run_again_takes_the_place_of_its_line(monkeypatch, tmp_path):
+    from studies import reruns
+    from studies.baselines import runs
+
+    written = []
     cell = {"configuration": "fo_b1", "depth": "2", "task": "1.1", "agent": "ppo", "seed": "0"}
     numbers = {"greedy_return": "1.0", "greedy_success": "1.0", "sampled_return": "0.5", "sampled_success": "0.5"}
     tables = {"baselines_b1": [cell | numbers], "reruns": [reruns.line_of("baselines_b1", cell, 4, 0)]}
     tables["main_job"] = []
     monkeypatch.setattr(reruns, "read", tables.get)
     monkeypatch.setattr(reruns, "write", lambda name, lines: written.extend(lines))
-    monkeypatch.setattr(make, "measured", lambda run: cell | numbers | {"sampled_return": 0.25})
+    monkeypatch.setattr(runs, "measured", lambda run: cell | numbers | {"sampled_return": 0.25})
     (tmp_path / "metrics.json").write_text("{}")
 
     reruns.compare("baselines_b1", tmp_path)
@@ -295,7 +301,8 @@ def test_a_cell_that_was_run_again_takes_the_place_of_its_line(make, monkeypatch
 
 
 def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have_been_found(make):
-    as_alone = __import__("as_alone")
+    from studies import together as as_alone
+
     found = as_alone.comparisons()
     sizes = {(line["way"], line["group_size"]) for line in make.read(as_alone.NAME)}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 
 import pytest
 from helpers.paths import CHECKOUT
@@ -13,6 +12,7 @@ import curricula
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS
 
 FOLDER = CHECKOUT / "docs" / "results"
+PAGE, LIFELONG = FOLDER / "baselines.md", FOLDER / "lifelong.md"
 WITHOUT_MEMORY = ("a2c", "dqn", "ppo", "ppo_count", "reinforce")
 SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
 GOALS = ("1.1", "1.2", "2.1", "2.2")
@@ -20,10 +20,9 @@ GOALS = ("1.1", "1.2", "2.1", "2.2")
 
 @pytest.fixture(scope="module")
 def make():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        yield __import__("make")
-        del sys.modules["make"]
+    from studies.baselines import page
+
+    return page
 
 
 def task_of(line):
@@ -35,24 +34,26 @@ def test_the_page_is_what_its_raw_results_make(make):
     assert make.page() == make.PAGE.read_text(encoding="utf-8")
 
 
-def test_the_lifelong_page_is_what_its_raw_results_make(make):
-    assert make.lifelong_page() == make.LIFELONG.read_text(encoding="utf-8")
+def test_the_lifelong_page_is_what_its_raw_results_make():
+    from studies.lifelong import page
+
+    assert page.page() == LIFELONG.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("page", ["PAGE", "LIFELONG"])
-def test_no_mean_of_five_seeds_stands_without_its_interval_and_none_leaves_what_is_possible(make, page):
-    tables = [line for line in getattr(make, page).read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+@pytest.mark.parametrize("page", [PAGE, LIFELONG], ids=["agents", "methods"])
+def test_no_mean_of_five_seeds_stands_without_its_interval_and_none_leaves_what_is_possible(page):
+    tables = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
     numbers = re.findall(r"\d\.\d\d(?! \[)", re.sub(r"±\d\.\d\d|\[[^]]*\]", "[]", " ".join(tables)))
     ends = [tuple(map(float, each)) for each in re.findall(r"\[(-?[\d.]+), (-?[\d.]+)\]", " ".join(tables))]
 
     assert numbers == []
     assert len(ends) > 100 and all(low < high for low, high in ends)
-    if page == "PAGE":
+    if page == PAGE:
         assert all(low >= 0 and high <= 1 for low, high in ends)
 
 
 def test_five_runs_that_all_know_everything_leave_half_open(make):
-    page = make.LIFELONG.read_text(encoding="utf-8").split("| fo_b1_4tasks |")[1].split("\n\n")[0]
+    page = LIFELONG.read_text(encoding="utf-8").split("| fo_b1_4tasks |")[1].split("\n\n")[0]
 
     (row,) = [line for line in page.splitlines() if line.startswith("| `mask_lc` |")]
     assert row.split("|")[4].strip() == "1.00 [0.48, 1]; 0.00 [-0.39, 0.39]"
@@ -66,7 +67,8 @@ def test_the_draws_of_the_evaluation_have_their_error(make):
 
 
 def test_a_threshold_does_not_hang_on_the_last_bit(make):
-    comparison = sys.modules["comparison"]
+    from studies.lifelong import comparison
+
     experts = [
         lines
         for (who, _), lines in make.groups(make.read("epochs/masks_ct12"), "method", "seed").items()
@@ -97,7 +99,7 @@ def test_ewc_has_the_results_of_ppo_on_the_first_task_but_for_rounding(make, nam
         others = [a != b for a, b in zip(first["finetune", seed], first["ewc_published", seed], strict=True)]
         assert sum(others) == OF_OTHER_ROUNDING.get(name, {}).get(seed, 0)
     said = "in four of ten seeds of CT8 one to three evaluations of the first task differ"
-    assert said in " ".join(make.LIFELONG.read_text(encoding="utf-8").split())
+    assert said in " ".join(LIFELONG.read_text(encoding="utf-8").split())
 
 
 @pytest.mark.parametrize("name", ["ct8_md", "ct8", "ct12", "fo_b1_4tasks", "fo_b1_4images", "fo_b1_depth2to5"])
@@ -119,14 +121,13 @@ def test_an_evaluation_of_the_lifelong_page_is_one_episode_of_a_return_in_0_to_1
         (["masks_ct8"], "holds no finished run of masks_ct8: give the folder of its runs"),
     ],
 )
-def test_what_cannot_be_collected_is_one_message_and_no_file_changes(
-    make, monkeypatch, capsys, tmp_path, arguments, message
-):
+def test_what_cannot_be_collected_is_one_message_and_no_file_changes(capsys, tmp_path, arguments, message):
+    import make
+
     before = {path: path.read_bytes() for path in FOLDER.glob("*.csv")}
-    monkeypatch.setattr(sys, "argv", ["make.py", "collect", *arguments, str(tmp_path)])
 
     with pytest.raises(SystemExit) as end:
-        make.main()
+        make.main(["collect", *arguments, str(tmp_path)])
 
     assert end.value.code == 2
     assert message in capsys.readouterr().err
@@ -193,7 +194,8 @@ def test_where_nothing_is_left_to_chance_is_as_the_page_says(make):
 
 
 def test_raw_results_say_the_machine_of_each_run_and_where_it_is_not_recorded(make, monkeypatch, tmp_path):
-    raw = sys.modules["raw"]
+    from studies import raw
+
     monkeypatch.setattr(raw, "HERE", tmp_path)
     earlier, new, unknown = {"seed": "0"}, {"machine": "x86_64 AVX512", "cpu": "AMD EPYC"}, {"machine": "x86_64 AVX2"}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import sys
 
 import pytest
 import torch
@@ -104,10 +103,10 @@ def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
 
 
 @pytest.fixture
-def gpu(monkeypatch):
-    monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
-    yield __import__("gpu")
-    del sys.modules["gpu"]
+def gpu():
+    from studies import gpu
+
+    return gpu
 
 
 def test_the_page_says_of_gpus_what_was_measured(gpu):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 from helpers.paths import CHECKOUT
 
@@ -15,11 +13,9 @@ PAGE = CHECKOUT / "docs" / "explanation" / "statistics.md"
 
 @pytest.fixture(scope="module")
 def coverage():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
-        yield __import__("coverage_of_rules")
-        for name in ("coverage_of_rules", "comparison", "raw"):
-            sys.modules.pop(name, None)
+    from studies import coverage
+
+    return coverage
 
 
 def cells(*names: str) -> list[str]:
@@ -33,7 +29,7 @@ def covered(cell: str) -> float:
 
 
 def test_the_page_is_its_template_with_tables(coverage):
-    template = (CHECKOUT / "docs" / "results" / "statistics_template.md").read_text(encoding="utf-8")
+    template = (CHECKOUT / "docs" / "results" / "templates" / "statistics.md").read_text(encoding="utf-8")
     written = template.replace("$draws", f"{coverage.DRAWS:,}")
 
     blocks = PAGE.read_text(encoding="utf-8").split("\n\n")

@@ -10,10 +10,12 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from pathlib import Path
 
 from helpers.paths import CHECKOUT
 
 PACKAGES = ("ctgraph_rl", "curricula", "baselines", "hydra_plugins")
+RESULTS = CHECKOUT / "docs" / "results"
 BY_NAME = ("import_module", "find_spec", "__import__")
 """Functions that import, or look for, a module by its name."""
 
@@ -41,7 +43,7 @@ class Import:
 
     @property
     def is_ours(self) -> bool:
-        return self.module.partition(".")[0] in PACKAGES
+        return self.module.partition(".")[0] in (*PACKAGES, "studies")
 
 
 @dataclass(frozen=True)
@@ -183,16 +185,22 @@ def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
     )
 
 
-def sources_of(*folders: str) -> dict[str, str]:
-    """Source texts of the checkout by the names of their modules."""
-    paths = sorted(path for folder in folders for path in (CHECKOUT / folder).rglob("*.py"))
-    return {".".join(path.relative_to(CHECKOUT).with_suffix("").parts): path.read_text("utf-8") for path in paths}
+def sources_of(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
+    """Source texts of the checkout by the names of their modules, which begin at a root."""
+    paths = sorted(path for folder in folders for path in (root / folder).rglob("*.py"))
+    return {".".join(path.relative_to(root).with_suffix("").parts): path.read_text("utf-8") for path in paths}
 
 
 @cache
 def modules_of_packages() -> list[Module]:
     """The modules of our packages."""
     return read(sources_of(*PACKAGES))
+
+
+@cache
+def modules_of_results() -> list[Module]:
+    """The modules of the pages of results: the command and its studies."""
+    return read(sources_of(".", root=RESULTS))
 
 
 @cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import pytest
 import torch
@@ -15,17 +14,10 @@ FOLDER = CHECKOUT / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
-def make():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        yield __import__("make")
-        for name in ("make", "comparison", "raw"):
-            del sys.modules[name]
+def comparison():
+    from studies.lifelong import comparison
 
-
-@pytest.fixture
-def comparison(make):
-    return sys.modules["comparison"]
+    return comparison
 
 
 def lines(*evaluations):
@@ -82,19 +74,26 @@ def test_the_mean_forward_transfer_is_continual_worlds(comparison):
     assert comparison.transfer(own, alone, [])["forward transfer"].startswith(f"{expected:.2f} ")
 
 
-def test_what_was_not_run_is_named_by_method_and_seed(comparison, monkeypatch):
-    monkeypatch.setattr(comparison, "expected", lambda name: {"method": ["a", "b"], "seed": ["0", "1", "2"]})
-    monkeypatch.setattr(comparison, "read", lambda name: [{"method": "a", "seed": "1"}, {"method": "b", "seed": "2"}])
+@pytest.fixture
+def experiments():
+    from studies.lifelong import experiments
 
-    assert comparison.missing("x") == "Not run yet: 4 of 6 cells, a (seeds 0, 2); b (seeds 0, 1)."
+    return experiments
 
 
-def test_further_seeds_of_an_agent_are_cells_of_its_experiment(comparison, monkeypatch):
-    monkeypatch.setattr(comparison, "expected", lambda name: {"agent": ["a", "b"], "seed": ["0"]})
-    monkeypatch.setattr(comparison, "MORE_SEEDS", {"x": {"b": 3}})
-    monkeypatch.setattr(comparison, "read", lambda name: [{"agent": "a", "seed": "0"}, {"agent": "b", "seed": "1"}])
+def test_what_was_not_run_is_named_by_method_and_seed(experiments, monkeypatch):
+    monkeypatch.setattr(experiments, "expected", lambda name: {"method": ["a", "b"], "seed": ["0", "1", "2"]})
+    monkeypatch.setattr(experiments, "read", lambda name: [{"method": "a", "seed": "1"}, {"method": "b", "seed": "2"}])
 
-    assert comparison.missing("x") == "Not run yet: 2 of 4 cells, b (seeds 0, 2)."
+    assert experiments.missing("x") == "Not run yet: 4 of 6 cells, a (seeds 0, 2); b (seeds 0, 1)."
+
+
+def test_further_seeds_of_an_agent_are_cells_of_its_experiment(experiments, monkeypatch):
+    monkeypatch.setattr(experiments, "expected", lambda name: {"agent": ["a", "b"], "seed": ["0"]})
+    monkeypatch.setattr(experiments, "MORE_SEEDS", {"x": {"b": 3}})
+    monkeypatch.setattr(experiments, "read", lambda name: [{"agent": "a", "seed": "0"}, {"agent": "b", "seed": "1"}])
+
+    assert experiments.missing("x") == "Not run yet: 2 of 4 cells, b (seeds 0, 2)."
 
 
 def write_run(folder, num_frames, fingerprint="f"):
@@ -107,22 +106,94 @@ def write_run(folder, num_frames, fingerprint="f"):
     (folder / "run.jsonl").write_text("".join(json.dumps({"n": 0, **line}) + "\n" for line in kinds))
 
 
-def test_two_runs_that_cannot_be_told_apart_are_refused_and_nothing_is_written(comparison, monkeypatch, tmp_path):
-    written = []
-    monkeypatch.setattr(comparison, "read", lambda name: [])
-    monkeypatch.setattr(comparison, "write", lambda name, lines: written.append(lines))
+@pytest.fixture
+def runs(monkeypatch, tmp_path):
+    """The module that collects runs, with tables in a folder of the test."""
+    from studies import raw
+    from studies.lifelong import runs
+
+    monkeypatch.setattr(raw, "HERE", tmp_path / "stored")
+    monkeypatch.setattr(raw, "GROWING", tmp_path / "growing")
+    return runs
+
+
+def frames_in(folder, name="masks_ct8"):
+    """The frames of the lines of a table in a folder; None where there is no such table."""
+    from studies import raw
+
+    path = folder / f"{name}.csv"
+    return [line["frames"] for line in raw.read(name, folder)] if path.exists() else None
+
+
+def test_two_runs_that_cannot_be_told_apart_are_refused_and_nothing_is_written(runs, tmp_path):
     write_run(tmp_path / "ct8" / "ppo-ewc-seed3-aaaa", 512)
-    comparison.collect("masks_ct8", tmp_path)
+    runs.collect("masks_ct8", [tmp_path])
     write_run(tmp_path / "ct8" / "ppo-ewc-seed3-bbbb", 1024)
 
     with pytest.raises(ValueError, match="two runs of ct8 ppo ewc 3"):
-        comparison.collect("masks_ct8", tmp_path)
+        runs.collect("masks_ct8", [tmp_path])
 
-    assert [[line["frames"] for line in each] for each in written] == [["512"]]
+    assert frames_in(tmp_path / "growing") == ["512"]
 
 
-def test_two_sets_of_experts_of_a_seed_are_refused(comparison, monkeypatch, tmp_path):
-    monkeypatch.setattr(comparison, "read", lambda name: [])
+def test_a_table_grows_apart_and_is_stored_once_when_all_its_cells_are_there(
+    runs, experiments, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr(experiments, "expected", lambda name: {"method": ["ewc", "si"], "seed": ["3"]})
+    growing, stored = tmp_path / "growing", tmp_path / "stored"
+    found = []
+    for method, frames in (("ewc", 512), ("si", 1024)):
+        folder = tmp_path / method
+        write_run(folder / "ct8" / f"ppo-{method}-seed3-aaaa", frames)
+        runs.collect("masks_ct8", [folder])
+        found.append((frames_in(growing), frames_in(stored)))
+
+    assert found == [(["512"], None), (None, ["512", "1024"])]
+    assert capsys.readouterr().out == (
+        "To run for masks_ct8.csv, 1 in all: si 3. The stored files stay as they were until then.\n"
+    )
+
+
+def test_cells_that_were_not_run_again_stay_where_runs_are_added(runs, experiments, monkeypatch, tmp_path):
+    monkeypatch.setattr(experiments, "expected", lambda name: {"method": ["ewc", "si"], "seed": ["3"]})
+    for method, frames in (("ewc", 512), ("si", 1024), ("si", 2048)):
+        folder = tmp_path / f"{method}{frames}"
+        write_run(folder / "ct8" / f"ppo-{method}-seed3-aaaa", frames)
+    runs.collect("masks_ct8", [tmp_path / "ewc512", tmp_path / "si1024"])
+
+    runs.collect("masks_ct8", [tmp_path / "si2048"])
+    replaced = frames_in(tmp_path / "stored")
+    runs.collect("masks_ct8", [tmp_path / "si2048"], add=True)
+
+    assert replaced == ["512", "1024"]
+    assert frames_in(tmp_path / "stored") == ["512", "2048"]
+
+
+def test_stored_tables_of_collectives_do_not_lose_a_run(runs, monkeypatch, tmp_path):
+    from studies import raw
+    from studies.collectives import runs as collectives
+
+    keys = dict.fromkeys(collectives.CELL, "1")
+    lines = [{**keys, "seed": seed, "frames": seed} for seed in ("0", "1")]
+    own = {"method": "mask_lc", "seed": "0", "block": "1", "frames": "1"}
+    for name in ("collectives", "collective_blocks"):
+        raw.write(name, lines)
+    raw.write("selecting", [own])
+    for seed in ("0", "1"):
+        (tmp_path / seed).mkdir()
+        (tmp_path / seed / "collective.jsonl").touch()
+    again = {seed: {**keys, "seed": seed, "frames": "9"} for seed in ("0", "1")}
+    monkeypatch.setattr(collectives, "measured", lambda log: (again[log.parent.name], [again[log.parent.name]]))
+
+    collectives.collect("collectives", [tmp_path / "0"], add=False)
+
+    assert frames_in(tmp_path / "growing", "collectives") == ["9"]
+    assert frames_in(tmp_path / "stored", "collectives") == ["0", "1"]
+    collectives.collect("collectives", [tmp_path / "1"], add=True)
+    assert frames_in(tmp_path / "stored", "collective_blocks") == ["9", "9"]
+
+
+def test_two_sets_of_experts_of_a_seed_are_refused(runs, tmp_path):
     for number, method in enumerate(("ewc", "si")):
         own = tmp_path / "runs" / "experts" / method
         own.mkdir(parents=True)
@@ -134,29 +205,29 @@ def test_two_sets_of_experts_of_a_seed_are_refused(comparison, monkeypatch, tmp_
             file.write(json.dumps({"n": 0, "kind": "experts", "experts": [{"task": 1, "run": f"x/{method}"}]}) + "\n")
 
     with pytest.raises(ValueError, match="two runs of ct8 ppo expert 3"):
-        comparison.collect("masks_ct8", tmp_path)
+        runs.collect("masks_ct8", [tmp_path])
 
 
-def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(comparison, monkeypatch, tmp_path):
+def test_a_run_of_another_curriculum_does_not_take_the_place_of_raw_results(runs, tmp_path):
+    from studies import raw
+
     there = {"curriculum": "ct8", "agent": "ppo", "method": "finetune", "seed": "3", "fingerprint": "other"}
-    monkeypatch.setattr(comparison, "read", lambda name: [there])
+    raw.write("masks_ct8", [there])
     write_run(tmp_path / "ct8" / "ppo-seed3-aaaa", 512)
 
     with pytest.raises(ValueError, match=r"learned another curriculum than masks_ct8\.csv has of ct8 ppo finetune 3"):
-        comparison.collect("masks_ct8", tmp_path)
+        runs.collect("masks_ct8", [tmp_path], add=True)
 
 
-def test_runs_of_another_experiment_are_refused(comparison, monkeypatch, tmp_path):
-    written = []
-    monkeypatch.setattr(comparison, "write", lambda name, lines: written.append(lines))
+def test_runs_of_another_experiment_are_refused(runs, tmp_path):
     write_run(tmp_path / "ct8" / "ppo-seed3-aaaa", 512)
 
     with pytest.raises(ValueError, match="learned ct8, and masks_ct12 is of ct12"):
-        comparison.collect("masks_ct12", tmp_path)
+        runs.collect("masks_ct12", [tmp_path])
     with pytest.raises(ValueError, match="and methods is of fo_b1_4tasks, fo_b1_4images, fo_b1_depth2to5"):
-        comparison.collect("methods", tmp_path)
+        runs.collect("methods", [tmp_path])
 
-    assert written == []
+    assert not (tmp_path / "growing").exists() and not (tmp_path / "stored").exists()
 
 
 def first_block(lines, *tasks):

@@ -30,7 +30,7 @@ from ctgraph_rl import cli, packages
 PAGES = {
     path.relative_to(CHECKOUT).as_posix(): path
     for path in sorted([CHECKOUT / "README.md", *(CHECKOUT / "docs").rglob("*.md")])
-    if not {"generated", "_build"} & {*path.parts} and not path.name.endswith("template.md")
+    if not {"generated", "_build", "templates"} & {*path.parts}
 }
 ELSEWHERE = {
     "README.md": "test_readme",

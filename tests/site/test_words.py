@@ -53,7 +53,7 @@ def shown() -> list[Path]:
     """Files of the checkout that readers and users see."""
     paths = [(path, path.relative_to(CHECKOUT).parts) for path in sources(KINDS)]
     seen = [path for path, parts in paths if parts[0] in FOLDERS + FILES]
-    return [path for path in seen if "results" not in path.parent.name]
+    return [path for path in seen if path.parent.name not in ("results", "templates")]
 
 
 def found(path: Path) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import statistics
-import sys
 from collections import defaultdict
 
 import pytest
@@ -19,11 +18,9 @@ CELL = ("curriculum", "frames_of_block", "exchange", "num_members", "num_epochs"
 
 @pytest.fixture(scope="module")
 def made():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        yield __import__("collectives")
-        for name in ("collectives", "collective_runs", "raw"):
-            sys.modules.pop(name, None)
+    from studies.collectives import page
+
+    return page
 
 
 def read(name: str, *keys: str) -> dict[tuple[str, ...], list[dict[str, str]]]:

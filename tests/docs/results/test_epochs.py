@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from statistics import fmean
 
 import pytest
@@ -19,34 +18,28 @@ TABLES = ("masks_ct8_md", "masks_ct8", "masks_ct12")
 @pytest.fixture(scope="module")
 def measured():
     """The scores of the runs of a method, by the table, the number of epochs and the method."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        epochs, comparison, pairs = (__import__(name) for name in ("epochs", "comparison", "pairs"))
-        found = {}
-        for table in comparison.MASKS:
-            for num, name in ((8, epochs.eight(table)), (1, table)):
-                for (method, _), lines in comparison.groups(comparison.read(name), "method", "seed").items():
-                    if method in METHODS:
-                        scores = comparison.scores(lines) | {"while learning": pairs.while_learning(lines)}
-                        found.setdefault((table, num, method), []).append(scores)
-        yield found
-        for name in ("epochs", "comparison", "pairs", "raw"):
-            sys.modules.pop(name, None)
+    from studies.lifelong import comparison, epochs, pairs
+
+    found = {}
+    for table in comparison.MASKS:
+        for num, name in ((8, epochs.eight(table)), (1, table)):
+            for (method, _), lines in comparison.groups(comparison.read(name), "method", "seed").items():
+                if method in METHODS:
+                    scores = comparison.scores(lines) | {"while learning": pairs.while_learning(lines)}
+                    found.setdefault((table, num, method), []).append(scores)
+    return found
 
 
 @pytest.fixture(scope="module")
 def by_curriculum():
     """For each table the means over seeds and tasks of what methods know at the end and have while learning."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        mastered = __import__("mastered")
-        tables = {name: mastered.Table(name) for name in mastered.GOALS}
-        yield {
-            name: {m: (table.known(m).double().mean().item(), table.areas(m).mean().item()) for m in METHODS}
-            for name, table in tables.items()
-        }
-        for name in ("mastered", "comparison", "pairs", "raw"):
-            sys.modules.pop(name, None)
+    from studies.lifelong import mastered
+
+    tables = {name: mastered.Table(name) for name in mastered.GOALS}
+    return {
+        name: {m: (table.known(m).double().mean().item(), table.areas(m).mean().item()) for m in METHODS}
+        for name, table in tables.items()
+    }
 
 
 def test_in_short_says_on_which_curricula_the_papers_claims_hold(by_curriculum):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 from helpers.claims import Claims, readings, sentences
@@ -138,11 +137,9 @@ def _(t):
 
 @pytest.fixture(scope="module")
 def by_agent():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(CHECKOUT / "docs" / "results"))
-        yield __import__("mastered").ByAgent()
-        for name in ("mastered", "pairs", "comparison", "raw"):
-            sys.modules.pop(name, None)
+    from studies.lifelong import mastered
+
+    return mastered.ByAgent()
 
 
 @pytest.mark.parametrize(("table", "sentence"), reads.each())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import pairwise
 
 import pytest
@@ -21,11 +20,9 @@ RUN = ("curriculum", "stay", "detector", "method", "num_fresh", "boundaries", "s
 
 @pytest.fixture(scope="module")
 def made():
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(str(FOLDER))
-        yield __import__("no_labels")
-        for name in ("no_labels", "pairs", "comparison", "raw"):
-            sys.modules.pop(name, None)
+    from studies.no_labels import page
+
+    return page
 
 
 def labelling(spans, num_tasks):
@@ -166,7 +163,7 @@ def test_with_longer_stays_all_detectors_keep_both_graphs_at_their_price(made):
 
 
 def test_what_is_said_of_ewc_on_new_images_is_what_the_pairs_show(made):
-    from pairs import of_pairs
+    from studies.lifelong.pairs import of_pairs
 
     from ctgraph_rl.report.statistics import holm
 

@@ -1,0 +1,41 @@
+"""The figure main_job.png, README's first: the tree of CT-SU-B1 beside the performance matrix of the main job."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from ctgraph_rl.report.figures.heatmaps import draw_performance
+from ctgraph_rl.report.statistics import Estimate, mean
+from ctgraph_rl.tasks.configurations import ct_su_b1
+from ctgraph_rl.visualize.style import new_figure, save_figure
+from ctgraph_rl.visualize.task_figure import draw_task
+from studies.raw import groups, read
+
+SIZE = 9.0, 4.2
+
+
+def draw(path: Path) -> None:
+    """Draw both parts from the raw results, and write the picture."""
+    figure = new_figure(*SIZE)
+    tree, matrix = figure.subplots(1, 2, width_ratios=[1, 1])
+    draw_task(tree, ct_su_b1())
+    tree.set_title("CT-SU-B1: two decisions, one reward", fontsize=10)
+    labels, rows = performance()
+    draw_performance(matrix, rows, labels, [[number] for number in range(len(labels))])
+    matrix.set_title("LSTM-PPO on su_b1_4tasks: mean return on each goal", fontsize=10)
+    save_figure(figure, path)
+
+
+def performance() -> tuple[list[str], list[list[Estimate]]]:
+    """Return the labels of the tasks, and for each block the mean over seeds on each task, without intervals."""
+    raw = read("main_job")
+    labels = list(dict.fromkeys(line["label"] for line in raw))
+    cells = groups(raw, "block", "label")
+    blocks = dict.fromkeys(line["block"] for line in raw)
+    return labels, [[_mean(cells[block, label]) for label in labels] for block in blocks]
+
+
+def _mean(lines: list[dict[str, str]]) -> Estimate:
+    found = mean([float(line["return_mean"]) for line in lines], bounds=(0, 1))
+    return dataclasses.replace(found, low=None, high=None)

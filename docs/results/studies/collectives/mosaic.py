@@ -1,0 +1,256 @@
+"""MOSAIC on nested goals: the section of collectives.md, made of the raw results of collectives.
+
+`texts` gives what the page's template names.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from itertools import product
+from statistics import fmean, median, variance
+
+from studies.collectives.runs import BLOCKS
+from studies.raw import Raw, groups, mean_of, numbers_in, read, table
+
+CURRICULUM, DEPTHS, BATCH = "ct28_mosaic_skips_d5", range(2, 10), 512
+"""The curriculum of MOSAIC's members, a task each, the depths of its tasks, and frames of a batch."""
+
+HALF, ALL = "14", "28"
+"""Members of the collectives: of the first two families of tasks, or of all four."""
+
+SECOND_HALF = 14_000
+"""Seeds of isolated members of the other two families, which are run as a collective of 14 of their own: this much more
+than the seed of all 28, since member i has the seed of its collective + 1000 i."""
+
+ALONE = (0.98, 0.98, 0.34, 0.11, 0.0, 0.0, 0.0, 0.0)
+SHARED = (1.0, 0.99, 0.98, 0.95, 0.97, 0.91, 0.74, 0.58)
+"""Published final returns at these depths, means over families and five seeds of the public raw data."""
+
+COLUMNS = (
+    ("isolated", "isolated", HALF, ALONE),
+    ("MOSAIC", "mosaic", ALL, SHARED),
+    ("MOSAIC without similarity", "mosaic_no_similarity", ALL, ()),
+    ("MOSAIC, 14 members", "mosaic", HALF, ()),
+    ("MOSAIC without similarity, 14 members", "mosaic_no_similarity", HALF, ()),
+)
+"""Title, exchange, members of a collective and published returns of the columns of one epoch."""
+
+NAMES = {"isolated": "isolated", "mosaic": "MOSAIC", "mosaic_no_similarity": "MOSAIC without similarity"}
+"""Exchanges and their names, in the order of the page."""
+
+SUMS = {"isolated": (9.5, 1.0), "mosaic": (25.7, 0.8), "mosaic_no_similarity": (19.9, None)}
+"""Published sums of the 28 final returns, means over five seeds, with half the width of their 95 % t-interval."""
+
+NUM_PUBLISHED = 5
+
+FOUND_ALONE = ("13", "34", "69, 7 of 20", *["not stated"] * 5)
+FOUND_SHARED = ("not stated", "not stated", "32", "42", "48", "58", "68", "74")
+"""Published batches until a return of 0.9 at these depths, medians over the runs that reached it."""
+
+
+@cache
+def _cells() -> dict[tuple[str, ...], Raw]:
+    return groups(read(BLOCKS), "curriculum", "exchange", "num_epochs", "num_members")
+
+
+def blocks(exchange: str, num_epochs: str, num_members: str) -> Raw:
+    """Return the blocks of the members of some collectives: one for each seed and member."""
+    return _cells().get((CURRICULUM, exchange, num_epochs, num_members), [])
+
+
+def depth_of(line: dict[str, str]) -> int:
+    """Return the depth of a block's task."""
+    return 1 + line["task"].count(".")
+
+
+def by_depth(
+    exchange: str, num_members: str, num_epochs: str = "1", column: str = "final_return"
+) -> dict[int, list[float]]:
+    """Return a column of blocks by depth: isolated members' own values, of others means of a seed."""
+    found: dict[int, dict[tuple[str, str], list[float]]] = {}
+    for line in blocks(exchange, num_epochs, num_members):
+        if line[column]:
+            sample = (line["seed"], line["member"] if exchange == "isolated" else "")
+            found.setdefault(depth_of(line), {}).setdefault(sample, []).append(float(line[column]))
+    return {depth: [sum(each) / len(each) for each in found[depth].values()] for depth in sorted(found)}
+
+
+def sums(exchange: str, num_members: str) -> list[float]:
+    """Return the sum of the final returns of all members of each seed; isolated members are run in two halves."""
+    halves = exchange == "isolated"
+    lines = blocks(exchange, "1", HALF if halves else num_members)
+    found = {int(seed): math.fsum(numbers_in(each, "final_return")) for (seed,), each in groups(lines, "seed").items()}
+    if not halves:
+        return list(found.values())
+    first = [seed for seed in found if seed < SECOND_HALF]
+    if num_members == HALF:
+        return [found[seed] for seed in first]
+    return [found[seed] + found[seed + SECOND_HALF] for seed in first if seed + SECOND_HALF in found]
+
+
+def sums_table() -> str:
+    """Return the sums of final returns beside the published ones."""
+    rows = []
+    for number in (HALF, ALL):
+        for exchange, name in NAMES.items():
+            if found := sums(exchange, number):
+                row = [number, name, str(len(found)), mean_of(found, (0, int(number)))]
+                rows.append([*row, *(published(exchange, found) if number == ALL else ("not stated", ""))])
+    head = ["members", "exchange", "seeds", "sum of final returns", "published", "difference"]
+    return table(head, rows)
+
+
+def published(exchange: str, found: Sequence[float]) -> tuple[str, str]:
+    """Return a published sum, and the difference of ours from it with Welch's 95 % interval."""
+    value, half = SUMS[exchange]
+    stated = f"{value}" if half is None else f"{value} \u00b1 {half}"
+    if len(found) < 2:
+        return stated, f"{fmean(found) - value:+.1f}"
+    low, high = welch(found, value, half)
+    return stated, f"{fmean(found) - value:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def verdicts() -> str:
+    """Return which intervals of differences from the published sums include 0."""
+    lines = []
+    for exchange, name in NAMES.items():
+        found, (value, half) = sums(exchange, ALL), SUMS[exchange]
+        if len(found) > 1:
+            low, high = welch(found, value, half)
+            verdict = f"{'includes' if low <= 0 <= high else 'excludes'} 0, and is {high - low:.1f} wide"
+            lines.append(f"- {name}, {len(found)} seeds: the interval of the difference {verdict}.")
+    return "\n".join(lines)
+
+
+def never(exchange: str) -> str:
+    """Return the tasks, among 28 members, whose final return is below 0.5 in each seed."""
+    of = groups(blocks(exchange, "1", ALL), "task", "member")
+    failed = [task for (task, _), lines in of.items() if max(numbers_in(lines, "final_return")) < 0.5]
+    return ", ".join(f"`{task.removeprefix('goal')}`" for task in failed) or "none"
+
+
+def most_apart() -> tuple[int, float]:
+    """Return the depth at which MOSAIC's sum of returns differs most from the published one, and by how much."""
+    members = {task: depth_of({"task": task}) for (task,) in groups(blocks("mosaic", "1", ALL), "task")}
+    apart = {}
+    for depth, values in by_depth("mosaic", ALL).items():
+        apart[depth] = [*members.values()].count(depth) * (fmean(values) - SHARED[depth - 2])
+    return max(apart.items(), key=lambda each: abs(each[1]))
+
+
+def welch(found: Sequence[float], value: float, half: float | None) -> tuple[float, float]:
+    """Return Welch's 95 % interval of a mean less a published one, whose own interval is value +- half.
+
+    A published value without an interval is taken as exact.
+    """
+    from scipy.stats import t
+
+    ours, count = variance(found) / len(found), len(found) - 1
+    theirs = 0.0 if half is None else (half / t.ppf(0.975, NUM_PUBLISHED - 1)) ** 2
+    freedom = (ours + theirs) ** 2 / (ours**2 / count + theirs**2 / (NUM_PUBLISHED - 1))
+    error = t.ppf(0.975, freedom) * math.sqrt(ours + theirs)
+    return fmean(found) - value - error, fmean(found) - value + error
+
+
+def returns_table() -> str:
+    """Return the final returns of members by the depths of their tasks, beside the published ones."""
+    rows = []
+    returns = [by_depth(exchange, number) for _, exchange, number, _ in COLUMNS]
+    for place, depth in enumerate(DEPTHS):
+        stated = [f"{values[place]:.2f}; " if values else "" for *_, values in COLUMNS]
+        cells = [mean_of(each[depth], (0, 1)) if depth in each else "-" for each in returns]
+        rows.append([str(depth), *(there + cell for there, cell in zip(stated, cells, strict=True))])
+    return table(["depth", *(name for name, *_ in COLUMNS)], rows)
+
+
+def epochs_table() -> str:
+    """Return the final returns with eight epochs, by depth."""
+    returns = [by_depth(exchange, HALF, "8") for exchange in ("isolated", "mosaic")]
+    rows = [
+        [str(depth), *(mean_of(each[depth], (0, 1)) for each in returns)]
+        for depth in DEPTHS
+        if all(depth in each for each in returns)
+    ]
+    return table(["depth, with 8 epochs", "isolated", "MOSAIC, 14 members"], rows)
+
+
+def times_table() -> str:
+    """Return the batches until members first have a return of 0.9, by depth, beside the published ones."""
+    found: dict[tuple[str, int], list[str]] = {}
+    for _, exchange, number, _ in COLUMNS[: len(NAMES)]:
+        for line in blocks(exchange, "1", number):
+            found.setdefault((exchange, depth_of(line)), []).append(line["frames_to_learn"])
+    rows = []
+    for depth, alone, shared in zip(DEPTHS, FOUND_ALONE, FOUND_SHARED, strict=True):
+        ours = [_batches(found.get((exchange, depth), [])) for exchange in NAMES]
+        rows.append([str(depth), f"{alone}; {ours[0]}", f"{shared}; {ours[1]}", ours[2]])
+    return table(["depth", *NAMES.values()], rows)
+
+
+def _batches(frames: Sequence[str]) -> str:
+    """Return the median number of batches of those who reached it, and how many did where not all did."""
+    reached = sorted(int(each) // BATCH for each in frames if each)
+    middle = f"{median(reached):g}" if reached else "never"
+    return f"{middle}, {len(reached)} of {len(frames)}" if 0 < len(reached) < len(frames) else middle
+
+
+def agreements() -> str:
+    """Return which published returns lie in the intervals of our own, and which do not."""
+    from ctgraph_rl.report import statistics
+
+    lines = []
+    for name, exchange, number, values_published in COLUMNS:
+        within: list[str] = []
+        beyond: list[str] = []
+        for depth, values in by_depth(exchange, number).items() if values_published else ():
+            found = statistics.mean(values, bounds=(0, 1))
+            if found.low is not None and found.high is not None:
+                is_within = found.low - 0.005 <= values_published[depth - 2] <= found.high + 0.005
+                (within if is_within else beyond).append(str(depth))
+        if within or beyond:
+            inside, outside = (", ".join(depths) or "none" for depths in (within, beyond))
+            lines.append(f"- {name}: in the interval at depth {inside}; not at {outside}.")
+    return "\n".join(lines)
+
+
+def settled(num_epochs: str) -> tuple[float, int]:
+    """Return the mean share of batches below 0.9 of isolated members that once had more, and their number."""
+    shares = [each for values in by_depth("isolated", HALF, num_epochs, "share_below").values() for each in values]
+    return sum(shares) / len(shares), len(shares)
+
+
+def runs() -> str:
+    """Return how many seeds there are of each exchange."""
+    kinds = [(number, "1", exchange) for number, exchange in product((ALL, HALF), NAMES)]
+    kinds += [(HALF, "8", exchange) for exchange in ("isolated", "mosaic")]
+    counts = {kind: len(sums(kind[2], kind[0])) for kind in kinds if kind[1] == "1"}
+    counts |= {kind: len(groups(blocks(kind[2], "8", HALF), "seed")) for kind in kinds if kind[1] == "8"}
+    parts = [
+        f"{count} of {NAMES[exchange]} with {number} members and {epochs} epoch{'s' * (epochs != '1')}"
+        for (number, epochs, exchange), count in counts.items()
+        if count
+    ]
+    return ", ".join(parts)
+
+
+def texts() -> dict[str, str]:
+    """Return what the template of the page names."""
+    found = {
+        "mosaic": returns_table(),
+        "mosaic_epochs": epochs_table(),
+        "mosaic_times": times_table(),
+        "agreements": agreements(),
+        "mosaic_sums": sums_table(),
+        "mosaic_verdicts": verdicts(),
+        "mosaic_runs": runs(),
+        "never_shared": never("mosaic"),
+        "never_any": never("mosaic_no_similarity"),
+    }
+    depth, apart = most_apart()
+    found |= {"apart_depth": str(depth), "apart": f"{apart:+.1f}"}
+    for epochs in ("1", "8"):
+        share, count = settled(epochs)
+        found |= {f"below_{epochs}": f"{share:.2f}", f"below_n_{epochs}": str(count)}
+    return found

@@ -1,0 +1,132 @@
+"""What runs of the lifelong tables have mastered, and when, as their page reads it from the raw results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import torch
+
+from ctgraph_rl.metrics import MASTERED, Curves
+from ctgraph_rl.report import statistics
+from studies.lifelong import comparison, pairs
+from studies.lifelong.experiments import expected
+from studies.raw import groups, read
+
+METHODS = ("finetune", "ewc_published", "mask_lc", "mask_ri", "mask_blc")
+GOALS = {
+    "masks_ct8": ["000", "001", "010", "011", "100", "101", "110", "111"],
+    "masks_ct12": ["00", "000", "01", "001", "10", "010", "11", "011", "100", "101", "110", "111"],
+    "masks_ct8_md": ["00", "01", "000", "001", "0000", "0001", "00000", "00001"],
+}
+
+
+class Table:
+    """The raw results of a comparison; runs of a method are in the order of their seeds."""
+
+    def __init__(self, name: str):
+        of = groups(read(name), "method", "seed")
+        found = {(method, int(seed)): comparison.curves(lines) for (method, seed), lines in sorted(of.items())}
+        self.curves = {who: [run for (other, _), run in found.items() if other == who] for who, _ in found}
+        self.experts = torch.stack([run.performance for run in self.curves["expert"]])
+        self.alone = self.experts.mean((0, 1))
+        self.goals = GOALS[name]
+
+    def ends(self, method: str) -> torch.Tensor:
+        """bool [seeds, blocks, tasks]: what is mastered after each block."""
+        return torch.stack([run.ends[1:] >= MASTERED for run in self.curves[method]])
+
+    def own(self, method: str) -> torch.Tensor:
+        """bool [seeds, tasks]: what is mastered at the end of its block."""
+        return self.ends(method).diagonal(dim1=1, dim2=2)
+
+    def known(self, method: str) -> torch.Tensor:
+        """bool [seeds, tasks]: what is mastered at the very end."""
+        return self.ends(method)[:, -1]
+
+    def stages(self, method: str) -> torch.Tensor:
+        """float64 [seeds, tasks, evaluations]: each task in its own block."""
+        tasks = range(len(self.alone))
+        return torch.stack([torch.stack([run.own_stage(task) for task in tasks]) for run in self.curves[method]])
+
+    def areas(self, method: str) -> torch.Tensor:
+        """float64 [seeds, tasks]: mean return over a task's own block."""
+        return self.stages(method).mean(-1)
+
+    def gain(self, method: str) -> torch.Tensor:
+        """float64 [seeds, tasks]: over the experts' mean."""
+        return self.areas(method) - self.alone
+
+    def early_shares(self, method: str) -> list[float]:
+        """The share of each run's TPOT that it has in tasks which have not begun."""
+        shares = []
+        for run in self.curves[method]:
+            begun = torch.tensor(run.blocks)[:, None] > torch.arange(len(self.alone))
+            shares.append(((run.performance * ~begun).sum() / run.performance.sum()).item())
+        return shares
+
+    def names(self, mastered: torch.Tensor) -> list[set[str]]:
+        """The goals that are mastered, for each seed."""
+        return [{goal for goal, known in zip(self.goals, seed, strict=True) if known} for seed in mastered.tolist()]
+
+    def since_success(self, *methods: str) -> torch.Tensor:
+        """bool [N]: whether a task is mastered, at all evaluations that follow the first success in its block."""
+        stages = torch.cat([self.stages(method).flatten(0, 1) for method in methods])
+        return torch.cat([stage[int(stage.double().argmax()) + 1 :] for stage in stages >= MASTERED if stage.any()])
+
+    def transfer_of_mask_lc(self) -> tuple[float, float]:
+        """Its forward transfer on CT8 multi-depth: as in the table, and with the first task."""
+        transfer = (self.gain("mask_lc") / (1 - self.alone)).mean(0)
+        return transfer[2:].mean().item(), transfer[[0, 2, 3, 4, 5, 6, 7]].mean().item()
+
+    def mean_areas(self) -> dict[str, float]:
+        """The mean return of each method over all blocks."""
+        return {method: self.areas(method).mean().item() for method in METHODS}
+
+    def pairs_of_areas(self) -> dict[tuple[str, str], float | None]:
+        """The p-values of all pairs of methods by the mean return over all blocks, corrected for all of them."""
+        of = {method: self.areas(method).mean(1) for method in METHODS}
+        pairs = list(combinations(METHODS, 2))
+        corrected = statistics.holm([self.p_value(of[one], of[other]) for one, other in pairs])
+        return dict(zip(pairs, corrected, strict=True))
+
+    @staticmethod
+    def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
+        """The p-value of the paired test of two methods, a number for each seed."""
+        return statistics.compare(first.tolist(), second.tolist()).p_value
+
+    def blocks_of_depth_3(self) -> list[tuple[str, set[str]]]:
+        """The goal of each block of depth 3 of fine-tuning on CT12, and all goals that it has at the end of it."""
+        places = [place for place, goal in enumerate(self.goals) if len(goal) == 3]
+        return [(self.goals[j], known) for j in places for known in self.names(self.ends("finetune")[:, j])]
+
+
+class ByAgent:
+    """The raw results of methods by agents."""
+
+    def __init__(self) -> None:
+        self.of = groups(read("methods"), "curriculum", "method", "agent", "seed")
+        self.swept = expected("methods")
+
+    def runs(self, axis: str, method: str, agent: str) -> list[Curves]:
+        """Runs of one cell, in the order of their seeds."""
+        cell = (f"fo_b1_{axis}", method, agent)
+        found = {int(key[3]): lines for key, lines in self.of.items() if key[:3] == cell}
+        return [comparison.curves(lines) for _, lines in sorted(found.items())]
+
+    def known(self, axis: str, method: str, agent: str) -> torch.Tensor:
+        """bool [seeds, tasks]: what is mastered at the end."""
+        return torch.stack([run.performance[-1] >= MASTERED for run in self.runs(axis, method, agent)])
+
+    def own(self, axis: str, method: str, agent: str) -> torch.Tensor:
+        """bool [seeds, tasks]: what is mastered at the end of its block."""
+        return torch.stack([run.ends[1:].diagonal() >= MASTERED for run in self.runs(axis, method, agent)])
+
+    def against_finetuning(self, agent: str) -> dict[str, statistics.Comparison]:
+        """Each method against fine-tuning with one agent on each curriculum."""
+        return pairs.against_finetuning([agent])
+
+    def keeps_and_finds(self, methods: Sequence[str]) -> tuple[bool, list[int]]:
+        """Whether PPO with each method keeps all depths that it learned, and in how many seeds it learns the last."""
+        own, known = ([of("depth2to5", method, "ppo") for method in methods] for of in (self.own, self.known))
+        return all(map(torch.equal, own, known)), [int(each[:, -1].sum()) for each in own]

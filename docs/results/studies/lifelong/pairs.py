@@ -1,0 +1,101 @@
+"""Paired comparisons of methods on the pages of results: seed by seed, with p-values corrected for their number.
+
+The runs of two methods on one curriculum with one agent and seed are a pair: they share the images, the initial weights
+and the evaluation's draws, and where both learn the first task alike, its results. Five pairs have no p-value below
+0.06, so pairs of several curricula, or of several agents, are tested together where there are no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from ctgraph_rl import metrics
+from ctgraph_rl.report import statistics
+from ctgraph_rl.report.statistics import LEVEL, Comparison
+from studies.lifelong import comparison
+from studies.lifelong.experiments import MASKS, MORE_SEEDS, expected
+from studies.raw import Raw, groups, read, shown, table
+
+COMBINED, ALONE, OTHERS = ("mask_lc", "mask_blc"), "mask_ri", ("finetune", "ewc_published")
+BASE = "finetune"
+
+Measured = dict[tuple[str, ...], float]
+"""A number of each run, by what tells pairs apart."""
+
+
+def at_the_end(lines: Raw) -> float:
+    """Mean return on all tasks at the end of a run."""
+    return float(comparison.curves(lines).performance[-1].mean())
+
+
+def while_learning(lines: Raw) -> float:
+    """Mean return on each task over the evaluations of its own block, mean over tasks."""
+    return float(metrics.stage_areas(comparison.curves(lines)).mean())
+
+
+def claims() -> dict[str, Comparison]:
+    """The two claims of the paper on masks, each for all pairs of methods that it is about, of the three curricula."""
+    raw = [{**line, "curriculum": name} for name in MASKS for line in read(name)]
+    of = groups(raw, "method", "curriculum", "seed")
+    end, learning = ({cell: measure(lines) for cell, lines in of.items()} for measure in (at_the_end, while_learning))
+    found = {}
+    for mask in (ALONE, *COMBINED):
+        for other in OTHERS:
+            found[f"at the end, `{mask}` - `{other}`"] = of_pairs(end, mask, other)
+    for mask in COMBINED:
+        found[f"while learning, `{mask}` - `{ALONE}`"] = of_pairs(learning, mask, ALONE)
+    return found
+
+
+def against_finetuning(agents: Collection[str]) -> dict[str, Comparison]:
+    """Each method against fine-tuning on each curriculum, pairs of some agents, by the mean return at the end."""
+    raw = [line for line in read("methods") if line["agent"] in agents]
+    of = groups(raw, "curriculum", "method", "agent", "seed")
+    swept, found = expected("methods"), {}
+    for curriculum in swept["curriculum"]:
+        measured = {cell[1:]: at_the_end(lines) for cell, lines in of.items() if cell[0] == curriculum}
+        for method in swept["method"]:
+            if method != BASE:
+                found[f"{curriculum}, `{method}`"] = of_pairs(measured, method, BASE)
+    return found
+
+
+def of_pairs(measured: Mapping[tuple[str, ...], float], first: str, second: str) -> Comparison:
+    """Compare two methods over all pairs that both have."""
+    pairs = [
+        (value, measured[second, *cell])
+        for (method, *cell), value in measured.items()
+        if method == first and (second, *cell) in measured
+    ]
+    values, others = zip(*pairs, strict=True)
+    return statistics.compare(values, others, bounds=(0.0, 1.0))
+
+
+def rows(found: Mapping[str, Comparison]) -> str:
+    """A line for each comparison, its p-value corrected for all of them."""
+    corrected = statistics.holm([each.p_value for each in found.values()])
+    lines = [_row(name, each, p) for (name, each), p in zip(found.items(), corrected, strict=True)]
+    return table(["", "difference", "pairs", "better, equal, worse", "p", "p (Holm)", ""], lines)
+
+
+def _row(name: str, each: Comparison, corrected: float | None) -> list[str]:
+    record = ", ".join(map(str, (each.wins, each.ties, each.losses)))
+    n = each.difference.n
+    clear = corrected is not None and corrected <= 1 - LEVEL
+    said = "" if clear else f"not distinguishable with {n} pairs"
+    return [name, shown(each.difference), str(n), record, *map(_p, (each.p_value, corrected)), said]
+
+
+def _p(value: float | None) -> str:
+    return "-" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def tables() -> dict[str, str]:
+    """What the template of the page names."""
+    alone = MORE_SEEDS["methods"]
+    others = [agent for agent in expected("methods")["agent"] if agent not in alone]
+    return {
+        "claims": rows(claims()),
+        "against_finetuning": rows(against_finetuning(alone)),
+        "against_finetuning_others": rows(against_finetuning(others)),
+    }

@@ -1,0 +1,4 @@
+"""What memory cells solve on confounding graphs: the page memory.md.
+
+`runs` says what is measured of a run; all others make the page.
+"""

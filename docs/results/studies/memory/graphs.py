@@ -1,0 +1,211 @@
+"""What memory.md says by graph: its tables, the totals over graphs, and how it reads the published claim."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from studies.memory.conditions import (
+    GIVEN,
+    NOISE,
+    NOISY,
+    NOISY_AGENTS,
+    SHARED,
+    TO_FIND,
+    UNIQUE,
+    Condition,
+    columns,
+    finished,
+)
+from studies.memory.runs import AGENTS, count, mean, returns, solved, solved_once
+from studies.raw import Raw, interval_of, shown, table
+
+if TYPE_CHECKING:
+    from ctgraph_rl.report.statistics import Comparison
+
+RIVALS = (
+    "dqn, 1 step",
+    "dqn, 6 steps",
+    "qrdqn_lstm",
+    "reinforce",
+    "a2c",
+    "lstm_ppo-amrl_max",
+    "lstm_ppo-amrl_avg",
+    "lstm_ppo-backpropamine",
+)
+"""The agents that the claim names, in its order."""
+
+POOR = 1
+"""The most seeds of five that solve a graph on which an agent is said to do poorly."""
+
+OF_CLAIM = [SHARED, TO_FIND[0], UNIQUE, TO_FIND[1]]
+
+
+def entry(lines: Raw | None) -> str:
+    """Return the seeds that solve the task, in brackets at any evaluation, and the greedy and the training return."""
+    if not lines:
+        return "not run"
+    means = (f"{mean(lines, key):.2f}" for key in ("greedy_return", "training_return"))
+    return f"{sum(solved(lines))} ({sum(solved_once(lines))}); {'; '.join(means)}"
+
+
+def return_table(conditions: list[Condition]) -> str:
+    """Return a line for each agent and a column for each condition."""
+    of = columns(conditions)
+    rows = [[AGENTS[name], *(entry(each.get(name)) for each in of.values())] for name in AGENTS]
+    ceilings = (ceiling(each) for each in of.values())
+    rows.append(["*best policy without memory*", *(f"*{value:.2f}*" for value in ceilings)])
+    return table(["", *(condition.graph for condition in of)], rows)
+
+
+def ceiling(of: Mapping[str, Raw]) -> float:
+    """Return the best return without memory on a graph."""
+    return float(next(iter(of.values()))[0]["ceiling_without_memory"])
+
+
+def speed_table(decisions: str) -> str:
+    """Return the median frames to the first evaluation that solves the task, on graphs with such decisions."""
+    of = columns([each for each in [*GIVEN, *TO_FIND] if each.decisions == decisions])
+    rows = [[AGENTS[name], *(median_frames(each.get(name)) for each in of.values())] for name in AGENTS]
+    heads = [f"p = {each.wait_prob}, {each.num_wait_images}" for each in of]
+    return table(["", *heads[:-1], f"{heads[-1]}, to be found"], rows)
+
+
+def median_frames(lines: Raw | None) -> str:
+    """Return the median over seeds, in thousands of frames, and how many seeds got there."""
+    if not lines:
+        return "not run"
+    from ctgraph_rl.report import statistics
+
+    times = [float(line["frames_to_90"] or math.inf) for line in lines]
+    median, reached = statistics.median_time(times).value, sum(map(math.isfinite, times))
+    return f"never ({reached})" if median is None or math.isinf(median) else f"{median / 1000:.0f} ({reached})"
+
+
+def noise_table() -> str:
+    """Return a line for each graph and agent that learned with noise: without and with it."""
+    of, rows = finished(), []
+    for noisy in NOISY:
+        plain = of.get(noisy._replace(read_noise="0"), {})
+        for name in NOISY_AGENTS:
+            entries = (entry(each.get(name)) for each in (plain, of.get(noisy, {})))
+            rows.append([f"p = {noisy.wait_prob}, {noisy.graph}", AGENTS[name], *entries])
+    return table(["", "", "without noise", f"noise up to {NOISE}"], rows)
+
+
+def with_noise() -> str:
+    """Return how many of all runs with noise solve the task after training, and of those without."""
+    of = finished()
+    noise, plain = (
+        [line for noisy in NOISY for name in NOISY_AGENTS for line in of[noisy._replace(read_noise=level)][name]]
+        for level in (NOISE, "0")
+    )
+    return f"{count(noise)} runs with noise and {count(plain)} without"
+
+
+def totals() -> dict[str, Raw]:
+    """Return the lines of each agent on all graphs with first rewards given, of those that ran on all."""
+    each = columns(GIVEN).values()
+    return {name: [line for of in each for line in of[name]] for name in AGENTS if all(name in of for of in each)}
+
+
+def compared(of: Mapping[str, Raw]) -> dict[str, tuple[Comparison, float]]:
+    """Return the paired comparison of each agent's greedy returns with the LSTM's, and its p-value after Holm."""
+    from ctgraph_rl.report import statistics
+
+    base, others = returns(of["lstm_ppo"]), [name for name in of if name != "lstm_ppo"]
+    found = [statistics.compare(returns(of[name]), base, bounds=(0, 1)) for name in others]
+    corrected = statistics.holm([each.p_value for each in found])
+    return {name: (each, p) for name, each, p in zip(others, found, corrected, strict=True) if p is not None}
+
+
+def total_table() -> str:
+    """Return a line for each agent: how many of all runs solve the task, and the difference from the LSTM."""
+    of = totals()
+    comparisons, rows = compared(of), []
+    for name in sorted(of, key=lambda name: -sum(solved(of[name]))):
+        lines = of[name]
+        row = [
+            AGENTS[name],
+            f"{sum(solved(lines))}",
+            f"{sum(solved_once(lines))}",
+            f"{mean(lines, 'greedy_return'):.2f}",
+        ]
+        if name in comparisons:
+            comparison, p = comparisons[name]
+            row += [shown(comparison.difference), f"{p:.3f}"]
+        rows.append([*row, "", ""][:6])
+    number = len(next(iter(of.values())))
+    heads = [
+        f"solved after training, of {number}",
+        "at any evaluation",
+        "greedy return",
+        "difference from the LSTM",
+        "p",
+    ]
+    return table(["", *heads], rows)
+
+
+def distinguishable() -> tuple[str, str]:
+    """Return the agents whose returns are lower than the LSTM's, p <= 0.05 after Holm, and those not distinguishable.
+
+    Raises:
+        ValueError: for an agent with higher returns, of which the page has no word.
+    """
+    lower: list[str] = []
+    alike: list[str] = []
+    for name, (comparison, p) in compared(totals()).items():
+        if p <= 0.05 and (comparison.difference.value or 0) > 0:
+            raise ValueError(f"{name} has higher returns than the LSTM: the page says otherwise")
+        (lower if p <= 0.05 else alike).append(AGENTS[name])
+    return listed(lower), listed(alike)
+
+
+def lost() -> str:
+    """Return how many runs that solved the task at an evaluation did not after training, by agent; without noise."""
+    each = columns([*GIVEN, *TO_FIND]).values()
+    runs = {name: [line for of in each for line in of.get(name, [])] for name in AGENTS}
+    once = {name: [line for line in lines if line["frames_to_90"]] for name, lines in runs.items()}
+    gone = {name: len(lines) - sum(solved(lines)) for name, lines in once.items()}
+    worst = sorted((name for name in once if gone[name]), key=lambda name: -gone[name] / len(once[name]))
+    parts = [f"{AGENTS[name]} {gone[name]} of {len(once[name])}" for name in worst]
+    whole = f"Of {sum(map(len, once.values()))} runs that solved the task at an evaluation, {sum(gone.values())}"
+    return f"{whole} did not after training: {', '.join(parts)}"
+
+
+def claim_table() -> str:
+    """Return a line for each rival and MOHQA, a column for each graph that the claim can be about."""
+    of = columns(OF_CLAIM)
+    heads = [f"{each.decisions}, {each.rewards.removeprefix('first rewards ')}" for each in OF_CLAIM]
+    rows = [[AGENTS[name], *(short(each.get(name)) for each in of.values())] for name in (*RIVALS, "mohqa")]
+    return table(["", *heads], rows)
+
+
+def short(lines: Raw | None) -> str:
+    """Return the seeds that solve the task after training, in brackets at any evaluation."""
+    return f"{count(lines)} ({sum(solved_once(lines))})" if lines else "not run"
+
+
+def verdict_table() -> str:
+    """Return a line for each graph that the claim can be about: the rivals that do poorly there, and the others."""
+    rows = []
+    for condition, of in columns(OF_CLAIM).items():
+        poor = [AGENTS[name] for name in RIVALS if name in of and sum(solved(of[name])) <= POOR]
+        others = [AGENTS[name] for name in RIVALS if name in of and AGENTS[name] not in poor]
+        lists = (", ".join(names) or "none" for names in (poor, others))
+        rows.append([f"{condition.decisions} decisions, {condition.rewards}", *lists])
+    return table(["", "agrees", "does not agree"], rows)
+
+
+def intervals() -> str:
+    """Return the interval of the probability to solve a task for each number of seeds of five."""
+    from ctgraph_rl.report import statistics
+
+    found = (statistics.solved_rate([place < number for place in range(5)]) for number in range(6))
+    return ", ".join(f"{number} of 5{interval_of(each)}" for number, each in enumerate(found))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence."""
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names) or "no agent"

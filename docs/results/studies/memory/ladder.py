@@ -1,0 +1,117 @@
+"""The search and the ladder: tables and sentences of graphs whose episodes get longer, for `memory_cells`.
+
+memory_ladder.csv has the runs of two experiments. ``memory_search`` tries some values of `SETTINGS` for each cell on
+one graph with the seeds of `SEARCHED`; ``memory_ladder`` gives each cell the setting that did best there.
+"""
+
+from __future__ import annotations
+
+from studies.memory.runs import AGENTS, CELLS, SEEDS, SETTINGS, count, mean, ranking, solved
+from studies.raw import Raw, groups, read, table
+
+NAME = "memory_ladder"
+
+SEARCHED = ("100", "101")
+"""Seeds of the search, which the ladder does not have."""
+
+RUNGS = [(depth, length) for depth in "234" for length in (("6" if depth == "2" else "10"), "30", "100", "300")]
+"""Depth and expected length of the ladder's graphs; the shortest are 6, 8 and 10, of which 8 was not run."""
+
+SHORT = 10
+"""A policy whose episodes take fewer steps on graphs of 100 or 300 steps does not wait."""
+
+LOW = 0.2
+"""A search whose best score is below this has found no setting that learns."""
+
+
+def searched() -> dict[str, dict[tuple[str, ...], Raw]]:
+    """Return the lines of the search by agent and setting, settings in the order of the file, of finished settings."""
+    lines = [line for line in read(NAME) if line["seed"] in SEARCHED]
+    of = {agent: groups(own, *SETTINGS) for (agent,), own in groups(lines, "agent").items()}
+    return {
+        agent: {setting: own for setting, own in each.items() if len(own) == len(SEARCHED)}
+        for agent, each in of.items()
+    }
+
+
+def score(lines: Raw) -> float:
+    """Return what the search maximises: the mean over seeds of the greedy return and of that of acting in training."""
+    return (mean(lines, "greedy_return") + mean(lines, "training_return")) / 2
+
+
+def best(agent: str) -> tuple[str, ...]:
+    """Return the setting that did best in the search, the first of equals."""
+    of = searched()[agent]
+    return max(of, key=lambda setting: score(of[setting]))
+
+
+def search_table() -> str:
+    """Return a line for each cell and a column for each setting, the best one in bold."""
+    of = searched()
+    settings = list(dict.fromkeys(setting for each in of.values() for setting in each))
+    rows = []
+    for name in (name for name in CELLS if name in of):
+        scores = {setting: f"{score(lines):.2f}" for setting, lines in of[name].items()}
+        scores[best(name)] = f"**{scores[best(name)]}**"
+        rows.append([AGENTS[name], *(scores.get(setting, "not run") for setting in settings)])
+    return table(["", *(f"{steps} / {rate} / {entropy}" for _, steps, rate, entropy in settings)], rows)
+
+
+def finished() -> dict[tuple[str, str], dict[str, Raw]]:
+    """Return the lines of each rung and cell with all seeds, which have one setting."""
+    found: dict[tuple[str, str], dict[str, Raw]] = {}
+    lines = [line for line in read(NAME) if line["seed"] not in SEARCHED]
+    for (depth, length, agent, *_), own in groups(lines, "depth", "expected_length", "agent", *SETTINGS).items():
+        if len(own) == SEEDS:
+            found.setdefault((depth, length), {})[agent] = own
+    return {rung: {agent: of[agent] for agent in CELLS if agent in of} for rung, of in found.items()}
+
+
+def wanted() -> list[tuple[str, list[str], dict[str, Raw]]]:
+    """Return the rungs in words, the agents that they are for, and what is finished of each."""
+    of = finished()
+    return [(f"depth {depth}, {length} steps", CELLS, of.get((depth, length), {})) for depth, length in RUNGS]
+
+
+def entry(lines: Raw | None) -> str:
+    """Return the seeds that solve the task, the greedy and the training return, and the training length."""
+    if not lines:
+        return "not run"
+    numbers = (mean(lines, key) for key in ("greedy_return", "training_return", "training_length"))
+    return "{}; {:.2f}; {:.2f}; {:.0f}".format(sum(solved(lines)), *numbers)
+
+
+def ladder_table(depth: str) -> str:
+    """Return a line for each cell, a column for each expected length at a depth."""
+    of = finished()
+    lengths = [length for each, length in RUNGS if each == depth]
+    rows = [[AGENTS[name], *(entry(of.get((depth, length), {}).get(name)) for length in lengths)] for name in CELLS]
+    ceilings = (line["ceiling_without_memory"] for line in read(NAME) if line["depth"] == depth)
+    value = f"*{float(next(ceilings)):.2f}*"
+    rows.append(["*best policy without memory*", *[value] * len(lengths)])
+    return table(
+        ["", *(f"{length} steps, {round(int(length) / (int(depth) + 1), 1):g} apart" for length in lengths)], rows
+    )
+
+
+def texts() -> dict[str, str]:
+    """Return the numbers and lists of the ladder within the text of the page."""
+    of, search = finished(), searched()
+    found = {f"ladder_2_{length}": ranking(of.get(("2", length), {})) for length in ("100", "300")}
+    low = [AGENTS[name] for name in CELLS if name in search and score(search[name][best(name)]) < LOW]
+    runs = [line for each in search.values() for lines in each.values() for line in lines]
+    found["search_low"] = ", ".join(low)
+    by_steps = {steps: [line for line in runs if line["num_steps"] == steps] for steps in ("128", "32")}
+    found["search_steps"] = " and ".join(f"{count(lines)} with {steps}" for steps, lines in by_steps.items())
+    found["search_lstm"] = count(search["lstm_ppo"][best("lstm_ppo")])
+    found["ladder_lstm"] = count(of.get(("2", "100"), {}).get("lstm_ppo"))
+    found["stopped"] = stopped(
+        [lines for (_, length), each in of.items() if length == "300" for lines in each.values()]
+    )
+    return found | {"stopped_100": stopped(list(of.get(("2", "100"), {}).values()))}
+
+
+def stopped(rungs: list[Raw]) -> str:
+    """Return how many runs end with training episodes of fewer than `SHORT` steps."""
+    lengths = [float(line["training_length"]) for lines in rungs for line in lines]
+    return f"{sum(length < SHORT for length in lengths)} of {len(lengths)}"

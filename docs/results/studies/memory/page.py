@@ -1,0 +1,86 @@
+"""Raw results of memory cells on confounding graphs, and memory.md and its figures, which are made of them.
+
+The page has numbers of an agent in a condition once all its seeds are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+
+from studies.memory import figures, graphs, ladder
+from studies.memory.conditions import GIVEN, NAME, NOISY, NOISY_AGENTS, SHARED, TO_FIND, UNIQUE, Condition, finished
+from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking, solved_once
+from studies.raw import HERE, TEMPLATES, machines, write
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write the raw results of the finished runs under some folders.
+
+    The table is of the experiment ``memory_cells``, memory_ladder.csv of ``memory_search`` and ``memory_ladder``.
+    """
+    paths = [path for folder in folders for path in folder.rglob("metrics.json") if "experts" not in path.parts]
+    lines, order = [measured(path.parent) for path in paths], list(AGENTS)
+    on_ladder = [line for line in lines if "expected_length" in line]
+    on_graphs = [line for line in lines if "expected_length" not in line]
+    for table, own, keys in (
+        (name, on_graphs, Condition._fields),
+        (ladder.NAME, on_ladder, ("depth", "expected_length", *SETTINGS)),
+    ):
+        place = [(*(float(line[key]) for key in keys), order.index(line["agent"]), line["seed"]) for line in own]
+        write(table, [own[i] for i in sorted(range(len(own)), key=place.__getitem__)])
+
+
+def not_run() -> str:
+    """Return a list of what the page has no number of, or that it has all."""
+    of, lines = finished(), []
+    wanted = [(str(condition), list(AGENTS), of.get(condition, {})) for condition in [*GIVEN, *TO_FIND]]
+    wanted += [(str(condition), list(NOISY_AGENTS), of.get(condition, {})) for condition in NOISY]
+    for what, agents, each in [*wanted, *ladder.wanted()]:
+        missing = [AGENTS[name] for name in agents if name not in each]
+        if missing:
+            lines.append(f"- {what}: {'all' if len(missing) == len(agents) else ', '.join(missing)}.")
+    return "\n".join(["Not run yet:\n", *lines]) if lines else "All runs that were planned are on this page."
+
+
+def texts() -> dict[str, str]:
+    """Return the numbers and lists within the text of the page."""
+    of = finished()
+    ranked = {"shared": SHARED, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
+    found = {place: ranking(of.get(condition, {})) for place, condition in ranked.items()}
+    for place, condition in (("unique", UNIQUE), ("find_unique", TO_FIND[1])):
+        one_step = of[condition]["dqn, 1 step"]
+        found |= {f"dqn_{place}": count(one_step), f"dqn_{place}_once": str(sum(solved_once(one_step)))}
+        found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
+    found["lower"], found["alike"] = graphs.distinguishable()
+    found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
+    return found | ladder.texts() | {"intervals": graphs.intervals()}
+
+
+def page() -> str:
+    """Return the page: the template with its tables and numbers."""
+    template = Template((TEMPLATES / "memory.md").read_text(encoding="utf-8"))
+    tables = {
+        "totals": graphs.total_table(),
+        "no_waits": graphs.return_table(GIVEN[:1]),
+        "some_waits": graphs.return_table(GIVEN[1:5]),
+        "long_waits": graphs.return_table(GIVEN[5:]),
+        "to_find": graphs.return_table(TO_FIND),
+        "noise": graphs.noise_table(),
+        "speed_shared": graphs.speed_table("shared"),
+        "speed_unique": graphs.speed_table("unique"),
+        "claim": graphs.claim_table(),
+        "verdicts": graphs.verdict_table(),
+        "search": ladder.search_table(),
+        **{f"ladder_depth_{depth}": ladder.ladder_table(depth) for depth in "234"},
+        "not_run": not_run(),
+    }
+    return template.substitute(tables, machines=machines(NAME, ladder.NAME), **texts())
+
+
+def make() -> None:
+    """Write the page and its figures."""
+    (HERE / "memory.md").write_text(page(), encoding="utf-8")
+    figures.draw_returns(HERE / "memory.png")
+    figures.draw_ladder(HERE / "memory_ladder.png")

@@ -1,0 +1,200 @@
+"""The page of detectors of task changes, no_labels.md, made of the raw results of `studies.no_labels.runs`."""
+
+from __future__ import annotations
+
+from statistics import mean
+from string import Template
+
+from studies.lifelong.pairs import of_pairs, rows
+from studies.no_labels import figures
+from studies.no_labels.learners import LEARNERS, finished, values
+from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PAIR, PLANNED, SPANS
+from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
+
+PAGE = HERE / "no_labels.md"
+SOON = 65_536
+"""Frames after a change within which an alarm is counted as one of that change on the page: eight batches."""
+
+HIGH = 0.9
+"""The return of the batch before an alarm from which on little was left to learn."""
+
+
+def delays(lines: Raw) -> list[float]:
+    """Return the frames from each change to the first alarm before the next one; NaN where there is none."""
+    return [float(each) if each != "-" else float("nan") for line in lines for each in line["delays"].split()]
+
+
+def soon(lines: Raw) -> int:
+    """Return the number of changes with an alarm within `SOON` frames."""
+    return sum(each <= SOON for each in delays(lines))
+
+
+def alarms(lines: Raw) -> Raw:
+    """Return the spans of some runs that end with an alarm which is not the first one soon after a change."""
+    own = {tuple(line[key] for key in ("curriculum", "stay", *FOUND, "seed")) for line in lines}
+    found = []
+    for run, spans in groups(read(SPANS), "curriculum", "stay", *FOUND, "seed").items():
+        seen = set()
+        for span in spans if run in own else ():
+            change, after = divmod(int(span["end"]), int(span["stay"]))
+            first = change > 0 and change not in seen
+            if span["alarm"] == "True":
+                seen.add(change)
+                if not (first and after <= SOON):
+                    found.append(span)
+    return found
+
+
+def other_alarms(lines: Raw) -> str:
+    """Return the alarms of `alarms` per 100,000 frames, and how many of them came at a high return."""
+    found = alarms(lines)
+    rate = 100_000 * len(found) / sum(values(lines, "frames"))
+    high = sum(float(span["return_before"]) >= HIGH for span in found)
+    return f"{rate:.2f}; {high} of {len(found)}" if found else "0"
+
+
+def span_of(numbers: list[float], form: str) -> str:
+    """Return the mean over seeds, and the lowest and the highest of them where they differ."""
+    middle, low, high = (format(each, form) for each in (mean(numbers), min(numbers), max(numbers)))
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def returns(lines: Raw, name: str) -> str:
+    """Return the mean over seeds of a metric that has the bounds of returns, with its interval."""
+    low, high = (float(lines[0][f"{end}_return"]) for end in ("lowest", "highest"))
+    return mean_of(values(lines, name), (low, high))
+
+
+def row(name: str, lines: Raw) -> list[str]:
+    """Return the cells of a learner."""
+    cells = [LEARNERS[name], returns(lines, "average_performance"), returns(lines, "online_return")]
+    if not lines[0]["detector"]:
+        return [*cells, *[""] * 5]
+    shares = [
+        [each / frames for each, frames in zip(values(lines, key), values(lines, "frames"), strict=True)]
+        for key in ("frames_not_learned", "frames_rolled_back")
+    ]
+    return [
+        *cells,
+        mean_of(values(lines, "label_agreement"), (-0.5, 1)),
+        f"{soon(lines)} of {len(delays(lines))}",
+        other_alarms(lines),
+        span_of(values(lines, "labels_per_task"), ".2f"),
+        "; ".join(f"{100 * mean(each):.0f} %" for each in shares),
+    ]
+
+
+HEAD = (
+    "",
+    "average performance",
+    "online return",
+    "adjusted Rand index",
+    "changes found soon",
+    "other alarms; at a return of 0.9",
+    "labels per task",
+    "not learned from; undone",
+)
+
+
+def results(curriculum: str, stay: str) -> str:
+    """Return the table of a curriculum."""
+    of = finished().get((curriculum, stay), {})
+    if not of:
+        return "No learner has all its seeds yet."
+    return table(HEAD, [row(name, lines) for name, lines in of.items()])
+
+
+def images() -> str:
+    """Return the table of the image sets of all configurations: average performance."""
+    of = {name: finished().get((name, "204800"), {}) for name in IMAGES}
+    rows = [
+        [LEARNERS[name], *(returns(each[name], "average_performance") if name in each else "" for each in of.values())]
+        for name in PLANNED[IMAGES[0], "204800"]
+    ]
+    return table(["", *(f"`{name}`" for name in IMAGES)], [cells for cells in rows if any(cells[1:])])
+
+
+def on_images(name: str) -> Raw:
+    """Return the lines of a learner on the image sets of all configurations that have all its seeds."""
+    return [line for place in IMAGES for line in finished().get((place, "204800"), {}).get(name, [])]
+
+
+def image_labels() -> str:
+    """Return the table of the labels on the image sets, of all configurations together."""
+    rows = []
+    for name in PLANNED[IMAGES[0], "204800"]:
+        lines = on_images(name)
+        if lines and lines[0]["detector"]:
+            cells = row(name, lines)[4:]
+            shown = [span_of(values(lines, key), ".2f") for key in ("online_return", "label_agreement")]
+            rows.append([LEARNERS[name], str(len(lines)), *shown, *cells])
+    return table(["", "runs", *HEAD[2:]], rows)
+
+
+def compared() -> str:
+    """Return the table of comparisons on the image sets, whose pairs are those of all configurations together."""
+    measured: dict[tuple[str, ...], float] = {
+        (name, place, line["seed"]): float(line["average_performance"])
+        for (place, _), each in finished().items()
+        if place in IMAGES
+        for name, lines in each.items()
+        for line in lines
+    }
+    names = {name for name, *_ in measured}
+    wanted = [(a, b) for a, b in COMPARED if {a, b} <= names]
+    if not wanted:
+        return "No two learners have all their seeds yet."
+    return rows({f"{LEARNERS[a]} - {LEARNERS[b]}": of_pairs(measured, a, b) for a, b in wanted})
+
+
+COMPARED = (
+    ("oracle", "none"),
+    ("swoks, fresh", "none"),
+    ("adwin", "none"),
+    ("announced", "oracle"),
+    ("oracle", "swoks, fresh"),
+    ("oracle", "adwin"),
+)
+
+
+def not_run() -> str:
+    """Return a list of what the page has no number of."""
+    of = finished()
+    missing = {place: [LEARNERS[n] for n in names if n not in of.get(place, {})] for place, names in PLANNED.items()}
+    lines = [
+        f"- `{name}` with stays of {int(stay):,} frames: {'; '.join(each) if (name, stay) in of else 'all'}."
+        for (name, stay), each in missing.items()
+        if each
+    ]
+    return "\n".join(["No number is on this page of:", "", *lines]) if lines else "Everything that was planned has run."
+
+
+def numbers() -> dict[str, str]:
+    """Return the numbers within the text of the page that follow from several tables."""
+    names = {"swoks_online": "swoks, fresh", "adwin_online": "adwin", "oracle_online": "oracle"}
+    online = {key: f"{mean(values(on_images(name), 'online_return')):.2f}" for key, name in names.items()}
+    found = {key.replace("online", "found"): str(soon(on_images(name))) for key, name in names.items()}
+    ends = {name: mean(values(on_images(name), "average_performance")) for name in ("announced", "oracle")}
+    return {**online, **found, "announced_less": f"{ends['announced'] - ends['oracle']:.2f}"}
+
+
+def page() -> str:
+    """Return the page: the template with its tables and numbers."""
+    template = Template((TEMPLATES / "no_labels.md").read_text(encoding="utf-8"))
+    tables = {
+        "masks": results(MASKS, "384000"),
+        "pair": results(PAIR, "51200"),
+        "long_pair": results(PAIR, "204800"),
+        "images": images(),
+        "image_labels": image_labels(),
+        "compared": compared(),
+        "not_run": not_run(),
+    }
+    return template.substitute(tables, machines=machines(NAME), **numbers())
+
+
+def make() -> None:
+    """Write the page and its figures."""
+    PAGE.write_text(page(), encoding="utf-8")
+    figures.draw_strips(HERE / "no_labels.png")
+    figures.draw_images(HERE / "no_labels_ewc.png")

@@ -1,0 +1,120 @@
+"""Raw results of detectors of task changes, from the runs of the experiments ``no_labels`` and ``no_labels_*``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from studies.raw import machine_of, write
+
+NAME, SPANS = "no_labels", "no_labels_spans"
+
+FOUND = ("detector", "method", "num_fresh", "boundaries")
+"""The columns that tell the learners of a curriculum apart."""
+
+MASKS, PAIR = "swoks_2x4", "dick2020_pair"
+IMAGES = ("fo_b1_4images", "su_b1_4images", "co_b1_4images", "posr_b1_4images")
+
+PLANNED = {
+    (MASKS, "384000"): ("announced", "oracle", "swoks", "swoks, fresh", "adwin", "none"),
+    (PAIR, "51200"): ("announced", "oracle", "amd", "swoks", "adwin", "none"),
+    (PAIR, "204800"): ("announced", "oracle", "amd", "swoks, fresh", "adwin", "none"),
+    **{(name, "204800"): ("announced", "oracle", "swoks, fresh", "adwin", "none") for name in IMAGES},
+}
+"""Curricula, frames of a stay, and learners of the experiments."""
+
+PLAIN = (
+    "average_performance",
+    "online_return",
+    "false_alarms",
+    "labels_per_task",
+    "label_agreement",
+    "frames_not_learned",
+    "frames_rolled_back",
+)
+"""Metrics of one value."""
+
+
+def measured(run: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the line of a finished run, and a line for each span of its labels.
+
+    The span that ends with an alarm has the mean return of training in the interval before the alarm's.
+    """
+    from ctgraph_rl.learn.labels import label_spans
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+    from ctgraph_rl.report.bounds import bounds_of_curriculum
+    from ctgraph_rl.tasks.curriculum import Curriculum
+
+    log, curriculum = RunLog.read(run / LOG), Curriculum.from_json(run / "curriculum.json")
+    about, metrics = log.of_kind("run")[0], json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    config, delay = about["config"], metrics["detection_delay"]
+    detector = config.get("detector") or {}
+    bounds = bounds_of_curriculum(curriculum).known
+    which = {
+        "curriculum": curriculum.name.removesuffix(" (modified)"),
+        "stay": curriculum.blocks[0].num_frames,
+        "agent": _module(config["agent"]),
+        "method": _module(config.get("method") or {}) or "finetune",
+        "detector": _module(detector),
+        "stable_phase": detector.get("stable_phase", ""),
+        "num_fresh": detector.get("num_fresh", ""),
+        "boundaries": curriculum.protocol.boundaries,
+        "task_id": curriculum.protocol.task_id,
+        "seed": config["seed"],
+    }
+    undefined = delay["undefined"] is not None and not delay["n_undefined"]
+    training = log.of_kind("training")
+    before = {int(line["frames"]): last["return_mean"] for last, line in pairwise(training)}
+    line = {
+        **which,
+        "frames": curriculum.num_frames,
+        **{name: _value(metrics[name]) for name in PLAIN},
+        "final_returns": " ".join(f"{each:.6g}" for each in metrics["average_performance"]["terms"]),
+        "detection_delay": _value(delay),
+        "delays": "" if undefined else " ".join("-" if each is None else f"{each:.0f}" for each in delay["terms"]),
+        "lowest_return": bounds.low,
+        "highest_return": bounds.high,
+        "fingerprint": about["fingerprint"],
+        "numbers": about["numbers"],
+        **{name: about["versions"][name] for name in ("ctgraph_rl", "torch")},
+        **machine_of(about),
+    }
+    spans = [
+        {
+            **which,
+            **{"start": int(s.start), "end": int(s.end), "label": s.label, "learned": s.learned, "alarm": s.alarm},
+            "return_before": round(before[int(s.end)], 6) if s.alarm else "",
+        }
+        for s in label_spans(log)
+    ]
+    return line, spans
+
+
+def _module(part: dict[str, Any]) -> str:
+    """Return the module of what a configuration builds, such as ``swoks``."""
+    return part["_target_"].split(".")[-2] if part else ""
+
+
+def _value(metric: dict[str, Any]) -> float | str:
+    """Return the value of a metric; nothing where it is undefined."""
+    return "" if metric["value"] is None else round(metric["value"], 6)
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write the raw results of the finished runs under some folders; of equal runs, the last one counts.
+
+    The table has a line for each run, and that of spans a line for each span of frames in which one label acted.
+    """
+    names = {name for name, _ in PLANNED}
+    found: dict[tuple[Any, ...], tuple[dict[str, Any], list[dict[str, Any]]]] = {}
+    for path in (path for folder in folders for path in sorted(folder.rglob("metrics.json"))):
+        if "experts" not in path.parts and path.parent.parent.name in names:
+            line, spans = measured(path.parent)
+            found[tuple(str(line[key]) for key in ("curriculum", "stay", *FOUND, "seed"))] = line, spans
+    in_order = [found[key] for key in sorted(found)]
+    write(name, [line for line, _ in in_order])
+    write(SPANS, [span for _, spans in in_order for span in spans])

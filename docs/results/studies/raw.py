@@ -1,0 +1,160 @@
+"""Raw results as CSV files, which grow under ``runs/results`` while a study runs; and what tables are made of."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ctgraph_rl.report.intervals import Bounds
+    from ctgraph_rl.report.statistics import Estimate
+
+HERE = Path(__file__).resolve().parents[1]
+"""Where raw results, pages and pictures are."""
+
+TEMPLATES = HERE / "templates"
+"""Pages without their tables and numbers."""
+
+GROWING = HERE.parents[1] / "runs" / "results"
+"""Where tables grow until all of their runs are there; git ignores it."""
+
+Raw = list[dict[str, str]]
+
+MACHINE = ("machine", "cpu")
+"""Columns for the kind of machine, with its instruction set, and the CPU's model; earlier files lack them."""
+
+NOT_RECORDED = "not recorded"
+
+MOST_NAMED = 12
+"""Runs that are lacking are named up to so many."""
+
+
+def read(name: str, folder: Path | None = None) -> Raw:
+    """The raw results of a table, as they are stored or in another folder; none if there are none."""
+    path = (folder or HERE) / f"{name}.csv"
+    if not path.exists():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def write(name: str, lines: Sequence[Mapping[str, Any]], folder: Path | None = None) -> None:
+    """Write the raw results of a table, to where they are stored or to another folder.
+
+    Raises:
+        ValueError: where there are none, before the file is touched.
+    """
+    if not lines:
+        raise ValueError(f"no raw results of {name}, whose file stays as it was: give the folder of its runs")
+    columns = dict.fromkeys(column for line in lines for column in line)
+    path = (folder or HERE) / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(columns), restval=NOT_RECORDED)
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def grown(name: str, key: Sequence[str], add: bool) -> Raw:
+    """The raw results that a table has so far while it grows.
+
+    Args:
+        name: of the table.
+        key: columns that tell its runs apart.
+        add: whether runs are added to the stored table: its other runs are among the results.
+    """
+    lines = read(name, GROWING)
+    there = groups(lines, *key)
+    others = [line for line in read(name) if tuple(line[column] for column in key) not in there]
+    return [*others, *lines] if add else lines
+
+
+def grow(tables: Mapping[str, Sequence[Mapping[str, Any]]], lacking: Sequence[str]) -> None:
+    """Write tables that grow: to `GROWING` while runs are lacking, and once, to where they are stored, at the end.
+
+    Args:
+        tables: their lines so far, by name.
+        lacking: the runs that they lack, in words.
+    """
+    for name, lines in tables.items():
+        write(name, lines, GROWING if lacking else None)
+        if not lacking:
+            (GROWING / f"{name}.csv").unlink(missing_ok=True)
+    if lacking:
+        named = ", ".join(lacking[:MOST_NAMED]) + (" and others" if len(lacking) > MOST_NAMED else "")
+        files = ", ".join(f"{name}.csv" for name in tables)
+        print(f"To run for {files}, {len(lacking)} in all: {named}. The stored files stay as they were until then.")
+
+
+def machine_of(about: Mapping[str, Any]) -> dict[str, str]:
+    """The machine of a run, as the first line of its log says it."""
+    return {key: str(about.get(key) or NOT_RECORDED) for key in MACHINE}
+
+
+def machines(*names: str) -> str:
+    """A sentence about the machines that the rows of tables are of."""
+    rows = [line for name in names for line in read(name)]
+    counts = Counter(", ".join(dict.fromkeys(line.get(key) or NOT_RECORDED for key in MACHINE)) for line in rows)
+    return "; ".join(f"{count:,} of {len(rows):,} rows: {what}" for what, count in sorted(counts.items()))
+
+
+def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
+    """Lines with the same values under some keys, in order of appearance."""
+    found: dict[tuple[str, ...], Raw] = {}
+    for line in raw:
+        found.setdefault(tuple(line[key] for key in keys), []).append(line)
+    return found
+
+
+def numbers_in(lines: Raw, column: str) -> list[float]:
+    """A column, one number for each seed."""
+    return [float(line[column]) for line in lines]
+
+
+def mean_of(values: Sequence[float | None], bounds: tuple[float, float] | Bounds) -> str:
+    """Mean over seeds with its interval; seeds without a value are counted, not averaged.
+
+    Args:
+        values: one per seed; None for a seed without.
+        bounds: the lowest and the highest possible value.
+    """
+    from ctgraph_rl.report import statistics
+
+    return shown(statistics.mean(values, bounds=bounds))
+
+
+def share_of(solved: Sequence[bool]) -> str:
+    """How many of the seeds, with the exact interval of their share."""
+    from ctgraph_rl.report import statistics
+
+    return f"{sum(solved)} of {len(solved)}{interval_of(statistics.solved_rate(solved))}"
+
+
+def shown(found: Estimate) -> str:
+    """A value and its interval, such as ``1.00 [0.48, 1]``."""
+    if found.value is None:
+        return "-"
+    missing = f" (n={found.n}/{found.n + found.n_undefined})" if found.n_undefined else ""
+    return f"{_number(found.value)}{interval_of(found)}{missing}"
+
+
+def interval_of(found: Estimate) -> str:
+    """The interval in brackets; nothing without one."""
+    if found.low is None or found.high is None:
+        return ""
+    low, high = (_number(end).removesuffix(".00") for end in (found.low, found.high))
+    return f" [{low}, {high}]"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if 100 <= abs(value) < math.inf else f"{value:.2f}".replace("-0.00", "0.00")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
