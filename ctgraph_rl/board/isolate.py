@@ -1,57 +1,53 @@
 """The code of others in a process of its own: limits of time, memory and disk, and what the system can close off.
 
-On Linux the process gets name spaces of its own, where the system allows them to users: no network, no other process
-in reach, and all files but those of its folder read-only. Limits hold on every POSIX system; `Isolation` says what
-this system cannot do. ``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process: no module
-of others can be imported before all of that is done.
+On Linux bubblewrap closes off everything but the process's own folder; see `ctgraph_rl.board.bubblewrap`. Limits hold
+on every POSIX system; `Isolation` says what is open and what is not limited.
+``python -m ctgraph_rl.board.isolate`` is the first thing that runs in the new process: no module of others can be
+imported before its limits are set.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import math
 import os
 import runpy
 import signal
+import stat
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
+from ctgraph_rl.board import bubblewrap
 from ctgraph_rl.checks import LARGEST_INT, positive, require
+from ctgraph_rl.disk import made_folder
 
 HERE = "ctgraph_rl.board.isolate"
 
-OUTPUT = "output.txt"
-"""The file in its folder that a process prints to."""
-
 MOST_OUTPUT = 2**12
-"""Bytes of `OUTPUT` that are shown: the last ones."""
+"""Bytes of what a process printed that are shown: the last ones."""
 
-MOST_PROCESSES, MOST_FILES, MOST_OPEN = 256, 100_000, 4096
-"""Processes at once, files in the folder and open files of a process."""
+MOST_PROCESSES, MOST_FILES, MOST_DEPTH, MOST_OPEN = 256, 100_000, 64, 4096
+"""Processes at once, files in the folder, folders within each other there, and open files of a process."""
+
+MOST_THREADS = 1024
+"""Of all processes together, where the system holds users to a limit."""
 
 SECONDS_BETWEEN_LOOKS = 0.2
 """At the use of memory and disk."""
 
+SECONDS_TO_END = 5
+"""For the last words of a process that was killed."""
+
 KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "CC", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 """Variables of the environment that a process is given; no other is."""
 
-SOCKETS = ("/run", "/var/run", "/tmp")
-"""Folders in which programs listen on Unix sockets: a process finds them empty, but for what it runs from."""
-
 PROC = Path("/proc")
-
-# from linux/sched.h, linux/mount.h, linux/prctl.h and linux/capability.h
-NEW_USER, NEW_NETWORK, NEW_PROCESSES, NEW_MOUNTS = 0x10000000, 0x40000000, 0x20000000, 0x00020000
-BIND, RECURSIVE, PRIVATE, DETACH = 0x1000, 0x4000, 0x40000, 2
-MOUNT_SETATTR, AT_CWD, AT_RECURSIVE, READ_ONLY = 442, -100, 0x8000, 1
-DIE_WITH_PARENT, DROP_FROM_BOUNDS, NO_NEW_PRIVILEGES, LAST_CAPABILITY = 1, 24, 38, 40
-CAPABILITIES_3 = 0x20080522
 
 
 class Limits(NamedTuple):
@@ -63,26 +59,39 @@ class Limits(NamedTuple):
 
 
 class Isolation(NamedTuple):
-    """What this system closes off for a process of ours."""
+    """How the code of others is closed off here."""
 
-    network: bool
-    files: bool  # all but those of its folder are read-only
-    processes: bool  # others are out of reach, and its own end with it
-    memory: bool  # the use of all its processes is seen; else each alone is limited
-    sockets: bool  # those of `SOCKETS` are out of sight
+    bubblewrap: str | None  # its version; None: it cannot be used
+    why_not: str | None  # why it cannot
+    graphics: bool  # whether the code may use the graphics cards
+    is_root: bool
+
+    def closed(self) -> list[str]:
+        """Return what is closed off, a text for each thing."""
+        if self.bubblewrap is None:
+            return []
+        inside = "it sees no files but its folder, the code, Python and the programs of the system"
+        other = "no other process, socket, shared memory, keyring, device or terminal"
+        return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes its folder alone", other]
 
     def missing(self) -> list[str]:
-        """Return a sentence for each thing that the code of others could do here."""
-        open_ways = {
-            "network": "it can use the network",
-            "files": "it can read and change every file that you can",
-            "processes": "it can signal your other processes and read their environment, and leave some behind",
-            "memory": "its memory is limited for each process alone, and not for all together",
-            "sockets": "it can connect to every Unix socket that you can, such as those of ssh-agent and docker",
-        }
-        reads = "it can read every file that you can"
-        reads += f", and connect to Unix sockets outside {', '.join(SOCKETS)}" if self.sockets else ""
-        return [text for name, text in open_ways.items() if not getattr(self, name)] + [reads] * self.files
+        """Return a text for each thing that the code of others could do here."""
+        if self.bubblewrap is None:
+            return [
+                "it can do all that you can: read and change every file of yours, use the network, signal your other "
+                "processes and read their environment, and leave some behind",
+                *([] if PROC.is_dir() else ["its memory is limited for each process, not for all together"]),
+            ]
+        root = "the system holds root to no number of processes: a burst of them is stopped once it is seen"
+        cards = "graphics cards: it may use all of their memory and of their driver"
+        return [
+            "weaknesses of the kernel stay, and what the processor's caches tell of other programs",
+            "the kernel's own memory for it is not limited, such as buffers of pipes and sockets; neither are files "
+            "that it removed and keeps in a socket",
+            f"memory, disk and processes are looked at {1 / SECONDS_BETWEEN_LOOKS:g} times a second",
+            *([root] if self.is_root else []),
+            *([cards] if self.graphics else []),
+        ]
 
 
 class Outcome(NamedTuple):
@@ -102,20 +111,18 @@ class Outcome(NamedTuple):
         return None if self.code == 0 else f"ended with exit code {self.code}: {last[0]}"
 
 
-def isolation(folder: Path) -> Isolation:
+def isolation(folder: Path, graphics: bool = False) -> Isolation:
     """Return what this system closes off, found by a process that tries.
 
     Args:
         folder: an existing directory for that process.
+        graphics: whether the code of others may use the graphics cards.
     """
     require((os.name == "posix", "verify needs a POSIX system to limit the code of others; use Linux or macOS"))
-    done = subprocess.run(_command({"folder": str(folder.resolve())}), capture_output=True, env=_environment(folder))
-    try:
-        found = json.loads(done.stdout)
-    except ValueError:
-        found = []
-    closed = {name: name in found for name in ("network", "files", "processes", "sockets")}
-    return Isolation(**closed, memory=PROC.is_dir())
+    folder = _prepared(folder)
+    why_not = bubblewrap.why_not(folder, _environment(folder))
+    found = None if why_not is not None else ".".join(map(str, bubblewrap.version() or ()))
+    return Isolation(found, why_not, graphics, is_root=os.geteuid() == 0)
 
 
 def run_isolated(
@@ -124,6 +131,7 @@ def run_isolated(
     folder: Path,
     limits: Limits,
     *,
+    isolated: Isolation,
     paths: Sequence[Path] = (),
     variables: Mapping[str, str] | None = None,
     watch: Callable[[], object] = lambda: None,
@@ -135,6 +143,7 @@ def run_isolated(
         arguments: of the module.
         folder: an existing directory, the only one that it may change; its working directory and its home.
         limits: what it may use.
+        isolated: how it is closed off; what is open was agreed to.
         paths: folders in which it finds more modules, after those that are installed.
         variables: of its environment, beside `KEPT`.
         watch: is called several times a second.
@@ -143,32 +152,53 @@ def run_isolated(
         ValueError: for a limit that is not positive.
     """
     require(*positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk))
+    folder = _prepared(folder)
+    spec = {"limits": limits, "module": module, "arguments": list(arguments)}
+    spec |= {"paths": [str(path.resolve()) for path in paths], "is_confined": isolated.bubblewrap is not None}
+    command = [sys.executable, "-P", "-s", "-m", HERE, json.dumps(spec)]
+    start = time.monotonic()
+    with ExitStack() as stack:
+        opened = ()
+        if isolated.bubblewrap is not None:
+            opened = (stack.enter_context(bubblewrap.program()),)
+            command = bubblewrap.confined(command, folder, paths, filtering=opened[0], graphics=isolated.graphics)
+        environment = {**_environment(folder), **(variables or {})}
+        process = stack.enter_context(_process(command, folder, environment, opened))
+        said = _Tail(process.stdout)
+        stopped = _watched(process, folder, limits, watch)
+        if stopped is not None:
+            _kill(process)
+        code = process.wait()
+    return Outcome(code, stopped, time.monotonic() - start, said.text())
+
+
+class _Tail(threading.Thread):
+    """Reads all that a process prints, and keeps the end."""
+
+    def __init__(self, pipe: IO[bytes] | None) -> None:
+        assert pipe is not None
+        super().__init__(daemon=True)
+        self._pipe, self._kept = pipe, b""
+        self.start()
+
+    def run(self) -> None:
+        """Read until no process has the other end."""
+        with suppress(OSError, ValueError):
+            while read := os.read(self._pipe.fileno(), 2**16):
+                self._kept = (self._kept + read)[-MOST_OUTPUT:]
+
+    def text(self) -> str:
+        """Return the end; what processes that have escaped still print is not waited for."""
+        self.join(SECONDS_TO_END)
+        return self._kept.decode("utf-8", "replace")
+
+
+def _prepared(folder: Path) -> Path:
+    """Return the path of a folder without links, with the folders in it that a process finds elsewhere."""
     folder = folder.resolve()
-    (folder / "tmp").mkdir(exist_ok=True)
-    spec = {"folder": str(folder), "limits": limits, "module": module, "arguments": list(arguments)}
-    spec["paths"] = [str(path.resolve()) for path in paths]
-    environment = {**_environment(folder), **(variables or {})}
-    (folder / OUTPUT).unlink(missing_ok=True)
-    with (folder / OUTPUT).open("x+b") as output:
-        with _process(_command(spec), folder, environment, output) as process:
-            start = time.monotonic()
-            stopped = _watched(process, folder, limits, watch)
-            if stopped is not None:
-                _kill(process)
-            code = process.wait()
-        return Outcome(code, stopped, time.monotonic() - start, _tail(output))
-
-
-def _tail(output: IO[bytes]) -> str:
-    """Return the end of what was printed, from the file as it was opened, whatever now has its name."""
-    size = output.seek(0, os.SEEK_END)
-    output.seek(max(0, size - MOST_OUTPUT))
-    return output.read(MOST_OUTPUT).decode("utf-8", "replace")
-
-
-def _command(spec: Mapping[str, object]) -> list[str]:
-    """Return what starts a process that finds no modules in its working directory or its home."""
-    return [sys.executable, "-P", "-s", "-m", HERE, json.dumps(spec)]
+    for name in bubblewrap.OWN.values():
+        made_folder(folder / name)
+    return folder
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -181,11 +211,24 @@ def _environment(folder: Path) -> dict[str, str]:
 
 @contextmanager
 def _process(
-    command: Sequence[str], folder: Path, environment: Mapping[str, str], output: IO[bytes]
+    command: Sequence[str], folder: Path, environment: Mapping[str, str], opened: Sequence[int]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a process as the first of a group and session of its own; kill all of them however this ends."""
-    streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
-    process = subprocess.Popen(command, cwd=folder, env=dict(environment), start_new_session=True, **streams)
+    """Start a process as the first of a group and session of its own; kill all of them however this ends.
+
+    It gets nothing that is open here but some descriptors, and prints into a pipe.
+    """
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=dict(environment),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        bufsize=0,
+        close_fds=True,
+        pass_fds=opened,
+        start_new_session=True,
+    )
     try:
         yield process
     finally:
@@ -221,12 +264,15 @@ def _watched(process: subprocess.Popen[bytes], folder: Path, limits: Limits, wat
 def _broken(number: int, folder: Path, limits: Limits, is_late: bool) -> str | None:
     """Return the limit that a process, those that it started or their folder break."""
     family = list(_family(number))
-    memory, (disk, files) = sum(each for _, each in family), _used(folder)
+    memory = sum(each for _, each in family)
+    used = _used(folder)
+    disk = used.disk + sum(_removed([each for each, _ in family]).values())
     rules = {
         f"it took longer than {limits.seconds:g} seconds": is_late,
         f"it used more than {limits.memory:,} bytes of memory": memory > limits.memory,
         f"it wrote more than {limits.disk:,} bytes": disk > limits.disk,
-        f"it made more than {MOST_FILES:,} files": files > MOST_FILES,
+        f"it made more than {MOST_FILES:,} files": used.files > MOST_FILES,
+        str(used.strange): used.strange is not None,
         f"it started more than {MOST_PROCESSES} processes": len(family) > MOST_PROCESSES,
     }
     return next((text for text, is_broken in rules.items() if is_broken), None)
@@ -248,129 +294,89 @@ def _family(number: int) -> Iterator[tuple[int, int]]:
         waiting += [each for each in parents.get(found[0], ()) if each[0] != number]
 
 
-def _used(folder: Path) -> tuple[int, int]:
-    """Return the bytes on disk of a folder, and its files, counted a little beyond `MOST_FILES`."""
-    total, count = 0, 0
-    for where, folders, files in os.walk(folder):
-        count += len(folders) + len(files)
-        for name in (*folders, *files):
+def _removed(processes: Sequence[int]) -> dict[tuple[int, int], int]:
+    """Return the bytes of files without a name that processes still have, each once, by device and number."""
+    found: dict[tuple[int, int], int] = {}
+    for process in processes if PROC.is_dir() else ():
+        with suppress(OSError):
+            for name in os.listdir(PROC / str(process) / "fd"):
+                with suppress(OSError):
+                    seen = os.stat(PROC / str(process) / "fd" / name)
+                    if stat.S_ISREG(seen.st_mode) and seen.st_nlink == 0:
+                        found[seen.st_dev, seen.st_ino] = seen.st_blocks * 512
+        with suppress(OSError, ValueError):
+            for line in (PROC / str(process) / "maps").read_text(errors="replace").splitlines():
+                if line.endswith(" (deleted)") and "/dev/zero" not in line:  # that is memory, and counted as such
+                    first, _, offset, device, inode, *_ = line.split()
+                    start, end = (int(part, 16) for part in first.split("-"))
+                    major, minor = (int(part, 16) for part in device.split(":"))
+                    key = os.makedev(major, minor), int(inode)
+                    found[key] = max(found.get(key, 0), int(offset, 16) + end - start)
+    return found
+
+
+class _Used(NamedTuple):
+    """What a folder holds."""
+
+    disk: int = 0  # bytes
+    files: int = 0  # counted a little beyond `MOST_FILES`
+    strange: str | None = None  # what was made there that hides files from this count
+
+
+def _used(folder: int | Path, depth: int = 0, files: int = 0) -> _Used:
+    """Return what a folder holds, and all in it; paths there may be longer than the system takes.
+
+    Args:
+        folder: its path, or its descriptor.
+        depth: of folders above it.
+        files: that were counted before.
+    """
+    disk, strange = 0, None
+    if depth > MOST_DEPTH:
+        return _Used(disk, files, f"it made more than {MOST_DEPTH} folders within each other")
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            files += 1
             with suppress(OSError):
-                total += os.lstat(os.path.join(where, name)).st_blocks * 512
-        if count > MOST_FILES:
-            break
-    return total, count
+                disk += entry.stat(follow_symlinks=False).st_blocks * 512
+                if entry.is_dir(follow_symlinks=False):
+                    below = _opened(entry, folder, depth, files)
+                    disk, files, strange = disk + below.disk, below.files, strange or below.strange
+            if files > MOST_FILES or strange is not None:
+                break
+    return _Used(disk, files, strange)
+
+
+def _opened(entry: os.DirEntry[str], folder: int | Path, depth: int, files: int) -> _Used:
+    """Return what a folder within another one holds; see `_used`."""
+    within = folder if isinstance(folder, int) else None
+    try:
+        opened = os.open(
+            entry.name if within else entry.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within
+        )
+    except PermissionError:
+        return _Used(0, files, "it made a folder that cannot be read")
+    try:
+        return _used(opened, depth + 1, files)
+    finally:
+        os.close(opened)
 
 
 # what runs in the new process
 
 
 def main() -> None:
-    """Close off what the system allows, set the limits, and run the module that the first argument names."""
+    """Set the limits, and run the module that the first argument names."""
     spec = json.loads(sys.argv[1])
-    with suppress(OSError, AttributeError):
-        _libc().prctl(DIE_WITH_PARENT, signal.SIGKILL)
-    paths = spec.get("paths", [])
-    closed = _close_off(Path(spec["folder"]), paths)
-    if "module" not in spec:
-        print(json.dumps(closed))
-        return
-    _limit(Limits(*spec["limits"]))
+    _limit(Limits(*spec["limits"]), spec["is_confined"])
     # not before: Python imports a sitecustomize that it finds, and modules of these names in place of its own
-    sys.path += paths
-    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *paths])
+    sys.path += spec["paths"]
+    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *spec["paths"]])
     sys.argv = [spec["module"], *spec["arguments"]]
     runpy.run_module(spec["module"], run_name="__main__", alter_sys=True)
 
 
-def _libc() -> ctypes.CDLL:
-    return ctypes.CDLL(None, use_errno=True)
-
-
-def _close_off(folder: Path, paths: Sequence[str]) -> list[str]:
-    """Enter name spaces of this process's own, as many as the system allows; return what they close off."""
-    if sys.platform != "linux":
-        return []
-    user, group, closed = os.getuid(), os.getgid(), []
-    if not _unshared(NEW_USER | NEW_NETWORK):
-        return []
-    closed.append("network")
-    with suppress(OSError):
-        for name, text in (("uid_map", f"{user} {user} 1"), ("setgroups", "deny"), ("gid_map", f"{group} {group} 1")):
-            (PROC / "self" / name).write_text(text)
-    if _unshared(NEW_PROCESSES):
-        closed.append("processes")
-        _become_first_process()
-    if _unshared(NEW_MOUNTS) and _libc().mount(b"none", b"/", None, RECURSIVE | PRIVATE, None) == 0:
-        needed = _needed([str(folder), *paths])
-        emptied = [_emptied(os.path.realpath(place), needed) for place in SOCKETS]
-        closed += ["sockets"] * all(emptied)
-        closed += ["files"] * _only_writes(os.fsencode(folder))
-    os.chdir(folder)
-    _drop_capabilities()
-    return closed
-
-
-def _unshared(flags: int) -> bool:
-    return _libc().unshare(flags) == 0
-
-
-def _become_first_process() -> None:
-    """Continue in a child, the first process of a new name space, with which all others of it end; wait for it here."""
-    child = os.fork()
-    if child == 0:
-        _libc().prctl(DIE_WITH_PARENT, signal.SIGKILL)
-        return
-    _, status = os.waitpid(child, 0)
-    os._exit(os.waitstatus_to_exitcode(status) % 256)
-
-
-def _needed(given: Sequence[str]) -> list[str]:
-    """Return the folders that a process runs from: given ones, and those of Python, programs and libraries."""
-    listed = [os.environ.get(name, "").split(os.pathsep) for name in ("PATH", "LD_LIBRARY_PATH")]
-    folders = [*given, sys.prefix, sys.base_prefix, *sys.path, *(each for some in listed for each in some)]
-    both = [path for each in folders if each for path in (os.path.abspath(each), os.path.realpath(each))]
-    return sorted({path for path in both if os.path.isdir(path)})
-
-
-def _emptied(place: str, needed: Sequence[str]) -> bool:
-    """Mount an empty folder over one, and in it what is needed of the one; return whether all else is out of sight."""
-    libc, target = _libc(), os.fsencode(place)
-    if any(Path(place).is_relative_to(path) for path in needed):
-        return False
-    within = {path: os.open(path, os.O_PATH) for path in needed if Path(path).is_relative_to(place)}
-    if not os.path.isdir(place) or libc.mount(b"none", target, b"tmpfs", 0, None) != 0:
-        return not os.path.isdir(place)
-    for path, number in within.items():
-        os.makedirs(path, exist_ok=True)
-        if libc.mount(os.fsencode(f"/proc/self/fd/{number}"), os.fsencode(path), None, BIND | RECURSIVE, None) != 0:
-            libc.umount2(target, DETACH)
-            return False
-    return True
-
-
-def _only_writes(folder: bytes) -> bool:
-    """Make all mounted files but those of one folder read-only; return whether that worked."""
-    is_own = _libc().mount(folder, folder, None, BIND | RECURSIVE, None) == 0
-    return is_own and _mount_flags(b"/", AT_RECURSIVE, READ_ONLY, 0) and _mount_flags(folder, 0, 0, READ_ONLY)
-
-
-def _mount_flags(path: bytes, how: int, added: int, removed: int) -> bool:
-    flags = (ctypes.c_uint64 * 4)(added, removed, 0, 0)
-    arguments = (AT_CWD, path, how, ctypes.byref(flags), ctypes.sizeof(flags))
-    return _libc().syscall(MOUNT_SETATTR, *arguments) == 0
-
-
-def _drop_capabilities() -> None:
-    """Give up what the first process of a name space may do to it, for good."""
-    libc = _libc()
-    for each in range(LAST_CAPABILITY + 1):
-        libc.prctl(DROP_FROM_BOUNDS, each, 0, 0, 0)
-    libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    header, nothing = (ctypes.c_uint32 * 2)(CAPABILITIES_3, 0), (ctypes.c_uint32 * 6)()
-    libc.capset(ctypes.byref(header), ctypes.byref(nothing))
-
-
-def _limit(limits: Limits) -> None:
+def _limit(limits: Limits, is_confined: bool) -> None:
     """Set the limits that the system holds, of this process and of each that it starts."""
     import resource  # here: POSIX systems alone have it
 
@@ -382,6 +388,8 @@ def _limit(limits: Limits) -> None:
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: MOST_OPEN,
     }
+    if is_confined:  # elsewhere it counts all processes of the user
+        wanted[resource.RLIMIT_NPROC] = MOST_THREADS
     for kind, value in wanted.items():
         hard = resource.getrlimit(kind)[1]
         most = min(value, LARGEST_INT if hard == resource.RLIM_INFINITY else hard)

@@ -18,7 +18,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl.board.isolate import Limits, Outcome, run_isolated
+from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Job, run_dir_of
 from ctgraph_rl.board.rescore import Check, equal
 from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
@@ -163,13 +163,18 @@ def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, cu
 
 
 def learn_again(
-    cell: Cell, limits: Limits, paths: Sequence[Path] = (), watch: Callable[[], object] = lambda: None
+    cell: Cell,
+    limits: Limits,
+    isolated: Isolation,
+    paths: Sequence[Path] = (),
+    watch: Callable[[], object] = lambda: None,
 ) -> Outcome:
     """Learn a cell in a process of its own; one that was stopped before is resumed where its learner can be.
 
     Args:
         cell: what to learn.
         limits: of the process.
+        isolated: how it is closed off.
         paths: folders with the code of others.
         watch: is called several times a second.
     """
@@ -178,10 +183,20 @@ def learn_again(
         return Outcome(0, None, 0.0, "")
     if cell.job.entry_point is not None:
         for run_dir in cell.run_dirs:
-            shutil.rmtree(run_dir, ignore_errors=True)
+            _remove(run_dir)
     _with_its_curriculum(cell).write(cell.folder / JOB)
     variables = VARIABLES if is_portable(cell.job.config) else {}
-    return run_isolated(MODULE, [JOB], cell.folder, limits, paths=paths, variables=variables, watch=watch)
+    return run_isolated(
+        MODULE, [JOB], cell.folder, limits, isolated=isolated, paths=paths, variables=variables, watch=watch
+    )
+
+
+def _remove(run_dir: Path) -> None:
+    """Remove what an entry point has left of a run that was stopped."""
+    try:
+        shutil.rmtree(run_dir, ignore_errors=True)
+    except RecursionError:
+        raise ValueError(f"{run_dir} has too many folders within each other to remove: rm -r it yourself") from None
 
 
 def _with_its_curriculum(cell: Cell) -> Job:

@@ -22,7 +22,7 @@ from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
-from ctgraph_rl.board.isolate import SOCKETS, Isolation, Limits, Outcome, isolation
+from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
 from ctgraph_rl.board.rerun import RERUN, Cell, cells_of, draw, learn_again, result_of, verified, why_other_bits
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
@@ -145,26 +145,15 @@ def described(plan: Plan, means: Means) -> list[str]:
     limits = means.limits(max(cells, key=lambda cell: cell.seconds))
     most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
-    closed = [text for name, text in CLOSED.items() if getattr(means.isolation, name)]
     lines = [
         f"number {plan.number} draws {'; '.join(seeds)}",
         f"{count}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
         f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_listed([means.paths])}",
         *([f"scores are tested where bits differ: {'; '.join(plan.other_bits)}"] if plan.other_bits else []),
-        f"isolated: {'; '.join(closed) or 'nothing'}",
+        f"isolated: {'; '.join(means.isolation.closed()) or f'nothing, {means.isolation.why_not}'}",
         *(f"NOT isolated: {text}" for text in means.isolation.missing()),
     ]
     return [terminal_text(line) for line in lines]
-
-
-CLOSED = {
-    "network": "no network",
-    "files": "all files but those of its folder are read-only",
-    "processes": "it signals no other process",
-    "memory": "all its processes share the limit of memory",
-    "sockets": f"no Unix sockets in {', '.join(SOCKETS)}",
-}
-"""What `Isolation` closes off, in words."""
 
 
 def _listed(groups: Iterator[Sequence[object]] | Sequence[Sequence[object]]) -> str:
@@ -231,7 +220,7 @@ def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
             def watch(number: int = place + 1) -> None:
                 bar.update(number, min(sum(each.frames for each in cells), total), math.nan)
 
-            outcomes[place] = learn_again(cell, means.limits(cell), means.paths, watch)
+            outcomes[place] = learn_again(cell, means.limits(cell), means.isolation, means.paths, watch)
             watch()
     return outcomes
 
@@ -316,7 +305,15 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     folder = made_folder(arguments.folder / name)
     plan = planned(submission, arguments.level, number, arguments.cells, folder)
     paths = () if arguments.code is None else (arguments.code,)
-    means = Means(isolation(folder), arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
+    isolated = isolation(folder, graphics=submission.config.get("device", "cpu") != "cpu")
+    fix = "or give --not-isolated to run it with all that you can do"
+    require(
+        (
+            isolated.why_not is None or arguments.not_isolated,
+            f"the code of others is not run: {isolated.why_not}, {fix}",
+        )
+    )
+    means = Means(isolated, arguments.hours, memory=arguments.memory, disk=arguments.disk, paths=paths)
     ask(described(plan, means), arguments.yes)
     with _ended_by_signals(f"interrupted, and no process is left; with --number {number} the same command resumes"):
         checks += checks_of_plan(plan, run_plan(plan, means))
@@ -354,6 +351,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--memory", type=float, default=8.0, metavar="GB", help="of a process (default: %(default)g)")
     made.add_argument("--disk", type=float, default=4.0, metavar="GB", help="of a process (default: %(default)g)")
     made.add_argument("--yes", action="store_true", help="agree to run it, with all that is not isolated")
+    made.add_argument("--not-isolated", action="store_true", help="run it also where bubblewrap cannot be used")
     made.add_argument(
         "--folder", type=Path, default=Path("verify"), metavar="DIR", help="of the reruns (default: %(default)s)"
     )

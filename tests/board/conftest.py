@@ -11,7 +11,10 @@ import pytest
 import yaml
 from helpers.sweeping import command_line
 
+from ctgraph_rl.board import relearn, rerun, verify
+from ctgraph_rl.board.isolate import Isolation, Outcome
 from ctgraph_rl.board.method import TEMPLATE
+from ctgraph_rl.board.relearn import Job
 from ctgraph_rl.board.submission import Submission, read_submission
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.board.tracks import Track, track
@@ -91,3 +94,25 @@ def submission(tiny_submission: Submission, tmp_path: Path) -> Iterator[Submissi
     """A valid submission that a test may change."""
     folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
     yield read_submission(folder, tiny_submission.track)
+
+
+CLOSED = Isolation(bubblewrap="0.8.0", why_not=None, graphics=False, is_root=False)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Reruns take place in this process; returns the folders in which they did."""
+    folders = []
+
+    def run(module, arguments, folder, limits, **more):
+        folders.append(folder)
+        try:
+            relearn.learn_again(Job.read(folder / arguments[0]), folder)
+        except Exception as error:
+            return Outcome(1, None, 0.0, f"{type(error).__name__}: {error}")
+        more["watch"]()
+        return Outcome(0, None, 0.0, "")
+
+    monkeypatch.setattr(rerun, "run_isolated", run)
+    monkeypatch.setattr(verify, "isolation", lambda folder, graphics: CLOSED)
+    return folders

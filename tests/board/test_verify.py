@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import pytest
 from helpers.sweeping import command_line
 
-from ctgraph_rl.board import relearn, rerun, verify
-from ctgraph_rl.board.isolate import Limits, Outcome
+from ctgraph_rl.board import bubblewrap, relearn, rerun, verify
+from ctgraph_rl.board.isolate import Isolation, Limits, Outcome
 from ctgraph_rl.board.relearn import Job, run_dir_of
 from ctgraph_rl.board.rerun import cells_of, draw, result_of
 from ctgraph_rl.board.rescore import Check
@@ -41,24 +41,6 @@ def train(curriculum, seed, run_dir):
         for frames in recorder.moments:
             recorder.evaluate(Waits(), frames)
 """
-
-
-@pytest.fixture
-def in_process(monkeypatch):
-    """Reruns take place in this process; returns the folders in which they did."""
-    folders = []
-
-    def run(module, arguments, folder, limits, **more):
-        folders.append(folder)
-        try:
-            relearn.learn_again(Job.read(folder / arguments[0]), folder)
-        except Exception as error:
-            return Outcome(1, None, 0.0, f"{type(error).__name__}: {error}")
-        more["watch"]()
-        return Outcome(0, None, 0.0, "")
-
-    monkeypatch.setattr(rerun, "run_isolated", run)
-    return folders
 
 
 def call(monkeypatch, home: Path, folder: Path, *arguments: str) -> tuple[int, dict]:
@@ -108,7 +90,9 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
     assert len(in_process) == 2
     said = capsys.readouterr()
     assert "number 3 draws rerun of seeds" in said.out
-    assert "NOT isolated: it can read every file that you can" in said.out
+    assert "isolated: bubblewrap 0.8.0; no network" in said.out
+    assert "NOT isolated: weaknesses of the kernel stay" in said.out
+    assert written["isolation"]["bubblewrap"] == "0.8.0"
     assert "process 2/2  512/512 frames" in said.err
     assert call(monkeypatch, tiny_home, folder, "--number=3", "--yes")[1]["level"] == "rerun"
     assert len(in_process) == 2
@@ -159,6 +143,25 @@ def test_nothing_runs_where_nobody_can_be_asked(tiny_submission, tiny_home, tmp_
     assert code == 2
     assert "give --yes to agree" in capsys.readouterr().err
     assert in_process == []
+
+
+def test_nothing_of_others_runs_without_bubblewrap_unless_the_user_says_so(
+    tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys
+):
+    folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
+    why = "it needs bubblewrap 0.8 or newer, there is none: install the package bubblewrap"
+    opened = Isolation(bubblewrap=None, why_not=why, graphics=False, is_root=False)
+    monkeypatch.setattr(verify, "isolation", lambda folder, graphics: opened)
+
+    code, _ = call(monkeypatch, tiny_home, folder, "--number=3", "--yes")
+
+    assert (code, in_process) == (2, [])
+    assert f"the code of others is not run: {why}, or give --not-isolated" in capsys.readouterr().err
+    code, written = call(monkeypatch, tiny_home, folder, "--number=3", "--yes", "--not-isolated")
+    assert (code, written["level"], written["isolation"]["bubblewrap"]) == (0, "rerun", None)
+    said = capsys.readouterr().out
+    assert f"isolated: nothing, {why}" in said
+    assert "NOT isolated: it can do all that you can" in said
 
 
 def test_seeds_that_were_trained_together_are_drawn_as_their_group(tiny_submission, tmp_path):
@@ -257,9 +260,11 @@ def test_a_group_is_rerun_in_a_process_of_its_own(tiny_home, tiny_track, method,
     assert command_line(monkeypatch, "-m", *where, "track=tiny", "agent=ppo", *settings, "together=true") == 0
     folder = submitted(tmp_path, tiny_track, method, tmp_path / "submission")
 
-    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes")
+    code, written = call(monkeypatch, tiny_home, folder, "--cells=1", "--yes", "--not-isolated")
 
     assert (code, written["level"], len(written["cells"])) == (0, "rerun", 2)
+    has_bubblewrap = (bubblewrap.version() or (0, 0)) >= bubblewrap.OLDEST
+    assert (written["isolation"]["bubblewrap"] is not None) == has_bubblewrap
 
 
 @pytest.mark.slow
