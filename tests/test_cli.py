@@ -7,12 +7,14 @@ import os
 import re
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 import curricula
-from ctgraph_rl import cli
+from ctgraph_rl import cli, packages
 from ctgraph_rl.describe import FRAMES_PER_SECOND, listing, to_markdown
 from ctgraph_rl.packages import first_imports
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -160,26 +162,42 @@ def in_a_folder_that_shadows(checkout, tmp_path, path, code):
     return subprocess.run([sys.executable, "script.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
 
 
-SHADOWS = {"curricula/__init__.py": "curricula; rename or move the folder found", "curricula.py": "file found"}
-
-
-@pytest.mark.parametrize("path", SHADOWS)
-def test_what_shadows_ours_is_refused_by_the_commands(checkout, tmp_path, path):
+def test_what_shadows_ours_is_refused_by_the_commands(checkout, tmp_path):
     code = "import sys; sys.argv = ['x', 'curricula']; from ctgraph_rl.cli import main; main()"
 
-    result = in_a_folder_that_shadows(checkout, tmp_path, path, code)
+    result = in_a_folder_that_shadows(checkout, tmp_path, "curricula/__init__.py", code)
 
     assert result.returncode == 1
     error = result.stderr[result.stderr.index("error: ") :]
-    assert f"error: package 'curricula' was found in {tmp_path / path.removesuffix('/__init__.py')} instead of" in error
-    assert SHADOWS[path] in error and "Traceback" not in result.stderr
+    assert f"error: package 'curricula' was found in {tmp_path / 'curricula'} instead of" in error
+    assert "curricula; rename or move the folder found" in error and "Traceback" not in result.stderr
+
+
+def shadowed(monkeypatch, name: str, path) -> None:
+    """Let Python find a package of ours elsewhere."""
+    found = ModuleSpec(name, None, origin=str(path))
+    monkeypatch.setattr(packages, "find_spec", lambda asked: found if asked == name else find_spec(asked))
+
+
+def test_a_file_that_shadows_ours_is_called_a_file(monkeypatch, tmp_path):
+    shadowed(monkeypatch, "curricula", tmp_path / "curricula.py")
+
+    with pytest.raises(ValueError, match=r"'curricula' was found in .*curricula\.py instead of .*; .* the file found"):
+        packages.check_packages()
+
+
+def test_a_trained_agent_is_refused_where_a_folder_is_named_baselines(monkeypatch, tmp_path):
+    shadowed(monkeypatch, "baselines", tmp_path / "baselines" / "__init__.py")
+
+    with pytest.raises(ValueError, match=r"'baselines' was found in .*/baselines instead of .*; .* the folder found"):
+        packages.class_named("baselines.dqn", "DQN")
 
 
 @pytest.mark.parametrize(
     "code",
     [
         "import ctgraph_rl, curricula; curricula.load('ct8')",
-        "import curricula; from ctgraph_rl import Task; curricula.load('ct8')",
+        pytest.param("import curricula; from ctgraph_rl import Task; curricula.load('ct8')", marks=pytest.mark.slow),
     ],
 )
 def test_what_shadows_ours_is_named_where_python_imports_it(checkout, tmp_path, code):
@@ -191,6 +209,7 @@ def test_what_shadows_ours_is_named_where_python_imports_it(checkout, tmp_path, 
     assert "has no attribute 'load'" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_folder_named_baselines_leaves_the_environment_usable_and_trained_agents_not(checkout, tmp_path):
     code = (
         "from ctgraph_rl.tasks.configurations import ct_su_b1; from ctgraph_rl import packages; print(ct_su_b1().goal)"

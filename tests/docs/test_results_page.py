@@ -34,6 +34,7 @@ def test_the_page_is_what_its_raw_results_make(make):
     assert make.page() == make.PAGE.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_lifelong_page_is_what_its_raw_results_make():
     from studies.lifelong import page
 

@@ -69,7 +69,7 @@ def test_no_metric_of_any_matrix_or_curve_is_outside_of_what_it_says(low, high):
     generator = torch.Generator().manual_seed(0)
     known = Known(low, high, tasks=3, evaluations=6, failure_is_lowest=True)
     extremes = 0
-    for _ in range(300):
+    for _ in range(60):
         values = torch.rand(7, 3, generator=generator, dtype=torch.float64)
         values = torch.where(torch.rand(7, 3, generator=generator) < 0.7, values.round(), values) * (high - low) + low
         curves = metrics.Curves(values, (0, 1, 1, 2, 2, 3, 3), tuple(range(7)), ((0,), (1,), (2,)))
@@ -85,7 +85,7 @@ def test_no_metric_of_any_matrix_or_curve_is_outside_of_what_it_says(low, high):
             lowest, highest = METRICS[name].bounds(known)
             assert metric.value is None or lowest - 1e-9 <= metric.value <= highest + 1e-9, name
             extremes += metric.value in (lowest, highest)
-    assert extremes > 100
+    assert extremes > 50
 
 
 def of_known_curriculum(folder, values):

@@ -89,17 +89,21 @@ def test_every_source_of_a_curriculum_has_bibtex(site):
     assert [name for name in curricula.names() if not entries_of(curricula.load(name).source)] == []
 
 
-def test_every_agent_method_detector_and_metric_has_a_card(site):
-    pages = {*dict(site("baseline_cards").baseline_cards()), *dict(site("metric_cards").metric_cards())}
+@pytest.fixture(scope="module")
+def cards(site) -> dict[str, str]:
+    """The cards of agents, methods, detectors and metrics by their files."""
+    return {**dict(site("baseline_cards").baseline_cards()), **dict(site("metric_cards").metric_cards())}
+
+
+def test_every_agent_method_detector_and_metric_has_a_card(cards):
+    pages = cards.keys()
 
     for group in ("agent", "cell", "method", "detector"):
         assert {f"{group}s/{entry.name}.md" for entry in catalogue(group)} <= pages
     assert {f"metrics/{name}.md" for name in metrics.definitions()} <= pages
 
 
-def test_cards_show_settings_variants_results_and_examples(site):
-    cards = {**dict(site("baseline_cards").baseline_cards()), **dict(site("metric_cards").metric_cards())}
-
+def test_cards_show_settings_variants_results_and_examples(cards):
     assert "| `method.coeff` | `100.0` | lambda |" in cards["methods/ewc.md"]
     assert "| `agent.cell.num_frames` | `4` |" in cards["cells/frames.md"]
     assert "### `method=ewc_published`" in cards["methods/ewc.md"]
