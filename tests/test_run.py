@@ -25,7 +25,7 @@ from ctgraph_rl.runs.job import with_changes
 from ctgraph_rl.runs.train import RESULTS
 from curricula.paper import ct_su_b1
 
-SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
+SHORT = ("curriculum.num_frames=1024", "agent.num_envs=128", "agent.num_steps=8", "agent.hidden_size=8")
 
 
 def measured(run_dir: Path) -> list[dict]:

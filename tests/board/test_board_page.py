@@ -19,6 +19,8 @@ from ctgraph_rl.portable import cpu_model
 for package in ("scipy", "jinja2", "pyarrow"):
     pytest.importorskip(package)
 
+pytestmark = pytest.mark.slow
+
 RESULTS = CHECKOUT / "docs" / "results"
 SUBMISSIONS = RESULTS / "board"
 MOST_BYTES = 6 * 2**20
@@ -58,7 +60,6 @@ def test_the_table_says_what_the_page_says_of_it(made):
     }
 
 
-@pytest.mark.slow
 def test_the_command_of_the_page_verifies_a_submission(tmp_path, monkeypatch):
     copy = shutil.copytree(SUBMISSIONS / "ppo", tmp_path / "ppo")
     (copy / VERIFICATION).unlink(missing_ok=True)

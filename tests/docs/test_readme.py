@@ -12,6 +12,7 @@ from ctgraph_rl import metrics
 README = CHECKOUT / "README.md"
 
 
+@pytest.mark.slow
 def test_the_python_in_readme_runs_in_its_order_and_prints_what_it_says(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, Any] = {}

@@ -13,6 +13,7 @@ from rich.console import Console
 import curricula
 from ctgraph_rl.log.provenance import named
 from ctgraph_rl.report import formats, results
+from ctgraph_rl.report.figures.gallery import Gallery
 from ctgraph_rl.report.names import displayed, modifications
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.sections import sections
@@ -121,6 +122,7 @@ def test_a_name_that_could_not_be_told_from_others_is_refused(runs, agents, mess
 
 
 def test_one_option_names_agents_in_tables_and_in_the_report(runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Gallery, "write", lambda self, names, figures: [])
     monkeypatch.setattr(sys, "argv", ["results", str(tmp_path), "--agent", "PPO=Ours", "--agent", "DQN"])
 
     results.main()

@@ -43,8 +43,14 @@ ELSEWHERE = {
 }
 """Pages whose Python another test runs, in the files that it needs."""
 
-LONG = ("docs/how-to/sb3_and_gymnasium.md", "docs/how-to/torchrl_ppo.md")
-"""Pages whose Python takes over 10 s: it is compiled, and runs with the slow tests."""
+LONG = (
+    *("docs/how-to/collectives.md", "docs/how-to/go_fast.md", "docs/how-to/sb3_and_gymnasium.md"),
+    *("docs/how-to/torchrl_ppo.md", "docs/how-to/train_in_python.md"),
+)
+"""Pages whose Python takes over a second: it is compiled, and runs with the slow tests."""
+
+MANY_COMMANDS = ("docs/results/collectives.md", "docs/results/memory.md")
+"""Pages whose commands take over a second to compose."""
 
 QUICK = {"agents", "curricula", "methods"}
 """Commands that run here; others are parsed: they need runs, a terminal, or are run by the tests of pictures."""
@@ -140,7 +146,13 @@ def shell_lines(page: Path) -> Iterator[str]:
             yield from (part.strip() for part in parts if part.strip() and not part.strip().startswith("#"))
 
 
-@pytest.mark.parametrize("name", with_blocks("bash", "sh"))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in MANY_COMMANDS else [])
+        for name in with_blocks("bash", "sh")
+    ],
+)
 def test_every_shell_line_of_a_page_runs_or_is_composed_and_parsed(name, folder, monkeypatch, capsys):
     write_files(PAGES[name], folder)
     for block in blocks(PAGES[name]):

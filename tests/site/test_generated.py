@@ -36,6 +36,7 @@ def test_every_exported_name_stands_on_one_page_of_the_api(site):
     assert sorted(listed) == sorted(set(ctgraph_rl.__all__) - {"metrics"})
 
 
+@pytest.mark.slow
 def test_every_command_and_its_own_commands_show_their_help(site):
     page = dict(site("command_pages").command_pages())["commands.md"]
 
@@ -54,6 +55,7 @@ def test_every_setting_of_a_run_has_its_default_and_a_comment(site):
     assert [setting.key for setting in own if not setting.comment] == []
 
 
+@pytest.mark.slow
 def test_a_track_has_a_card_with_what_its_tasks_allow(site):
     pages = dict(site("track_cards").track_cards())
 

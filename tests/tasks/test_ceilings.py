@@ -56,8 +56,9 @@ def test_two_decision_images_let_a_deterministic_policy_have_a_quarter():
 
 
 @pytest.mark.parametrize("goal", [(1, 1), (1, 2), (2, 1), (1, 1, 2), (2, 1, 2)])
-@pytest.mark.parametrize(("waits", "decisions"), [(1, 1), (2, 2), (1, 3), (1, 4)])
-@pytest.mark.parametrize("fail_reward", [0.0, -1.0])
+@pytest.mark.parametrize(
+    ("waits", "decisions", "fail_reward"), [(1, 1, 0.0), (1, 1, -1.0), (2, 2, -1.0), (1, 3, 0.0), (1, 4, 0.0)]
+)
 def test_the_best_of_all_deterministic_policies_has_the_deterministic_ceiling(goal, waits, decisions, fail_reward):
     task = make_task(2, len(goal), 0.5, waits=waits, decisions=decisions, goal=goal, fail_reward=fail_reward)
 
@@ -82,7 +83,7 @@ def test_unique_waits_do_not_help_a_deterministic_policy_that_forgets_them():
     assert [each.memoryless_ceiling(deterministic=True) for each in best] == [0.0, 1.0]
 
 
-@pytest.mark.parametrize("num_ids", range(1, 12))
+@pytest.mark.parametrize("num_ids", [1, 2, 3, 4, 7, 11])
 @pytest.mark.parametrize("goal", [(1, 1, 1), (1, 2, 3), (1, 1, 2, 3), (3, 3, 3, 1, 1, 2), (2, 2, 2, 2, 2, 2, 2, 3, 1)])
 def test_the_division_of_images_among_decisions_is_the_best_of_all_divisions(goal, num_ids):
     task = make_task(3, len(goal), decisions=num_ids, goal=goal)

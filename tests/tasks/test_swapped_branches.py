@@ -91,7 +91,7 @@ def table(task: Task, policy):
 @pytest.mark.parametrize("task", SWAPPED)
 @pytest.mark.parametrize("kernel", ["off", "auto"])
 def test_every_action_leads_where_the_plain_tree_leads(task, kernel):
-    actions = scripts(400, 8, task.graph.branching_factor + 1)
+    actions = scripts(120, 8, task.graph.branching_factor + 1)
     env = CTGraphEnv([replace(task, graph=replace(task.graph, wait_prob=0.0))] * 8, seed=1, kernel=kernel)
     data = env.reset()
     states = [(HOME, ())] * 8

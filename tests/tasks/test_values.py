@@ -147,7 +147,12 @@ def test_the_chain_of_transition_solved_gives_the_closed_forms(b, d, p):
 
 
 @pytest.mark.parametrize(
-    ("b", "d", "p", "printed"), [(3, 10, 0.9, "3.75e-23"), (2, 16, 0.5, "3.04e-20"), (2, 5, 0.0, "5.65e-06")]
+    ("b", "d", "p", "printed"),
+    [
+        pytest.param(3, 10, 0.9, "3.75e-23", marks=pytest.mark.slow),
+        pytest.param(2, 16, 0.5, "3.04e-20", marks=pytest.mark.slow),
+        (2, 5, 0.0, "5.65e-06"),
+    ],
 )
 def test_the_papers_small_probabilities_follow_from_every_transition_of_the_whole_graph(b, d, p, printed):
     graph = CTGraph(b, d, p)

@@ -150,7 +150,7 @@ def test_visits_stand_in_the_nodes():
     assert {"1M", "12k", "9999", "0"} == set(words_in_nodes(axes_of(ct_fo_b1(), visits=many)))
 
 
-@pytest.mark.parametrize("shape", [(2, 2), (3, 2), (2, 3), (2, 7)], ids=str)
+@pytest.mark.parametrize("shape", [(2, 2), (3, 2), pytest.param((2, 7), marks=pytest.mark.slow)], ids=str)
 def test_numbers_do_not_overlap_each_other(shape):
     b, d = shape
     task = make_task(branching_factor=b, depth=d, wait_prob=0.5, fully_observable=False)
@@ -175,7 +175,7 @@ def test_a_large_graph_is_a_summary_that_says_so():
     assert labels == ["11111111", "11111112", "11111113", "11111114", "11111115", "11111121", "11111122", "33333333"]
 
 
-@pytest.mark.parametrize("shape", [(2, 1), (40, 1), (2, 5), (2, 6), (5, 6), (1000, 3), (2, 60)], ids=str)
+@pytest.mark.parametrize("shape", [(2, 1), (40, 1), (2, 6), (1000, 3), (2, 60)], ids=str)
 def test_a_graph_of_any_shape_is_drawn(shape, tmp_path):
     b, d = shape
     task = make_task(branching_factor=b, depth=d, wait_prob=0.3, fully_observable=False)

@@ -316,7 +316,7 @@ EVALUATIONS = st.builds(
 ).filter(lambda how: how.at_block_ends or how.tasks == "all")  # else nothing may ever be evaluated
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.text(min_size=1), st.integers(1, 99), st.text(), BLOCKS, EVALUATIONS)
 def test_random_curricula_come_back_from_json(name, version, source, blocks, evaluation):
     curriculum = Curriculum(name, version, source, blocks, evaluation)
@@ -337,7 +337,7 @@ ANY_JSON = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.sampled_from([place for place in places(full().to_json()) if not place.startswith("about")]), ANY_JSON)
 def test_any_json_at_any_place_is_refused_or_means_the_same_content(place, value):
     wrong = changed(full().to_json(), place, value)
