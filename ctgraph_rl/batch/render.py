@@ -129,7 +129,7 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
     way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
     _lines(canvas, list(pairwise([*way, place])), 2 * unit, WAY)
     _star(canvas, marks[goal], unit)
-    if swapped is not None and swapped in marks:
+    if swapped in marks:
         _lines(canvas, _cross(marks[swapped], 0.6 * marks[swapped].radius), unit, OUTLINE)
     if failed:
         _lines(canvas, _cross(place, place.radius + 2.5 * unit), 2 * unit, kind)

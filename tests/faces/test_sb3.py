@@ -20,6 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from baselines import _stable
 from ctgraph_rl.gym import CTGraphGymEnv, make_task
 from ctgraph_rl.sb3 import SB3VecEnv
 from ctgraph_rl.tasks import configurations as paper
@@ -174,3 +175,26 @@ def test_ppo_without_memory_does_not_learn_ct_su_b1():
 
     assert make_task("CT-SU-B1", goal=GOAL).memoryless_ceiling(deterministic=True) == 0
     assert mean_return(model, "CT-SU-B1") == 0
+
+
+def test_the_benchmark_counts_the_first_episode_of_each_row_and_no_later_one(monkeypatch):
+    first, later = np.arange(100) < 50, np.arange(100) >= 50
+    ends = [(first, 3), (first | later, 2)]
+
+    class Envs:
+        def reset(self):
+            return np.zeros(100)
+
+        def step(self, action):
+            done, outcome = ends.pop(0)
+            return np.zeros(100), np.zeros(100), done, [{"outcome": outcome} if one else {} for one in done]
+
+    class Model:
+        def predict(self, observation, state, episode_start, deterministic):
+            return np.zeros(100), None
+
+    agent = object.__new__(_stable.Stable)
+    agent.task, agent.model = None, Model()
+    monkeypatch.setattr(_stable, "batch", lambda task, num_rows: Envs())
+
+    assert agent.success() == 0.5

@@ -167,7 +167,7 @@ def test_the_log_of_a_larger_curriculum_is_refused():
     ("make", "message"),
     [
         (ppo(num_layers=10**6), "num_layers must be at most 1,000, got 1000000"),
-        (ppo(hidden_size=10**9), "weights of hidden_size=1000000000 in num_layers=1 need"),
+        (ppo(hidden_size=10**9), "weights of hidden_size=1000000000 in num_layers=1 need 2,368,000,000,000 bytes"),
         (ppo(hidden_size=2**70), r"hidden_size must be an integer < 2\*\*63"),
         (ppo(gamma=1e-4, gae_lambda=1e-4), r"gamma \* gae_lambda must be >= 1e-06, got 0.0001 \* 0.0001"),
         (ppo(num_epochs=10**9), "num_epochs must be at most 1,000,000"),

@@ -115,3 +115,25 @@ def test_every_metric_is_an_attribute_and_listed_once():
     assert all(getattr(metrics, name) is entry.metric for name, entry in METRICS.items())
     with pytest.raises(AttributeError, match="no attribute 'forgetfulness'"):
         _ = metrics.forgetfulness
+
+
+def test_every_name_that_is_exported_is_listed_and_there():
+    names = metrics.__all__
+
+    assert sorted(names) == [
+        *(
+            "AGAINST_EXPERTS",
+            "Column",
+            "Curves",
+            "Definition",
+            "MASTERED",
+            "METRICS",
+            "Metric",
+            "Regime",
+            "RegimeTable",
+        ),
+        *("STAGES", "SUMMARY", "Trained", "Undefined", "check_experts", "definitions", "mean_area", "of_curves"),
+        *("of_inputs", "of_matrix", "of_regimes", "prepare", "stage_areas", "summary", "trapezoid_area", "undefined"),
+    ]
+    assert {*names, *METRICS} == set(dir(metrics))
+    assert all(getattr(metrics, name) is not None for name in names)

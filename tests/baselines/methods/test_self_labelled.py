@@ -23,7 +23,7 @@ from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import read_run
 from ctgraph_rl.runs.train import new_agent
-from ctgraph_rl.tasks.images import PaperImages
+from ctgraph_rl.tasks.images import OneHot, PaperImages
 
 EVALUATION = Evaluation(1, greedy=False, every=32)
 
@@ -317,3 +317,16 @@ def test_what_a_detector_cannot_label_is_refused_with_what_to_do(compose, method
 
     with pytest.raises(ValueError, match=message):
         maker(compose, method, lambda: Script({}, **how))(of(*(Block(task, 64) for task in tasks), **protocol))
+
+
+@pytest.mark.parametrize(
+    ("images", "known"), [((OneHot(16), OneHot(20)), 20), ((PaperImages(5), PaperImages(5)), None)]
+)
+def test_a_detector_is_told_the_most_entries_of_one_hot_observations_and_of_images_none(compose, images, known):
+    script, told = Script({}), []
+    tasks = [replace(task, images=kind) for task, kind in zip((ONE, TWO), images, strict=True)]
+    script.setup = lambda *given: told.append(given)
+
+    maker(compose, "mask_ri", lambda: script)(of(*(Block(task, 64) for task in tasks), **HIDDEN))
+
+    assert told == [(8, 4, 3, known)]
