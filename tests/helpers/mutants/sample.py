@@ -116,9 +116,7 @@ def default_tests(path: Path) -> set[str]:
 
 def _is_left_out(marks: str) -> bool:
     """Whether markers, but for those of single cases, keep a test out of the default run."""
-    return any(
-        f"pytest.mark.{name}" in re.sub(r"marks=pytest\.mark\.\w+", "", marks) for name in ("slow", "slurm")
-    )
+    return any(f"pytest.mark.{name}" in re.sub(r"marks=pytest\.mark\.\w+", "", marks) for name in ("slow", "slurm"))
 
 
 @cache
