@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from . import sample, trial
-from .sample import CHECKOUT, Mutant
+from helpers.mutants import sample, trial
+from helpers.mutants.sample import CHECKOUT, Mutant
 
 NUMBER = 100
 NEAREST = 3

@@ -12,7 +12,7 @@ from functools import cache
 from itertools import groupby
 from pathlib import Path
 
-from .operators import Change, changes, parses, replaced
+from helpers.mutants.operators import Change, changes, parses, replaced
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 STORED = Path(__file__).with_name("sample.json")

@@ -14,8 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from .operators import replaced
-from .sample import CHECKOUT, Mutant
+from helpers.mutants.operators import replaced
+from helpers.mutants.sample import CHECKOUT, Mutant
 
 THIRD_PARTY = ("torch", "tensordict", "torchrl.envs", "torchrl.modules", "torchrl.data", "torchrl.objectives", "hydra")
 THIRD_PARTY += (
@@ -108,7 +108,7 @@ def first_failure(copy: Path, tests: Sequence[str], workers: str = "0") -> str |
 
 def _run(copy: Path, tests: Sequence[str], workers: str, answer: Any) -> None:
     """What a fork does."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("helpers", "tests")]:
         del sys.modules[name]
     os.chdir(copy)
     sys.path.insert(0, str(copy))
