@@ -8,20 +8,21 @@ from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, paramete
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from torch.fx import symbolic_trace
 from torch.nn.utils.rnn import PackedSequence
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
-from baselines import benchmark
+from baselines import benchmark, together
 from baselines._roofline import Products
 from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
 from baselines.distinct import distinct
-from baselines.learner import functional_gradient_step
+from baselines.learner import compiler_options, functional_gradient_step
 from baselines.networks import GROUP
 from baselines.optimisers import parts_of
-from baselines.together import why_not_together
+from baselines.together import Group, why_not_together
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.benchmark import ladder as ladder_of_envs
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
@@ -362,3 +363,16 @@ def test_a_run_starts_within_1_3_times_the_bare_imports():
     times = [(seconds(BARE), seconds(RUN)) for _ in range(2)]
 
     assert min(run / bare for bare, run in times) < 1.3
+
+
+def test_graphs_for_acting_of_equal_code_are_compiled_once(small_agent, monkeypatch):
+    group = Group([small_agent("ppo", [ct_su_b1()])], [torch.Generator()])
+    zero, compiled = torch.zeros(1), []
+    one, equal_one = (symbolic_trace(lambda x: x.sin()) for _ in range(2))
+    other = symbolic_trace(lambda x: x.cos())
+    monkeypatch.setattr(together, "compile", lambda *given: compiled.append(given) or f"graph {len(compiled)}")
+
+    made = [group._compile(graph, (zero,)) for graph in (one, equal_one, other)]
+
+    assert made == ["graph 1", "graph 1", "graph 2"]
+    assert compiled == [(graph, [zero], compiler_options()) for graph in (one, other)]

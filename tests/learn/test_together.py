@@ -12,10 +12,9 @@ import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
 from helpers.small_agents import BATCHED, TINY, saved_and_loaded
-from torch.fx import symbolic_trace
 
 from baselines import together
-from baselines.learner import compiler_options, total_loss
+from baselines.learner import total_loss
 from baselines.stack import Stack, Template
 from baselines.together import Group
 from ctgraph_rl import Block, Curriculum, RunLog, learn_curriculum
@@ -206,18 +205,6 @@ def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(ma
 
     assert len(compared) > 8
     assert all(compared)
-
-
-def test_graphs_of_equal_code_are_compiled_once(make, monkeypatch):
-    group, zero, compiled = make().group(SEEDS[:1]), torch.zeros(1), []
-    one, equal_one = (symbolic_trace(lambda x: x.sin()) for _ in range(2))
-    other = symbolic_trace(lambda x: x.cos())
-    monkeypatch.setattr(together, "compile", lambda *given: compiled.append(given) or f"graph {len(compiled)}")
-
-    made = [group._compile(graph, (zero,)) for graph in (one, equal_one, other)]
-
-    assert made == ["graph 1", "graph 1", "graph 2"]
-    assert compiled == [(graph, [zero], compiler_options()) for graph in (one, other)]
 
 
 @pytest.mark.slow
