@@ -24,8 +24,9 @@ from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
-from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, sweepable
+from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep
 from ctgraph_rl.runs.settings import in_digits
+from ctgraph_rl.runs.sweep import sweepable
 
 
 def run(cfg: DictConfig, run_dir: Path) -> None:
@@ -85,6 +86,8 @@ class Stop(BaseException):
 @hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
+    if HydraConfig.get().job.chdir:
+        os.chdir(HydraConfig.get().runtime.cwd)  # relative paths are of the directory that the command was given in
     try:
         check_one_cell()
         if cfg.portable is True and not in_sweep():

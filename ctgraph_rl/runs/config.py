@@ -7,7 +7,9 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from inspect import Parameter
 from pathlib import Path
@@ -16,10 +18,13 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.singleton import Singleton
+from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
+from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import did_you_mean, is_int, nearest, positive, require
@@ -59,6 +64,9 @@ LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm":
 
 HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
 """What to do about settings that only some targets take."""
+
+RENEWED: tuple[type, ...] = (GlobalHydra, JobRuntime, VersionBase)  # of Hydra's state: what composing changes
+_HYDRA = threading.RLock()  # is held while Hydra's global state is ours
 
 SEEDS_APART = 1000
 """Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
@@ -226,10 +234,10 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
             there = f"; in {config_dir}: {', '.join(own) or 'none'}" if config_dir is not None else ""
             raise ValueError(f"{error}{there}") from None
     check_packages()
-    sys.path.append(os.getcwd())  # where a user's own function may be, as in a run
     try:
-        cfg = composed([f"curriculum={name}"], config_dir)
-        made = target(cfg, "curriculum")()
+        with _importing_from_here():
+            cfg = composed([f"curriculum={name}"], config_dir)
+            made = target(cfg, "curriculum")()
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(explain(error)) from None
     kind = type(made).__name__
@@ -237,20 +245,47 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
     return made
 
 
+@contextmanager
+def _importing_from_here() -> Iterator[None]:
+    """Find modules in the working directory, too, where a user's own function may be, as a run does."""
+    before = list(sys.path)
+    sys.path.append(os.getcwd())
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
 def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictConfig:
-    """Return the configuration of a command line, within a program that uses Hydra itself, too.
+    """Return the configuration of a command line; the Hydra of a program that uses it itself stays as it was.
 
     Args:
         settings: such as ``agent=ppo``.
         config_dir: is searched after ``conf``.
     """
     searched = [] if config_dir is None else [f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
-    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
-    try:
-        with hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
-            return hydra.compose("config", [*settings, *searched])
-    finally:
-        GlobalHydra.instance().hydra = running
+    with _hydra_of_its_own(), hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+        return hydra.compose("config", [*settings, *searched])
+
+
+@contextmanager
+def _hydra_of_its_own() -> Iterator[None]:
+    """Let Hydra begin anew, in one thread at a time, and put back what it was.
+
+    A program's own Hydra then keeps its ``version_base`` and the name of its job, on which the directories of its
+    further jobs depend, and its resolvers.
+    """
+    with _HYDRA:
+        singletons = {kind: Singleton._instances.pop(kind) for kind in RENEWED if kind in Singleton._instances}
+        resolvers = dict(BaseContainer._resolvers)
+        try:
+            yield
+        finally:
+            for kind in RENEWED:
+                Singleton._instances.pop(kind, None)
+            Singleton._instances.update(singletons)
+            BaseContainer._resolvers.clear()
+            BaseContainer._resolvers.update(resolvers)
 
 
 def curriculum_names(config_dir: Path | None) -> list[str]:
@@ -284,17 +319,6 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
         return composed([f"{group}={name}" for group, name in given.items()], config_dir)
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(explain(error)) from None
-
-
-def logger_of(given: Any) -> Callable[..., Any] | None:
-    """Return what builds a logger in a folder: a function as it is, or that of a name in ``conf/logger``.
-
-    Raises:
-        ValueError: for an unknown name, with the one that was probably meant, and for what is neither.
-    """
-    fits = given is None or isinstance(given, str) or callable(given)
-    require((fits, f"logger must be a name such as 'csv', a function of a folder, or None, got {given!r:.80}"))
-    return target(with_names({"logger": given}), "logger") if isinstance(given, str) else given
 
 
 def names_in(folder: Path | str, group: str) -> list[str]:
@@ -373,28 +397,3 @@ def _unknown_setting(asked: str, node: DictConfig) -> str:
 def _says_what_to_do(error: BaseException) -> bool:
     """Return whether an error says more than what caused it."""
     return isinstance(error, (ValueError, OSError)) and not isinstance(error, OmegaConfBaseException)
-
-
-def sweepable(arguments: Sequence[str]) -> list[str]:
-    """Write settings of groups, such as ``agent.compile=true``, as choices of one value in the command line of a sweep.
-
-    Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
-    a setting that this default lacks.
-    """
-    if not any(each == "-m" or (each.startswith("--m") and "--multirun".startswith(each)) for each in arguments):
-        return list(arguments)
-    groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
-    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")
-    return [_as_choice(*match.groups()) if (match := setting.fullmatch(each)) else each for each in arguments]
-
-
-def _as_choice(key: str, value: str) -> str:
-    """Return a setting as the choice of its one value; unchanged, if it has several, or would be read differently."""
-    setting, choice = f"{key}={value}", f"{key}=choice({value})"
-    parse = OverridesParser.create().parse_override
-    try:
-        before = parse(setting).value()
-        after = [parse(f"{key}={text}").value() for text in parse(choice).sweep_string_iterator()]
-    except HydraException:  # which Hydra reports, if the setting itself is at fault
-        return setting
-    return choice if after == [before] else setting

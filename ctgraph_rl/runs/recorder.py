@@ -25,10 +25,9 @@ from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sources import full_name
-from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import SECONDS, Checkpoints
 from ctgraph_rl.runs.settings import differences, flat
-from ctgraph_rl.runs.trackers import FOLDER, Tracker
+from ctgraph_rl.runs.trackers import FOLDER, Tracker, logger_of
 from ctgraph_rl.runs.train import remove_results, resumed_log, write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -139,7 +138,7 @@ class Recorder:
             self.log = RunLog()
             self.log.append("run", **self._about)
         else:
-            make_logger = config.logger_of(logger)
+            make_logger = logger_of(logger)
             self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
             self.log = self._opened(self.run_dir, overwrite, resume)
             self._track(make_logger, self.run_dir)

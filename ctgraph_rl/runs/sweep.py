@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.core.utils import JobReturn, JobStatus
-from hydra.errors import ConfigCompositionException, MissingConfigException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, member_folder
-from ctgraph_rl.packages import check_packages
+from ctgraph_rl.packages import check_packages, conf_dir
 from ctgraph_rl.portable import become_portable
 from ctgraph_rl.runs.config import check_overwrite, explain, of_member, save_yaml
 from ctgraph_rl.runs.status import (
@@ -303,3 +304,28 @@ def shortened(cells: Sequence[Overrides]) -> list[str]:
     """Return the cells' settings without those that all of them have."""
     common = set.intersection(*map(set, cells)) if len(cells) > 1 else set()
     return [" ".join(setting for setting in cell if setting not in common) for cell in cells]
+
+
+def sweepable(arguments: Sequence[str]) -> list[str]:
+    """Write settings of groups, such as ``agent.compile=true``, as choices of one value in the command line of a sweep.
+
+    Hydra composes what a sweep's cells have in common with the default of every group that is swept, and would refuse
+    a setting that this default lacks.
+    """
+    if not any(each == "-m" or (each.startswith("--m") and "--multirun".startswith(each)) for each in arguments):
+        return list(arguments)
+    groups = "|".join(path.name for path in Path(conf_dir()).iterdir() if path.is_dir() and path.name != "hydra")
+    setting = re.compile(rf"((?:{groups})\.[\w.]+)=(.+)")
+    return [_as_choice(*match.groups()) if (match := setting.fullmatch(each)) else each for each in arguments]
+
+
+def _as_choice(key: str, value: str) -> str:
+    """Return a setting as the choice of its one value; unchanged, if it has several, or would be read differently."""
+    setting, choice = f"{key}={value}", f"{key}=choice({value})"
+    parse = OverridesParser.create().parse_override
+    try:
+        before = parse(setting).value()
+        after = [parse(f"{key}={text}").value() for text in parse(choice).sweep_string_iterator()]
+    except HydraException:  # which Hydra reports, if the setting itself is at fault
+        return setting
+    return choice if after == [before] else setting

@@ -24,6 +24,7 @@ from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.disk import require_no_link
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs import config
 
 FOLDER = "tracker"
 """The folder in the run's directory that trackers write into."""
@@ -107,6 +108,17 @@ class Tracker:
     def _give_up(self, error: Exception) -> None:
         self._logger = None
         warnings.warn(f"{self.name} failed, the run continues without it: {error}", stacklevel=3)
+
+
+def logger_of(given: Any) -> Callable[..., Any] | None:
+    """Return what builds a logger in a folder: a function as it is, or that of a name in ``conf/logger``.
+
+    Raises:
+        ValueError: for an unknown name, with the one that was probably meant, and for what is neither.
+    """
+    fits = given is None or isinstance(given, str) or callable(given)
+    require((fits, f"logger must be a name such as 'csv', a function of a folder, or None, got {given!r:.80}"))
+    return config.target(config.with_names({"logger": given}), "logger") if isinstance(given, str) else given
 
 
 def scalars(measurement: Mapping[str, Any]) -> dict[str, float]:

@@ -9,7 +9,8 @@ import pytest
 from helpers.sweeping import UNLUCKY, command_line, configs, sweep
 
 from ctgraph_rl import run as run_module
-from ctgraph_rl.runs import config, status
+from ctgraph_rl.runs import status
+from ctgraph_rl.runs.sweep import sweepable
 
 
 @pytest.mark.parametrize("whole", ["method=ewc,l2", "method=l2,ewc method.coeff=3", "experiment=own"])
@@ -54,16 +55,14 @@ def test_settings_of_groups_become_choices_of_one_where_that_reads_the_same(flag
         "other.num_envs=3",
     ]
 
-    assert config.sweepable(
-        [flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]
-    ) == [
+    assert sweepable([flag, "method.coeff=2.5", "method.heads='multi'", "agent.layers=[8, 8]", *as_they_are]) == [
         flag,
         "method.coeff=choice(2.5)",
         "method.heads=choice('multi')",
         "agent.layers=choice([8, 8])",
         *as_they_are,
     ]
-    assert config.sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
+    assert sweepable(["method.coeff=2.5"]) == ["method.coeff=2.5"]
 
 
 def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
