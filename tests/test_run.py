@@ -9,6 +9,7 @@ from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.sweeping import command_line, files_in
@@ -312,6 +313,37 @@ def test_a_folder_that_shadows_our_curricula_is_refused_with_its_path(monkeypatc
     assert f"'curricula' was found in {tmp_path / 'curricula'}" in err
     assert "Traceback" not in err and out == ""
     assert not any(path.endswith("run.jsonl") for path in files_in(tmp_path))
+
+
+OWN_IMAGES = """
+from dataclasses import replace
+
+from ctgraph_rl import Block, Curriculum, ImageFile
+from curricula import su_b1_4tasks
+
+def make():
+    curriculum = su_b1_4tasks(num_frames=64)
+    tasks = [replace(task, images=ImageFile.of("images.npy")) for task in curriculum.tasks[:2]]
+    return Curriculum("own", 1, "here", [Block(task, 64) for task in tasks])
+"""
+
+
+def test_relative_paths_are_of_the_directory_of_the_command_also_where_hydra_changes_it(monkeypatch, tmp_path, capsys):
+    (tmp_path / "my_conf" / "curriculum").mkdir(parents=True)
+    (tmp_path / "my_conf" / "curriculum" / "own.yaml").write_text("_target_: own_images.make\n")
+    (tmp_path / "own_images.py").write_text(OWN_IMAGES)
+    np.save(tmp_path / "images.npy", np.arange(12 * 12 * 12, dtype=np.uint8).reshape(12, 1, 12, 12))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    tiny = ("agent=ppo", "agent.num_envs=16", "agent.num_steps=4", "agent.hidden_size=8", "evaluation.num_episodes=2")
+    own = ("--config-dir=my_conf", "curriculum=own", "hydra.job.chdir=true", *tiny)
+
+    code = command_line(monkeypatch, *own, "experts=true", "experts_dir=shared", "hydra.run.dir=out")
+
+    assert code == 0
+    assert len(list((tmp_path / "shared").iterdir())) == 2 and not (tmp_path / "out" / "shared").exists()
+    assert "results: out\n" in capsys.readouterr().out
+    assert Path.cwd() == tmp_path
 
 
 def test_a_users_own_reward_plugs_in_through_yaml(monkeypatch, tmp_path, capsys):
