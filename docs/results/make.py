@@ -1,8 +1,8 @@
 """Makes the pages of results and their figures from the raw results beside this file; and raw results from runs.
 
 ``python docs/results/make.py`` makes all pages but ``statistics``, whose simulations take long; with a NAME it makes
-one. ``make.py collect TABLE RUNS`` writes TABLE.csv from the runs under the folders RUNS. Tables of methods and of
-collectives grow under ``runs/results``, which git ignores, and are written once, when all of their runs are there.
+one. ``make.py collect TABLE RUNS`` writes TABLE.csv from the runs under the folders RUNS. Tables of `GROWING` grow
+under ``runs/results``, which git ignores, and are written once, when all of their runs are there.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ TABLES = {
 }
 """Tables of raw results, and the modules that collect them."""
 
-GROWING = (*OF_METHODS, "collectives")
+GROWING = (*OF_METHODS, "collectives", "memory_cells", "no_labels")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

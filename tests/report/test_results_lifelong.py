@@ -169,30 +169,6 @@ def test_cells_that_were_not_run_again_stay_where_runs_are_added(runs, experimen
     assert frames_in(tmp_path / "stored") == ["512", "2048"]
 
 
-def test_stored_tables_of_collectives_do_not_lose_a_run(runs, monkeypatch, tmp_path):
-    from studies import raw
-    from studies.collectives import runs as collectives
-
-    keys = dict.fromkeys(collectives.CELL, "1")
-    lines = [{**keys, "seed": seed, "frames": seed} for seed in ("0", "1")]
-    own = {"method": "mask_lc", "seed": "0", "block": "1", "frames": "1"}
-    for name in ("collectives", "collective_blocks"):
-        raw.write(name, lines)
-    raw.write("selecting", [own])
-    for seed in ("0", "1"):
-        (tmp_path / seed).mkdir()
-        (tmp_path / seed / "collective.jsonl").touch()
-    again = {seed: {**keys, "seed": seed, "frames": "9"} for seed in ("0", "1")}
-    monkeypatch.setattr(collectives, "measured", lambda log: (again[log.parent.name], [again[log.parent.name]]))
-
-    collectives.collect("collectives", [tmp_path / "0"], add=False)
-
-    assert frames_in(tmp_path / "growing", "collectives") == ["9"]
-    assert frames_in(tmp_path / "stored", "collectives") == ["0", "1"]
-    collectives.collect("collectives", [tmp_path / "1"], add=True)
-    assert frames_in(tmp_path / "stored", "collective_blocks") == ["9", "9"]
-
-
 def test_two_sets_of_experts_of_a_seed_are_refused(runs, tmp_path):
     for number, method in enumerate(("ewc", "si")):
         own = tmp_path / "runs" / "experts" / method

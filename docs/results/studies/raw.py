@@ -59,18 +59,25 @@ def write(name: str, lines: Sequence[Mapping[str, Any]], folder: Path | None = N
         writer.writerows(lines)
 
 
-def grown(name: str, key: Sequence[str], add: bool) -> Raw:
-    """The raw results that a table has so far while it grows.
+def merged(name: str, new: Raw, key: Sequence[str], add: bool) -> Raw:
+    """The lines of some runs, and of other runs those that a table has so far while it grows.
 
     Args:
         name: of the table.
-        key: columns that tell its runs apart.
-        add: whether runs are added to the stored table: its other runs are among the results.
+        new: lines of runs.
+        key: columns that tell runs apart.
+        add: whether runs are added to the stored table: its other runs are among the lines.
     """
-    lines = read(name, GROWING)
+    found = groups(read(name), *key) if add else {}
+    found |= groups(read(name, GROWING), *key)
+    found |= groups(new, *key)
+    return [line for lines in found.values() for line in lines]
+
+
+def lost(name: str, lines: Raw, key: Sequence[str]) -> list[str]:
+    """The runs of a stored table that some lines lack, in words."""
     there = groups(lines, *key)
-    others = [line for line in read(name) if tuple(line[column] for column in key) not in there]
-    return [*others, *lines] if add else lines
+    return [" ".join(run) for run in groups(read(name), *key) if run not in there]
 
 
 def grow(tables: Mapping[str, Sequence[Mapping[str, Any]]], lacking: Sequence[str]) -> None:
@@ -79,7 +86,13 @@ def grow(tables: Mapping[str, Sequence[Mapping[str, Any]]], lacking: Sequence[st
     Args:
         tables: their lines so far, by name.
         lacking: the runs that they lack, in words.
+
+    Raises:
+        ValueError: where there are no lines at all.
     """
+    if not any(tables.values()):
+        raise ValueError(f"no finished run of {', '.join(tables)}, whose files stay as they were: give its folder")
+    tables = {name: lines for name, lines in tables.items() if lines}
     for name, lines in tables.items():
         write(name, lines, GROWING if lacking else None)
         if not lacking:
@@ -106,7 +119,7 @@ def groups(raw: Raw, *keys: str) -> dict[tuple[str, ...], Raw]:
     """Lines with the same values under some keys, in order of appearance."""
     found: dict[tuple[str, ...], Raw] = {}
     for line in raw:
-        found.setdefault(tuple(line[key] for key in keys), []).append(line)
+        found.setdefault(tuple(str(line[key]) for key in keys), []).append(line)
     return found
 
 

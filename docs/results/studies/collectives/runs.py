@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.collectives import selecting
-from studies.raw import Raw, grow, grown, machine_of, read
+from studies.raw import Raw, grow, lost, machine_of, merged
 
 NAME, BLOCKS = "collectives", "collective_blocks"
 
@@ -35,36 +35,19 @@ def collect(name: str, folders: Sequence[Path], add: bool = False) -> None:
         name: of the first table.
         folders: with run directories.
         add: whether runs that are not under the folders stay as the stored tables have them.
-
-    Raises:
-        ValueError: for folders without runs.
     """
     found = [measured(path) for folder in folders for path in sorted(folder.rglob("collective.jsonl"))]
     new = [pair for pair in found if pair is not None]
-    collectives = [line for line, _ in new]
-    blocks = [line for _, lines in new for line in lines]
-    tables = {
-        name: _merged(name, collectives, collectives, add),
-        BLOCKS: _merged(BLOCKS, collectives, blocks, add),
-        selecting.NAME: selecting.merged(folders, add),
-    }
-    if not any(tables.values()):
-        raise ValueError(f"{', '.join(map(str, folders))} has no finished collective and no run on ct28: give others")
-    there = {_key(line) for line in tables[name]}
-    lacking = [" ".join(_key(line)) for line in read(name) if _key(line) not in there]
-    lacking += selecting.lacking(tables[selecting.NAME])
-    grow({table: lines for table, lines in tables.items() if lines}, lacking)
+    collectives = merged(name, [line for line, _ in new], KEY, add)
+    blocks = merged(BLOCKS, [line for _, lines in new for line in lines], KEY, add)
+    alone = merged(selecting.NAME, selecting.measured(folders), selecting.KEY, add)
+    tables = {name: _ordered(collectives), BLOCKS: _ordered(blocks), selecting.NAME: selecting.ordered(alone)}
+    grow(tables, lost(name, collectives, KEY) + lost(selecting.NAME, alone, selecting.KEY))
 
 
-def _merged(name: str, collectives: Raw, lines: Raw, add: bool) -> Raw:
-    """Return the lines of some collectives, and of the others those that a table has so far."""
-    present = {_key(line) for line in collectives}
-    kept = [line for line in grown(name, KEY, add) if _key(line) not in present]
-    return sorted([*kept, *lines], key=lambda line: tuple(map(_place, [line[key] for key in KEY])))
-
-
-def _key(line: dict[str, str]) -> tuple[str, ...]:
-    return tuple(str(line[key]) for key in KEY)
+def _ordered(lines: Raw) -> Raw:
+    """Return lines in the order of their columns `KEY`."""
+    return sorted(lines, key=lambda line: [_place(line[key]) for key in KEY])
 
 
 def _place(value: object) -> tuple[int, str]:

@@ -6,35 +6,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from studies.raw import Raw, groups, grown, machine_of, mean_of, read, table
+from studies.raw import Raw, groups, machine_of, mean_of, read, table
 
 NAME, SEEDS, NUM_TASKS, HIGH, LAST = "selecting", 5, 28, 0.9, 5
 
 METHODS = {"mask_amsc": "AMSC", "mask_lc": "Mask LC", "cka_rl": "CKA-RL", "mask_ri": "Mask RI", "finetune": "PPO"}
 """Methods and their names, in the order of the page."""
 
+KEY = ("method", "seed")
+"""The columns that tell runs apart."""
+
 DEPTHS = range(2, 9)
 
 
-def merged(folders: Sequence[Path], add: bool) -> Raw:
-    """Return the lines of the finished runs on ct28 under some folders, and of the others those of the table so far."""
-    found = [lines for folder in folders for log in sorted(folder.rglob("run.jsonl")) if (lines := _measured(log))]
-    new = {_run(lines[0]) for lines in found}
-    kept = [line for line in grown(NAME, ("method", "seed"), add) if _run(line) not in new]
-    lines = [*kept, *(line for lines in found for line in lines)]
+def measured(folders: Sequence[Path]) -> Raw:
+    """Return the lines of the finished runs on ct28 under some folders."""
+    logs = [log for folder in folders for log in sorted(folder.rglob("run.jsonl"))]
+    return [line for log in logs for line in _measured(log) or ()]
+
+
+def ordered(lines: Raw) -> Raw:
+    """Return lines in the order of the methods, of their seeds and of blocks."""
     order = list(METHODS)
     return sorted(lines, key=lambda line: (order.index(line["method"]), int(line["seed"]), int(line["block"])))
-
-
-def lacking(lines: Raw) -> list[str]:
-    """Return the runs of the stored table that some lines lack."""
-    there = {_run(line) for line in lines}
-    return [f"{NAME} {' '.join(run)}" for run in dict.fromkeys(map(_run, read(NAME))) if run not in there]
-
-
-def _run(line: dict[str, str]) -> tuple[str, str]:
-    """Return what tells runs apart: the method and the seed."""
-    return line["method"], str(line["seed"])
 
 
 def _measured(path: Path) -> Raw | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ctgraph_rl.log.run_log import RunLog
 from studies.lifelong.experiments import curricula_of, lacking
-from studies.raw import Raw, groups, grow, grown, machine_of
+from studies.raw import Raw, groups, grow, machine_of, merged
 
 EXPERT = "expert"
 CELL = ("curriculum", "agent", "method", "seed")
@@ -32,7 +32,7 @@ def collect(name: str, folders: Sequence[Path], add: bool = False) -> None:
         ValueError: for two runs of one cell or two sets of experts of one seed, which differ in what is not in the raw
             results, another curriculum, and folders without finished runs.
     """
-    kept = groups(grown(name, CELL, add), *CELL)
+    kept = groups(merged(name, [], CELL, add), *CELL)
     found: dict[tuple[str, ...], Raw] = {}
     own = curricula_of(name)
     where = ", ".join(map(str, folders))

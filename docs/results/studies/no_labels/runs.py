@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from studies.raw import machine_of, write
+from studies.raw import grow, lost, machine_of, merged
 
 NAME, SPANS = "no_labels", "no_labels_spans"
 
 FOUND = ("detector", "method", "num_fresh", "boundaries")
 """The columns that tell the learners of a curriculum apart."""
+
+KEY = ("curriculum", "stay", *FOUND, "seed")
+"""The columns that tell runs apart."""
 
 MASKS, PAIR = "swoks_2x4", "dick2020_pair"
 IMAGES = ("fo_b1_4images", "su_b1_4images", "co_b1_4images", "posr_b1_4images")
@@ -104,17 +107,28 @@ def _value(metric: dict[str, Any]) -> float | str:
     return "" if metric["value"] is None else round(metric["value"], 6)
 
 
-def collect(name: str, folders: Sequence[Path]) -> None:
-    """Write the raw results of the finished runs under some folders; of equal runs, the last one counts.
+def collect(name: str, folders: Sequence[Path], add: bool = False) -> None:
+    """Add the finished runs under some folders to tables that grow until they have all runs of the stored ones.
 
-    The table has a line for each run, and that of spans a line for each span of frames in which one label acted.
+    The table has a line for each run, and that of spans a line for each span of frames in which one label acted. Of
+    equal runs, the last one counts.
+
+    Args:
+        name: of the first table.
+        folders: with run directories.
+        add: whether runs that are not under the folders stay as the stored tables have them.
     """
-    names = {name for name, _ in PLANNED}
-    found: dict[tuple[Any, ...], tuple[dict[str, Any], list[dict[str, Any]]]] = {}
+    curricula = {curriculum for curriculum, _ in PLANNED}
+    found: dict[tuple[str, ...], tuple[dict[str, Any], list[dict[str, Any]]]] = {}
     for path in (path for folder in folders for path in sorted(folder.rglob("metrics.json"))):
-        if "experts" not in path.parts and path.parent.parent.name in names:
+        if "experts" not in path.parts and path.parent.parent.name in curricula:
             line, spans = measured(path.parent)
-            found[tuple(str(line[key]) for key in ("curriculum", "stay", *FOUND, "seed"))] = line, spans
-    in_order = [found[key] for key in sorted(found)]
-    write(name, [line for line, _ in in_order])
-    write(SPANS, [span for _, spans in in_order for span in spans])
+            found[_key(line)] = line, spans
+    lines = merged(name, [line for line, _ in found.values()], KEY, add)
+    all_spans = merged(SPANS, [span for _, spans in found.values() for span in spans], KEY, add)
+    grow({name: sorted(lines, key=_key), SPANS: sorted(all_spans, key=_key)}, lost(name, lines, KEY))
+
+
+def _key(line: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what tells a run apart; spans of a run stay in their order."""
+    return tuple(str(line[column]) for column in KEY)
