@@ -135,6 +135,6 @@ def _needed(paths: Sequence[Path]) -> list[str]:
     """Return what Python and our packages are read from, and given folders, those that hold others first."""
     package = Path(__file__).resolve().parents[2]
     sites = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
-    named = [*paths, sys.prefix, sys.base_prefix, *sites, *(package / name for name in PACKAGES)]
+    named: list[str | Path] = [*paths, sys.prefix, sys.base_prefix, *sites, *(package / name for name in PACKAGES)]
     both = {path for each in named for path in (os.path.abspath(each), os.path.realpath(each))}
     return sorted(path for path in both if os.path.isdir(path) and not Path(path).is_relative_to("/usr"))

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from ctgraph_rl.board import bubblewrap
 from ctgraph_rl.checks import LARGEST_INT, positive, require
@@ -153,12 +153,12 @@ def run_isolated(
     """
     require(*positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk))
     folder = _prepared(folder)
-    spec = {"limits": limits, "module": module, "arguments": list(arguments)}
+    spec: dict[str, Any] = {"limits": limits, "module": module, "arguments": list(arguments)}
     spec |= {"paths": [str(path.resolve()) for path in paths], "is_confined": isolated.bubblewrap is not None}
     command = [sys.executable, "-P", "-s", "-m", HERE, json.dumps(spec)]
     start = time.monotonic()
     with ExitStack() as stack:
-        opened = ()
+        opened: tuple[int, ...] = ()
         if isolated.bubblewrap is not None:
             opened = (stack.enter_context(bubblewrap.program()),)
             command = bubblewrap.confined(command, folder, paths, filtering=opened[0], graphics=isolated.graphics)
