@@ -275,7 +275,14 @@ def test_goals_are_gathered_by_graph_with_their_blocks():
     }
 
 
-@pytest.mark.parametrize("shapes", [[(2, 2)], [(2, 5), (3, 11), (30, 1), (1000, 2)], [(2, d) for d in range(1, 15)]])
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        [(2, 2)],
+        [(3, 11), (30, 1), (1000, 2)],
+        pytest.param([(2, d) for d in range(1, 15)], marks=pytest.mark.slow),
+    ],
+)
 def test_graphs_of_any_size_are_drawn(tmp_path, shapes):
     blocks = [Block(surjective(b, d, goal=goal), 1) for b, d in shapes for goal in ((1,) * d, (2,) * d)]
 

@@ -256,11 +256,12 @@ def test_dot_and_the_status_of_a_sweep_have_no_controls():
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no LaTeX")
-def test_latex_reads_the_tables(tmp_path):
-    (tmp_path / "a.tex").write_text(
-        r"\documentclass{article}\usepackage[T1]{fontenc}\begin{document}"
-        + escape.latex_text(WORST)
-        + r"\end{document}"
-    )
-    done = subprocess.run(["pdflatex", "-interaction=nonstopmode", "a.tex"], cwd=tmp_path, capture_output=True)
-    assert b"! Undefined control sequence" not in done.stdout
+def test_latex_sets_a_name(tmp_path):
+    emoji = r"\DeclareUnicodeCharacter{1F642}{:-)}"  # which the fonts of LaTeX lack
+    preamble = rf"\documentclass{{article}}\usepackage[T1]{{fontenc}}{emoji}\begin{{document}}"
+    (tmp_path / "a.tex").write_text(preamble + escape.latex_text(WORST) + r"\end{document}")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "a.tex"]
+
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True)
+
+    assert done.returncode == 0, done.stdout[-2000:]

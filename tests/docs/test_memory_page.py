@@ -86,6 +86,7 @@ def says(part: str, of: dict[str, Lines]) -> bool:
     return not numbers
 
 
+@pytest.mark.slow
 def test_the_page_is_what_its_raw_results_make(cells):
     assert cells.page() == (FOLDER / "memory.md").read_text(encoding="utf-8")
 
@@ -238,6 +239,7 @@ def runs_of(command: str) -> set[tuple[str, ...]]:
     return found
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_make_its_runs(cells):
     text = (FOLDER / "memory.md").read_text(encoding="utf-8").replace("\\\n", " ")
     commands = [line for line in text.splitlines() if line.startswith("ctgraph-rl -m experiment=")]
@@ -247,6 +249,7 @@ def test_the_commands_of_the_page_make_its_runs(cells):
     assert set().union(*map(runs_of, commands)) == set().union(*recorded)
 
 
+@pytest.mark.slow
 def test_agents_have_the_weights_and_take_the_gradient_steps_that_the_page_says(compose):
     env = CTGraphEnv([co_hard().tasks[0]])
     words = {"a2c": "A2C", "reinforce": "REINFORCE", "dqn": "DQN, targets of 1 or 6 steps", "mohqa": "MOHQA"}

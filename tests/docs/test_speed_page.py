@@ -19,6 +19,7 @@ from ctgraph_rl.tasks.configurations import ct_co_b1
 PAGE = CHECKOUT / "docs" / "how-to" / "go_fast.md"
 
 
+@pytest.mark.slow
 def test_the_example_of_the_fast_path_learns_the_task(capsys):
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     (code,) = [block for block in blocks if "optimizer" in block]
@@ -48,7 +49,7 @@ def test_the_benchmark_prints_a_row_for_every_way(capsys):
     ]
 
 
-@pytest.mark.parametrize(("limit", "stops_after", "rows"), [(600.0, 9, 4), (600.0, 3, 2), (1e-9, 9, 0)])
+@pytest.mark.parametrize(("limit", "stops_after", "rows"), [(600.0, 3, 2), (1e-9, 9, 0)])
 def test_the_ladder_of_a_device_prints_what_it_has_measured_when_it_is_stopped(
     limit, stops_after, rows, capsys, monkeypatch
 ):

@@ -46,6 +46,7 @@ def l2d2c(num_members: int, epochs: int = 1, frames: int = 12_800, column: str =
     return [float(line[column]) for line in lines]
 
 
+@pytest.mark.slow
 def test_the_page_is_what_its_raw_results_make(made):
     assert made.page() == (FOLDER / "collectives.md").read_text(encoding="utf-8")
 

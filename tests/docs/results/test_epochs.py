@@ -42,6 +42,7 @@ def by_curriculum():
     }
 
 
+@pytest.mark.slow
 def test_in_short_says_on_which_curricula_the_papers_claims_hold(by_curriculum):
     masks, short = [m for m in METHODS if "mask" in m], PAGE[: PAGE.index("Every seed that was run")]
 
@@ -60,6 +61,7 @@ def values(measured):
     return lambda table, epochs, method, column: [scores[column] for scores in measured[table, epochs, method]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("table", TABLES)
 def test_a_line_has_both_columns_for_8_epochs_and_for_one(values, table, method):

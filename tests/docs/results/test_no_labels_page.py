@@ -39,6 +39,7 @@ def labelling(spans, num_tasks):
     return Labelling(*map(torch.tensor, zip(*rows, strict=True)))
 
 
+@pytest.mark.slow
 def test_the_page_is_what_its_raw_results_make(made):
     assert made.page() == (FOLDER / "no_labels.md").read_text(encoding="utf-8")
 
