@@ -158,6 +158,44 @@ def takes_numbers(function: Function) -> Function:
     return called  # type: ignore[return-value]
 
 
+KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "int": ("an integer", lambda value: is_int(value)),
+    "float": ("a number", lambda value: is_real(value)),
+    "bool": ("true or false", lambda value: isinstance(value, bool)),
+    "str": ("a text", lambda value: isinstance(value, str)),
+    "Sequence": ("a list", lambda value: isinstance(as_tuple(value), tuple)),
+    "None": ("null", lambda value: value is None),
+}
+"""By the names in annotations, what a value must be in words, and whether it is."""
+
+
+def takes_its_kinds(function: Function) -> Function:
+    """Give a function plain numbers, see `takes_numbers`, and refuse values of other kinds than are annotated.
+
+    So what a function does not use is not silently accepted. Annotations with other names than `KINDS` say nothing.
+    """
+    shape = signature(function)
+    kinds = {name: [re.sub(r"\[.*", "", kind) for kind in _kinds(each)] for name, each in shape.parameters.items()}
+    checked = {name: each for name, each in kinds.items() if set(each) <= set(KINDS)}
+
+    @wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        given = shape.bind(*args, **kwargs).arguments
+        require(*(_kind_rule(name, given[name], checked[name]) for name in given if name in checked))
+        return function(*args, **kwargs)
+
+    return takes_numbers(called)  # type: ignore[return-value]
+
+
+def _kinds(parameter: Parameter) -> list[str]:
+    return re.split(r" \| (?![^\[]*\])", str(parameter.annotation))
+
+
+def _kind_rule(name: str, value: object, kinds: list[str]) -> tuple[bool, str]:
+    fits = any(KINDS[kind][1](value) for kind in kinds)
+    return fits, f"{name} must be {' or '.join(KINDS[kind][0] for kind in kinds)}, got {value!r}"
+
+
 class TakesNumbers:
     """The base of classes whose constructors take numbers of NumPy and torch, too, see `takes_numbers`."""
 

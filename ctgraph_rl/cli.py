@@ -56,9 +56,12 @@ SETTINGS = {
 
 PARTS = {
     **{part: f"curricula {part}" for part in ("describe", "list", "probabilities")},
+    **dict.fromkeys(("fit", "learn", "start", "train"), "run"),
+    **dict.fromkeys(("evaluate", "plot", "show"), "report"),
+    "sweep": "-m",
     **{option: f"--{option}" for option in ("help", "version")},
 }
-"""Words that are no commands but part of one, or options."""
+"""Words that are no commands but part of one, options, or what other programs call one."""
 
 USAGE = """usage: ctgraph-rl COMMAND ...         each command has --help
        ctgraph-rl SETTING=VALUE ...    one run, such as ctgraph-rl curriculum=su_b1_4tasks agent=dqn

@@ -14,7 +14,7 @@ from inspect import getdoc, signature, unwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.checks import nearest, takes_numbers
+from ctgraph_rl.checks import nearest, takes_its_kinds
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
@@ -84,7 +84,7 @@ def _function(name: str) -> Callable[..., Curriculum]:
 @cache
 def _named() -> dict[str, Callable[..., Curriculum]]:
     tables = (import_module(f"curricula.{module}").NAMED for module in _MODULES)
-    return {name: takes_numbers(function) for table in tables for name, function in table.items()}
+    return {name: takes_its_kinds(function) for table in tables for name, function in table.items()}
 
 
 def __getattr__(name: str) -> Any:

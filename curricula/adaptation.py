@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot, PaperImages
@@ -51,7 +51,7 @@ def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 2
         num_rows: trials side by side, for the default of ``num_frames``.
         seed: draws the two goals.
     """
-    require((depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"))
+    require((depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"), *at_least_one(num_rows=num_rows))
     unique = (False, False)
     config = environment(depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=unique)
     tasks = random_goals(Task.from_json(config, (1,) * depth), 2, seed)

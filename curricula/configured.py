@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require, takes_numbers
+from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require, takes_its_kinds
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
 from ctgraph_rl.tasks.task import Task
@@ -23,7 +23,7 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
 }
 
 
-@takes_numbers
+@takes_its_kinds
 def from_axes(
     configuration: str = "su_b1",
     branching_factor: int | Sequence[int] | None = None,
@@ -75,7 +75,11 @@ def from_axes(
     Raises:
         ValueError: for values out of range; lists the choices.
     """
-    require((order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"))
+    require(
+        (order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"),
+        *at_least_one(num_goals=num_goals, repeats=repeats),
+        (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
+    )
     seeds = _several(image_seeds)
     if random_graphs is None:
         task, depths = _deepest(configuration, branching_factor, depth)

@@ -78,24 +78,14 @@ class MaskExchange(Exchange):
         methods = [getattr(agent, "method", None) for agent in agents]
         known = [isinstance(method, Masks) and self.takes(method) for method in methods]
         name, fix = type(self).__name__, f"take method={self.method}"
-        require(
-            *(
-                (good, f"{name} needs masks, and member {number} has {type(method).__name__}: {fix}")
-                for number, (method, good) in enumerate(zip(methods, known, strict=True))
-            )
-        )
+        lack = [number for number, good in enumerate(known) if not good]
+        one = f"member {lack[0]} has {type(methods[lack[0]]).__name__}" if lack else ""
+        require((not lack, f"{name} needs masks, which {len(lack)} of {len(methods)} members lack; {one}: {fix}"))
         self.methods: list[Any] = methods
         first = self.methods[0].constant
-        require(
-            *(
-                (
-                    torch.equal(first, method.constant),
-                    f"{name} needs one network behind all masks, and member {number} has another than member 0: "
-                    "set method.backbone_seed",
-                )
-                for number, method in enumerate(self.methods)
-            )
-        )
+        others = [number for number, method in enumerate(methods) if not torch.equal(first, method.constant)]
+        have = f"{len(others)} of {len(methods)} members have another than member 0"
+        require((not others, f"{name} needs one network behind all masks, and {have}: set method.backbone_seed"))
         self.returns: list[dict[int, float]] = [{} for _ in methods]
 
     def takes(self, method: Masks) -> bool:

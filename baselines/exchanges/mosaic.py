@@ -21,7 +21,7 @@ from baselines.methods.mask_shared import MaskShared
 from baselines.methods.masks import Masks
 from baselines.methods.weights import flat
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import at_least_one, is_real, require, true_or_false
+from ctgraph_rl.checks import LARGEST_INT, at_least_one, is_int, is_real, require, true_or_false
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
 
@@ -77,6 +77,7 @@ class Mosaic(MaskExchange):
         require(
             (is_real(threshold, -1, 1), f"threshold must be in [-1, 1], got {threshold!r}"),
             (own_share is None or (is_real(own_share, 0, 1) and own_share not in (0, 1)), share_rule),
+            (is_int(seed, 0, LARGEST_INT), f"seed must be an integer in [0, 2**63), got {seed!r}"),
             *at_least_one(top_n=top_n, num_samples=num_samples, buffer_size=buffer_size, num_references=num_references),
             *true_or_false(use_similarity=use_similarity, use_return=use_return),
         )

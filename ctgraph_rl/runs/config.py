@@ -191,7 +191,7 @@ def changes_of(cfg: DictConfig, part: str) -> dict[str, Any]:
     Raises:
         ValueError: for a part without keys.
     """
-    message = f"{part} must have keys, such as {part}.{PARTS[part]}, got {cfg[part]}"
+    message = f"{part} must have keys, such as {part}.{PARTS[part]}, got {cfg[part]!r}"
     require((isinstance(cfg[part], DictConfig), message))
     return {str(key): value for key, value in OmegaConf.to_container(cfg[part]).items() if value is not None}  # type: ignore[union-attr]
 

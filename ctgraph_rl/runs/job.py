@@ -35,6 +35,7 @@ from ctgraph_rl.runs.status import holds_results, marked_if_it_fails
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import changed
 
 KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
 
@@ -394,6 +395,5 @@ def with_changes(curriculum: Curriculum, cfg: DictConfig) -> Curriculum:
     how = curriculum.protocol
     if protocol.get("task_id") == "hidden":
         how = replace(how, task_id="hidden", num_task_ids=None, task_ids=None)  # hidden ids have no length or numbers
-    return replace(
-        curriculum, evaluation=replace(curriculum.evaluation, **evaluation), protocol=replace(how, **protocol)
-    )
+    measured = changed("evaluation", curriculum.evaluation, evaluation)
+    return replace(curriculum, evaluation=measured, protocol=changed("protocol", how, protocol))

@@ -14,7 +14,7 @@ from itertools import accumulate
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import as_path, as_tuple, is_int, make_fields_plain, require
+from ctgraph_rl.checks import LARGEST_INT, as_path, as_tuple, is_int, make_fields_plain, require
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, write_curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
@@ -101,6 +101,7 @@ class Curriculum:
         return [
             (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
             (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
+            (self.num_frames <= LARGEST_INT, f"the blocks have {self.num_frames:,} frames together, at most 2**63 - 1"),
             (one_each, "task ids given at_boundaries need blocks of one task each"),
             (self._ever_evaluates(), "nothing would be evaluated: set before, every or at_block_ends"),
         ]

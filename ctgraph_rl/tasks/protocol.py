@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, is_dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, make_fields_plain, one_of, require, true_or_false
+from ctgraph_rl.checks import (
+    as_tuple,
+    at_least_one,
+    did_you_mean,
+    is_int,
+    make_fields_plain,
+    one_of,
+    require,
+    true_or_false,
+)
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 from ctgraph_rl.tasks.task import Task
+
+Part = TypeVar("Part", "Evaluation", "Protocol")
 
 TASK_IDS = ("hidden", "one_hot", "at_boundaries")
 BOUNDARIES = ("announced", "hidden")
@@ -53,7 +65,7 @@ class Block:
         switches = self.switch is None or (is_dataclass(self.switch) and switch_rule(self.switch)[0])
         require(
             (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
-            (is_int(self.num_frames, 1), f"num_frames must be an integer >= 1, got {self.num_frames!r}"),
+            *at_least_one(num_frames=self.num_frames),
             (switches, f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}"),
         )
         enough = self.switch is None or len(self.tasks) > 1
@@ -207,3 +219,19 @@ class Protocol:
     def length(self, num_tasks: int) -> int:
         """The length of a one-hot id."""
         return max(self.ids(num_tasks)) + 1 if self.num_task_ids is None else self.num_task_ids
+
+
+def changed(name: str, part: Part, changes: Mapping[str, Any]) -> Part:
+    """An evaluation or a protocol with other values of some fields.
+
+    Args:
+        name: of the part, for errors.
+        part: the part.
+        changes: values by the names of fields.
+
+    Raises:
+        ValueError: for a name of no field, with the one that was probably meant, and for values out of range.
+    """
+    known = [each.name for each in fields(part)]
+    require(*((key in known, f"{name} has no {key}: {did_you_mean(key, known)}") for key in changes))
+    return replace(part, **changes)

@@ -93,6 +93,8 @@ def test_the_version_is_its_own_with_those_of_what_it_is_built_on(call):
         ("help", "--help"),
         ("curriculum", "curriculum=NAME"),
         ("PPO", "agent=ppo"),
+        ("train", "run"),
+        ("plot", "report"),
         ("su-b1-4tasks", "curriculum=su_b1_4tasks"),
     ],
 )

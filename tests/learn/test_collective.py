@@ -298,12 +298,12 @@ def test_members_that_cannot_be_a_collective_are_refused_before_any_work(make, c
 @pytest.mark.parametrize(
     ("method", "overrides", "message"),
     [
-        ("ewc", (), "L2D2C needs masks, and member 0 has EWC: take method=mask_ri; L2D2C needs masks, and member 1"),
-        ("mask_lc", (), "L2D2C needs masks, and member 0 has MaskLC: take method=mask_ri"),
+        ("ewc", (), "L2D2C needs masks, which 2 of 2 members lack; member 0 has EWC: take method=mask_ri"),
+        ("mask_lc", (), "L2D2C needs masks, which 2 of 2 members lack; member 0 has MaskLC: take method=mask_ri"),
         (
             "mask_ri",
             ("method.backbone_seed=null",),
-            "needs one network behind all masks, and member 1 has another than member 0: set method.backbone_seed",
+            "one network behind all masks, and 1 of 2 members have another than member 0: set method.backbone_seed",
         ),
     ],
 )

@@ -62,7 +62,7 @@ def test_without_ids_there_are_none_in_the_data():
         ({"task_ids": {ONE: True}}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[True\]"),
         ({"task_ids": [0]}, r"task_ids must give tasks their ids, integers in 0..1048575, got \[\[0\]\]"),
         ({"task_ids": {ONE: 2}, "num_task_ids": 2}, r"num_task_ids must be an integer in 3..1048576, .*got 2"),
-        ({"task_ids": {ONE: 2}, "num_task_ids": 3.0}, r"num_task_ids must be an integer in 3..1048576, .*got 3.0"),
+        ({"task_ids": {ONE: 2}, "num_task_ids": 3.5}, r"num_task_ids must be an integer in 3..1048576, .*got 3.5"),
     ],
 )
 def test_wrong_task_ids_are_refused(arguments, message):

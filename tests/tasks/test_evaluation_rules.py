@@ -25,7 +25,7 @@ THREE = replace(ONE, goal_reward=3.0)
         ({"at_block_ends": None}, "at_block_ends must be true or false, got None"),
         ({"every": -1}, "every must be an integer >= 0, got -1"),
         ({"every": True}, "every must be an integer >= 0, got True"),
-        ({"every": 8.0}, "every must be an integer >= 0, got 8.0"),
+        ({"every": 8.5}, "every must be an integer >= 0, got 8.5"),
         ({"tasks": "held_out"}, "tasks must be one of all, seen, got 'held_out'"),
         ({"held_out": "ONE"}, "held_out must be tasks, got 'ONE'"),
         ({"held_out": (ONE, 1)}, "held_out must be tasks, got .*, 1"),

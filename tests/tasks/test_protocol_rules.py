@@ -20,7 +20,7 @@ THREE = replace(ONE, goal_reward=3.0)
         ({"task_id": "shown"}, "task_id must be one of hidden, one_hot, at_boundaries, got 'shown'"),
         ({"boundaries": "blurred"}, "boundaries must be one of announced, hidden, got 'blurred'"),
         ({"task_id": "one_hot", "num_task_ids": 0}, "num_task_ids must be an integer in 1..1048576, got 0"),
-        ({"task_id": "one_hot", "num_task_ids": 2.0}, "num_task_ids must be an integer in 1..1048576, got 2.0"),
+        ({"task_id": "one_hot", "num_task_ids": 2.5}, "num_task_ids must be an integer in 1..1048576, got 2.5"),
         (
             {"task_id": "one_hot", "task_ids": ()},
             r"task_ids must be integers in 0..1048576, one for each task, got \(\)",

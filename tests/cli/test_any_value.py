@@ -1,0 +1,225 @@
+"""Every setting in ``conf`` with values of wrong kinds and extremes: it works, or one line says why it does not."""
+
+from __future__ import annotations
+
+import copy
+import math
+import random
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.sweeping import command_line
+from omegaconf import DictConfig, OmegaConf
+
+import curricula
+from baselines.catalogue import catalogue
+from ctgraph_rl.packages import conf_dir
+from ctgraph_rl.run import ERRORS
+from ctgraph_rl.runs import config
+from ctgraph_rl.runs.interrupt import Interrupt
+from ctgraph_rl.runs.job import Job
+
+SECONDS = 30
+"""For one case; most take a hundredth of a second."""
+
+VALUES: tuple[Any, ...] = (
+    *("", "text", math.nan, math.inf, 1.5, -1, 0, 1e-9, 1e30, 2**63, True, None, {"a": 1}, [1, 2], [], "a\nb"),
+)
+
+OVER = {
+    "agent": (),
+    "cell": ("agent=lstm_ppo",),
+    "curriculum": ("agent=ppo",),
+    "detector": ("agent=ppo", "method=mask_ri"),
+    "exchange": ("agent=ppo", "method=mask_shared", "curriculum=l2d2c_2x2"),
+    "logger": ("agent=ppo",),
+    "method": ("agent=ppo", "protocol.task_id=at_boundaries"),
+}
+"""What the settings of a group are tried with."""
+
+FITTING = {"l2d2c": ("agent=ppo", "method=mask_ri", "curriculum=l2d2c_2x2"), "isolated": ("agent=ppo",)}
+
+SMALL = {"num_envs": 4, "num_steps": 8, "hidden_size": 8, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
+
+FREE = ("checkpoint_seconds", "experts", "max_grad_norm")
+"""Settings that may be of another kind than their value in the file: any number, and what a sweep also lists."""
+
+FILES = [f"{group}={path.stem}" for group in OVER for path in sorted(Path(conf_dir(), group).glob("*.yaml"))]
+
+RUN = ("seed", "device", "num_threads", "together", "portable", "experts", "experts_dir", "report", "overwrite")
+OF_RUN = (*RUN, "resume", "checkpoint_seconds", "evaluation", "protocol")
+
+
+class Slow(Exception):
+    """A case that takes too long."""
+
+
+@contextmanager
+def limited() -> Iterator[None]:
+    """Stop what takes longer than a case may."""
+
+    def stop(*_: Any) -> None:
+        raise Slow(f"takes more than {SECONDS} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def build(cfg: DictConfig) -> None:
+    """Make all that a run makes before it works."""
+    if "logger" in cfg:
+        config.target(cfg, "logger")
+    if "exchange" not in cfg:
+        config.check_values(cfg)
+        Job.of(cfg, Interrupt())
+        return
+    exchange = config.target(cfg, "exchange")()
+    members = [config.of_member(cfg, number) for number in range(exchange.num_members)]
+    for each in members[:1]:
+        config.check_values(each)
+        Job.of(each, Interrupt())
+
+
+def small(compose: Callable[..., DictConfig], file: str) -> DictConfig:
+    """The configuration with a file, made small."""
+    group, _, name = file.partition("=")
+    cfg = compose(*FITTING.get(name, OVER[group]), file)
+    for key in SMALL.keys() & cfg.agent.keys():
+        cfg.agent[key] = SMALL[key]
+    if "num_frames" in cfg.curriculum:
+        cfg.curriculum.num_frames = 1024
+    return cfg
+
+
+def settings_of(cfg: DictConfig, file: str) -> list[str]:
+    """The names of a file's settings in the configuration."""
+    group = file.partition("=")[0]
+    place = {"cell": "agent.cell"}.get(group, group)
+    node = OmegaConf.select(cfg, place) or {}
+    return [f"{place}.{key}" for key in node if not str(key).startswith("_") and key != "cell"]
+
+
+def differs_in_kind(value: Any, usual: Any) -> bool:
+    """Whether a value cannot be meant where another one is usual; null and lists may stand for what is not there."""
+    if value is None or usual is None or isinstance(usual, (list, str)) or isinstance(value, list):
+        return False
+    numbers = (int, float)
+    both = type(value) in numbers and type(usual) in numbers
+    fraction = type(usual) is int and type(value) is float and not value.is_integer()
+    return not both or fraction or (isinstance(value, float) and not math.isfinite(value))
+
+
+def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
+    """What is wrong with the way in which a setting is answered; None if it works or is refused in one line."""
+    usual = OmegaConf.select(cfg, name)
+    changed = copy.deepcopy(cfg)
+    OmegaConf.update(changed, name, value, merge=False)
+    case = f"{name}={value!r}"
+    try:
+        with limited():
+            build(changed)
+    except ERRORS as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None and not config._says_what_to_do(cause):
+            cause = cause.__cause__
+        said = isinstance(cause, (ValueError, ImportError)) and str(cause) and "\n" not in str(cause).strip()
+        return None if said else f"{case}: {type(cause).__name__}: {cause}"
+    except Exception as error:
+        return f"{case}: {type(error).__name__}: {error}"
+    fits = usual is None or not differs_in_kind(value, usual) or name.rpartition(".")[2] in FREE
+    return None if fits else f"{case} is accepted, where {usual!r} is usual"
+
+
+def faults(compose: Callable[..., DictConfig], file: str, num_cases: int | None = None) -> list[str]:
+    """The faults of all cases of a file, or of some that are drawn."""
+    cfg = small(compose, file)
+    cases = [(name, value) for name in settings_of(cfg, file) for value in VALUES]
+    chosen = cases if num_cases is None else random.Random(file).sample(cases, min(num_cases, len(cases)))
+    return [found for case in chosen if (found := fault(cfg, *case)) is not None]
+
+
+SAMPLED = ("agent=ppo", "curriculum=axes", "method=mask_sc", "exchange=l2d2c")
+
+
+@pytest.mark.parametrize("file", SAMPLED)
+def test_some_values_of_some_files_work_or_are_refused_in_one_line(compose, file):
+    assert faults(compose, file, num_cases=12) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", FILES)
+def test_all_values_of_every_file_work_or_are_refused_in_one_line(compose, file):
+    assert faults(compose, file) == []
+
+
+@pytest.mark.parametrize(
+    "value",
+    [value if value in ("a\nb", 1.5) else pytest.param(value, marks=pytest.mark.slow) for value in VALUES],
+    ids=repr,
+)
+def test_values_of_the_run_itself_work_or_are_refused_in_one_line(compose, value):
+    cfg = small(compose, "agent=reinforce")
+    names = [f"{key}.{part}" for key in OF_RUN[-2:] for part in cfg[key]] + list(OF_RUN)
+
+    assert [found for name in names if (found := fault(cfg, name, value)) is not None] == []
+
+
+@pytest.mark.parametrize("part", ["evaluation", "protocol"])
+def test_a_key_that_a_part_of_a_curriculum_has_not_is_refused_with_the_one_that_was_meant(compose, part):
+    cfg = compose(f"+{part}.task_idd=1")
+
+    with pytest.raises(ValueError, match=f"{part} has no task_idd: did you mean 'tasks?_?i?d?'"):
+        build(cfg)
+
+
+ODD: tuple[Any, ...] = ("", 1.5, math.nan, {"a": 1})
+
+REPORTED = [
+    ("su_b1_4images", "image_seed", ODD, "image_seed must be an integer, got "),
+    ("su_b1_uncorrelated", "image_seed", ODD, "image_seed must be an integer, got "),
+    ("fo_b2_dissimilar", "image_seed", ODD, "image_seed must be an integer, got "),
+    ("from_axes", "switch", ([1, 2],), r"switch must be a text or null, got \[1, 2\]"),
+    ("from_axes", "num_goals", (1e-9, 0, -1), "num_goals must be an integer"),
+    ("from_axes", "seed", (-1, "x"), "seed must be an integer"),
+    ("from_axes", "num_frames", (2**63,), r"num_frames must be an integer < 2\*\*63, got 9223372036854775808"),
+    ("from_axes", "num_frames", (2**62,), "the blocks have 18,446,744,073,709,551,616 frames together, at most 2"),
+    ("penn_a_swap", "num_rows", (1e30, 0, 1.5), "num_rows must be an integer"),
+    ("dick2020_pair", "one_hot", ({"a": 1}, 1, ""), "one_hot must be true or false, got "),
+    ("ct28_blocked_skips_d5", "seed_set", ({"a": 1}, True), "seed_set must be an integer, got "),
+    ("nm_uniform_goals", "depth", ([1, 2],), "depth must be an integer, got"),
+    ("random_graphs", "image_seed", ([1, 2],), "image_seed must be an integer, got"),
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "values", "said"), REPORTED)
+def test_values_of_other_kinds_are_refused_by_curricula_also_where_they_are_not_used(name, argument, values, said):
+    for value in values:
+        with pytest.raises(ValueError, match=said):
+            getattr(curricula, name)(**{argument: value})
+
+
+@pytest.mark.parametrize("seed", [{"a": 1}, -1, 2**63, True])
+def test_a_seed_of_an_exchange_that_is_none_is_refused(seed):
+    [mosaic] = [entry for entry in catalogue("exchange") if entry.name == "mosaic"]
+
+    with pytest.raises(ValueError, match=r"seed must be an integer in \[0, 2\*\*63\), got "):
+        mosaic.kind(**{**mosaic.settings, "seed": seed})
+
+
+def test_what_no_member_of_a_collective_can_do_is_said_once(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    code = command_line(monkeypatch, "agent=ppo", "exchange=mosaic")
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert error.count("needs masks, which 28 of 28 members lack") == 1 and len(error.splitlines()) == 1
