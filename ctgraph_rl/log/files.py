@@ -28,6 +28,10 @@ CHECKPOINTS = "checkpoints"
 LOCK = ".lock"
 """The file in a directory that names the process that has locked it."""
 
+WITH_LOCKS = (
+    "keep runs on a file system with locks (flock): set hydra.run.dir, with -m hydra.sweep.dir, and experts_dir"
+)
+
 SECONDS_BETWEEN_ATTEMPTS = 0.5
 """To get a lock that another process has."""
 
@@ -53,7 +57,8 @@ def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterato
     try:
         yield
     finally:
-        (folder / LOCK).unlink(missing_ok=True)
+        if _is_still_there(file, folder / LOCK):  # not where the folder was moved, and another is in its place
+            (folder / LOCK).unlink(missing_ok=True)
         file.close()
 
 
@@ -87,7 +92,9 @@ def _is_locked(file: BinaryIO) -> bool:
     except BlockingIOError:
         return False
     except OSError as error:
-        message = f"{error.strerror}: {file.name} cannot be locked; keep runs on a file system with locks"
+        if not os.fstat(file.fileno()).st_size:  # else another process has signed it
+            Path(os.fsdecode(file.name)).unlink(missing_ok=True)
+        message = f"{error.strerror}: {file.name} cannot be locked; {WITH_LOCKS}"
         raise OSError(error.errno, message) from error
     return True
 

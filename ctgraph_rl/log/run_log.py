@@ -22,6 +22,7 @@ the only field that differs between two equal runs. A reader in three lines, for
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -77,6 +78,7 @@ class RunLog:
         self.listeners: list[Callable[[dict[str, Any]], object]] = []
         self._start = time.perf_counter()
         self._path = None if path is None else as_path("path", path)
+        self._place = None if self._path is None else self._path.absolute()  # a program may change its directory
         self._file: BinaryIO | None = None
         if self._path is not None:
             self._file = open_own(self._path, "xb")
@@ -96,6 +98,7 @@ class RunLog:
         log = cls.read(path)
         require((log.torn_lines == 0, f"{path}: the last line before the checkpoint is torn: restore the file"))
         log._path, log._file, log._num_bytes = path, open_own(path, "ab"), MOST_BYTES
+        log._place = path.absolute()
         log._start -= position["seconds"]
         return log
 
@@ -107,6 +110,7 @@ class RunLog:
         """Let the lines so far reach the disk; return the length of the file, in bytes."""
         if self._file is None or self._path is None or self._file.closed:
             return 0
+        self._check_place()
         size = self._file.tell()
         try:
             os.fsync(self._file.fileno())
@@ -114,12 +118,33 @@ class RunLog:
             raise cannot_write(self._path, size, error) from error
         return size
 
+    def _check_place(self) -> None:
+        """Refuse to write on where the file is not at its place any more, as what is written beside it would be lost.
+
+        Raises:
+            FileNotFoundError: if the run's directory was moved or removed.
+        """
+        assert self._file is not None and self._place is not None
+        own = os.fstat(self._file.fileno())
+        try:
+            is_there = os.path.samestat(own, self._place.stat())
+        except FileNotFoundError:
+            is_there = False
+        if not is_there:
+            message = f"{self._place} was moved, removed or replaced while this run was writing it; the run stops here"
+            raise FileNotFoundError(errno.ENOENT, f"{message}. Move it back and run the same command, which resumes it")
+
     def append(self, kind: str, **values: Any) -> None:
-        """Add one measurement; NaN and infinity become null, as JSON has neither."""
+        """Add one measurement; NaN and infinity become null, as JSON has neither.
+
+        Raises:
+            OSError: if it cannot be written, and where the file has been moved.
+        """
         finite = {name: _finite(value) for name, value in values.items()}
         measurement = {"kind": kind, **finite, "seconds": round(time.perf_counter() - self._start, 3)}
         self.measurements.append(measurement)
         if self._file is not None and self._path is not None:
+            self._check_place()
             line = json.dumps(measurement).encode() + b"\n"
             try:
                 written = self._file.write(line)

@@ -9,12 +9,15 @@ import signal
 import subprocess
 import sys
 import threading
+from unittest.mock import Mock
 
 import pytest
+from helpers.stopped_runs import StopsAfter, learn_into
 
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
 from ctgraph_rl.log.files import LOCK, locked
+from ctgraph_rl.runs.status import status_of
 
 HOLD = """
 import sys, time
@@ -175,17 +178,39 @@ def test_the_lock_ends_with_an_error(tmp_path):
         pass
 
 
-def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_named_and_leaves_no_sign_of_a_process(tmp_path, monkeypatch, number):
     def no_locks(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
+    said = rf"{os.strerror(number)}: .*\.lock cannot be locked; keep runs on a file system with locks"
 
-    with (
-        pytest.raises(OSError, match=r"No locks available: .*\.lock cannot be locked; keep runs on a file system with"),
-        locked(tmp_path),
-    ):
+    with pytest.raises(OSError, match=said), locked(tmp_path):
         pytest.fail("no lock")
+
+    assert list(tmp_path.iterdir()) == []
+    assert status_of(tmp_path, error="OSError: no locks") == ("failed", "OSError: no locks")
+
+
+def test_the_lock_of_another_is_left_where_a_file_system_has_lost_its_locks(tmp_path, monkeypatch):
+    (tmp_path / LOCK).write_text("process 1 on another since now")
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=OSError(errno.ENOLCK, "No locks available")))
+
+    with pytest.raises(OSError, match="No locks available"), locked(tmp_path):
+        pytest.fail("no lock")
+
+    assert (tmp_path / LOCK).read_text() == "process 1 on another since now"
+
+
+def test_the_lock_of_a_folder_in_the_place_of_one_that_was_moved_is_left(tmp_path):
+    (tmp_path / "run").mkdir()
+    with locked(tmp_path / "run"):
+        (tmp_path / "run").rename(tmp_path / "moved")
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / LOCK).write_text("another's")
+
+    assert (tmp_path / "run" / LOCK).read_text() == "another's"
 
 
 def test_a_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
@@ -196,3 +221,24 @@ def test_a_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
 
     with pytest.raises(OSError, match=rf"Read-only file system: '{tmp_path}"), locked(tmp_path):
         pytest.fail("no lock")
+
+
+def test_a_run_whose_directory_is_moved_says_so_at_the_next_write_and_writes_nothing_at_the_old_place(tmp_path):
+    class Moves(StopsAfter):
+        def offer(self, state, at_block_end):
+            self.frames = -1  # never stops the run
+            super().offer(state, at_block_end)
+            if state()["frames"] == 64:
+                (tmp_path / "run").rename(tmp_path / "moved")
+
+    said = (
+        "run/run.jsonl was moved, removed or replaced while this run was writing it; the run stops here. Move it back"
+    )
+
+    with pytest.raises(FileNotFoundError, match=said):
+        learn_into(tmp_path / "run", Moves(tmp_path / "run" / "checkpoints"))
+
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "moved").rename(tmp_path / "run")
+    learn_into(tmp_path / "run")
+    assert (tmp_path / "run" / "metrics.json").exists() and (tmp_path / "run" / "restarts.jsonl").exists()
