@@ -149,7 +149,9 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
     study = f"learn from {published / 1e6:.2f} million frames a second ([speed](../explanation/speed.md#gpus)): "
     study += f"{14_336e6 / published / 3600:.0f} hours for F"
     assert study in " ".join((CHECKOUT / "docs" / "how-to" / "sweeps.md").read_text(encoding="utf-8").split())
-    assert f"on an H100 {su:.1f} billion" in " ".join((CHECKOUT / "README.md").read_text(encoding="utf-8").split())
+    readme = " ".join((CHECKOUT / "README.md").read_text(encoding="utf-8").split())
+    said = f"One H100, 65,536 environments: fused steps take {su:.1f} billion a second"
+    assert f"{said}, and PPO trains on {ppo:.0f} million" in readme
 
 
 def test_a_report_of_a_gpu_has_its_parts_as_they_were_measured_and_the_time_of_many_seeds(gpu, monkeypatch):
