@@ -1,4 +1,7 @@
-"""What several test files use: configurations as a run composes them, and agents of them."""
+"""What several test files use: configurations as a run composes them, and agents of them.
+
+What needs torch is imported where it is used: the process that hands tests to others starts without it.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,21 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 import pytest
-import torch
-from helpers.small_agents import SMALL_AGENT
-from helpers.sweeping import UNLUCKY
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from baselines.learner import compiled
 from ctgraph_rl import packages
-from ctgraph_rl.env import CTGraphEnv
-from ctgraph_rl.runs import config, job
-from ctgraph_rl.tasks.task import Task
+
+if TYPE_CHECKING:
+    from ctgraph_rl.tasks.task import Task
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -58,8 +61,32 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> None:
     """Small networks gain nothing from more."""
+    import torch
+
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def files_parsed_once() -> Iterator[None]:
+    """Hydra parses each yaml file once in a process; one that has changed again."""
+    with pytest.MonkeyPatch.context() as patch:
+        for source in (FileConfigSource, ImportlibResourcesConfigSource):
+            patch.setattr(source, "load_config", _parsed_once(source.load_config))
+        yield
+
+
+def _parsed_once(load_config: Callable[..., Any]) -> Callable[..., Any]:
+    parsed: dict[Any, Any] = {}
+
+    def load(source: Any, config_path: str) -> Any:
+        path = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
+        key = (path, source.provider, path.exists() and path.read_bytes())
+        if key not in parsed:
+            parsed[key] = load_config(source, config_path)
+        return copy.deepcopy(parsed[key])
+
+    return load
 
 
 @pytest.fixture(autouse=True)
@@ -79,6 +106,9 @@ def compose() -> Iterator[Callable[..., DictConfig]]:
 @pytest.fixture
 def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None]]:
     """Sets the backend that compiles gradient steps; steps of other tests are compiled again."""
+    import torch
+
+    from baselines.learner import compiled
 
     def set_backend(backend: Any) -> None:
         monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
@@ -90,12 +120,28 @@ def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None
 
 @cache
 def _composed(overrides: Sequence[str], **how: Any) -> DictConfig:
-    return hydra.compose("config", overrides=list(overrides), **how)
+    """As Hydra composes them; the groups that are chosen once, however their settings are changed."""
+    parsed = OverridesParser.create().parse_overrides([*overrides])
+    settings = [each for each in parsed if not _is_group(each.key_or_group)]
+    if how or not settings or any(each.is_delete() or each.is_sweep_override() for each in parsed):
+        return hydra.compose("config", overrides=[*overrides], **how)
+    choices = tuple(each.input_line for each in parsed if each not in settings)
+    cfg = copy.deepcopy(_composed(choices))
+    ConfigLoaderImpl._apply_overrides_to_config(settings, cfg)
+    return cfg
+
+
+def _is_group(key: str) -> bool:
+    return key.startswith("hydra") or Path(packages.conf_dir(), key).is_dir()
 
 
 @pytest.fixture
 def build_agent(compose: Callable[..., DictConfig]) -> Callable[..., Any]:
     """Builds ``conf/agent/NAME.yaml`` for tasks, with overrides; equal weights for every call."""
+    import torch
+
+    from ctgraph_rl.env import CTGraphEnv
+    from ctgraph_rl.runs import config
 
     def build(name: str, tasks: Sequence[Task], *overrides: str) -> Any:
         cfg = compose(f"agent={name}", *overrides)
@@ -109,6 +155,8 @@ def build_agent(compose: Callable[..., DictConfig]) -> Callable[..., Any]:
 @pytest.fixture
 def small_agent(build_agent: Callable[..., Any]) -> Callable[..., Any]:
     """As ``build_agent``, with a small network, few rows and short batches."""
+    from helpers.small_agents import SMALL_AGENT
+
     return lambda name, tasks, *overrides: build_agent(name, tasks, *SMALL_AGENT[name], *overrides)
 
 
@@ -133,6 +181,10 @@ def console_script(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.fixture
 def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
     """The cells that were run, in a folder of their own, by a learner that needs no time; it fails for one seed."""
+    from helpers.sweeping import UNLUCKY
+
+    from ctgraph_rl.runs import config, job
+
     cells: list[Path] = []
 
     def learn(cfg, run_dir, interrupt):

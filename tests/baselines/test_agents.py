@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.marks import others_slow
 from helpers.paths import CHECKOUT
 from helpers.small_agents import (
     AGENTS,
@@ -108,7 +109,7 @@ def test_learning_leaves_the_batch_as_it_was(small_agent, name):
     assert (batch == before).all()
 
 
-@every_agent
+@pytest.mark.parametrize("name", others_slow(AGENTS, "dqn", "lstm_ppo", "rl2"))
 def test_a_saved_agent_acts_the_same_after_loading(small_agent, name):
     agent, other = small_agent(name, [ct_su_b1()]), small_agent(name, [ct_su_b1()], "seed=1")
     data = batches(agent, ct_su_b1(), 1)[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.marks import others_slow
 from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
@@ -116,7 +117,7 @@ def learn_probe(compose, name: str, num_batches: int, **probe) -> float:
     return found[-1]
 
 
-@every_agent
+@pytest.mark.parametrize("name", others_slow(AGENTS, "a2c", "dqn", "lstm_ppo", "mohqa"))
 def test_one_of_two_actions_pays(compose, name):
     assert learn_probe(compose, name, 200, shows_cue=False) == 1.0
 

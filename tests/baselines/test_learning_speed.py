@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.marks import others_slow
 from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
@@ -133,7 +134,7 @@ def test_frames_that_differ_by_less_than_rounding_are_of_different_kinds():
     assert torch.equal(values[examples][kinds], values)
 
 
-@pytest.mark.parametrize("name", ["a2c", "ppo", "ppo_count", "reinforce", "lstm_ppo", "rl2"])
+@pytest.mark.parametrize("name", others_slow(["a2c", "ppo", "ppo_count", "reinforce", "lstm_ppo", "rl2"], "a2c", "rl2"))
 def test_losses_and_gradients_are_the_same_where_equal_frames_are_computed_once(small_agent, name):
     agents = [small_agent(name, [ct_su_b1()], f"agent.deduplicate={once}").double() for once in ("false", "true")]
     batch = batches(small_agent(name, [ct_su_b1()]), ct_su_b1(), 2)[1]
@@ -206,7 +207,7 @@ def test_the_loss_of_dqn_in_plain_tensors_equals_torchrls(small_agent, double):
     assert torch.equal(losses["td_error"], sample["td_error"].flatten())
 
 
-@pytest.mark.parametrize("name", ["a2c", "dqn", "ppo", "ppo_published"])
+@pytest.mark.parametrize("name", others_slow(["a2c", "dqn", "ppo", "ppo_published"], "a2c", "dqn", "ppo"))
 def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent, name):
     agent, other = (small_agent(name, [ct_su_b1()]) for _ in range(2))
     minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[-1]

@@ -63,7 +63,7 @@ def within_specs(env: CTGraphEnv, data: TensorDictBase) -> bool:
     return all(spec.contains(data.select(*spec.keys())) for spec in specs)
 
 
-@examples(12)
+@examples(6)
 @given(batches(least=2), seeds, st.sampled_from([0, 1, 7, 2**32 - 4]))
 def test_any_row_of_any_batch_equals_its_task_alone(batch, seed, first_row):
     data = rollout(CTGraphEnv(batch, seed=seed, first_row=first_row), seed, 12)
@@ -77,7 +77,7 @@ def test_any_row_of_any_batch_equals_its_task_alone(batch, seed, first_row):
         assert torch.equal(alone["observation"], seen[..., :length]) and not seen[..., length:].any()
 
 
-@examples(12)
+@examples(6)
 @given(batches(), seeds)
 def test_the_optimal_policy_reaches_the_goal_of_any_task(batch, seed):
     env = CTGraphEnv(batch, seed=seed, check_actions=False)
@@ -93,7 +93,7 @@ def test_the_optimal_policy_reaches_the_goal_of_any_task(batch, seed):
         assert task.reward_std or total.item() == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-@examples(12)
+@examples(6)
 @given(batches(), seeds, st.integers(1, 12))
 def test_a_state_dict_of_any_moment_of_any_tasks_resumes_bit_exactly(batch, seed, moment):
     env = CTGraphEnv(batch, seed=seed, first_row=5)
@@ -148,7 +148,7 @@ def shows(task: Task, seen: torch.Tensor, shown_id: int) -> bool:
     return bool(fits.flatten(1).all(1).any())
 
 
-@examples(15)
+@examples(8)
 @given(batches(), seeds)
 def test_the_data_of_any_tasks_lie_within_the_specs_and_follow_the_papers_tree_step_by_step(batch, seed):
     env, rng, states = CTGraphEnv(batch, seed=seed), random.Random(seed), [(HOME, ())] * len(batch)
@@ -194,7 +194,7 @@ def mean_random_return(task: Task) -> float:
     return there * task.goal_reward * share + (1 - there) * task.fail_reward + steps * task.step_reward
 
 
-@examples(80)
+@examples(40)
 @given(st.sampled_from([None, 4]).flatmap(tasks))
 def test_the_closed_forms_of_any_task_agree_with_the_value_of_the_random_policy(task):
     graph, actions = task.graph, task.graph.branching_factor + 1
@@ -250,7 +250,7 @@ def broken(draw: Any) -> tuple[Any, dict[str, Any]]:
     return target, {name: draw(st.sampled_from(ILLEGAL[name])) for name in names}
 
 
-@examples(250)
+@examples(125)
 @given(broken())
 def test_every_broken_field_is_named_with_its_value_in_one_value_error(target_and_values):
     target, values = target_and_values
@@ -262,7 +262,7 @@ def test_every_broken_field_is_named_with_its_value_in_one_value_error(target_an
         assert re.search(rf"\b{name}\b[^;]*, got {re.escape(repr(value))}", str(error.value))
 
 
-@examples(60)
+@examples(30)
 @given(tasks(4), st.sampled_from([0, -1, 5, 10**9, 1.0, NAN, None, True, 2**63, "longer", "shorter"]), st.data())
 def test_a_goal_that_does_not_fit_names_its_bound_and_length(task, wrong, data):
     b, d, place = task.graph.branching_factor, task.graph.depth, data.draw(st.integers(0, task.graph.depth - 1))
@@ -273,7 +273,7 @@ def test_a_goal_that_does_not_fit_names_its_bound_and_length(task, wrong, data):
         replace(task, goal=goal)
 
 
-@examples(60)
+@examples(30)
 @given(tasks(4), st.permutations(IDS), st.integers(0, 2))
 def test_overlapping_ids_are_refused_with_both_names(task, names, more):
     (moved, other), (_, last) = names[:2], getattr(task.observations, names[1])
@@ -301,7 +301,7 @@ def test_every_range_with_too_few_unique_ids_is_named_with_the_number_it_needs(b
     assert needs == [wanted[kind] for kind in KINDS if kind in short]
 
 
-@examples(100)
+@examples(50)
 @given(st.integers(2, 12) | st.integers(2, 2**63), st.integers(1, 70) | st.integers(1, 10**6))
 def test_a_graph_is_legal_as_long_as_its_states_fit_int64(b, d):
     if d < 64 and sum(counts_of(b, d).values()) < 2**63:
@@ -322,7 +322,7 @@ NO_ACTIONS = [
 ]
 
 
-@examples(40)
+@examples(20)
 @given(seeds, st.integers(1, 8), st.sampled_from(NO_ACTIONS))
 def test_a_wrong_action_is_refused_with_the_expected_spec_and_changes_nothing(seed, steps, wrong):
     env, (action, got) = CTGraphEnv(MIXED, seed=seed), wrong
@@ -335,7 +335,7 @@ def test_a_wrong_action_is_refused_with_the_expected_spec_and_changes_nothing(se
     assert unchanged(env, before)
 
 
-@examples(12)
+@examples(6)
 @given(batches(least=2), seeds, st.integers(0, 8), st.lists(flips, min_size=4, max_size=4))
 def test_a_reset_of_any_rows_leaves_the_present_and_the_future_of_the_others_alone(batch, seed, steps, resets):
     mask, rng = torch.tensor([*resets[1 : len(batch)], True]), random.Random(seed)

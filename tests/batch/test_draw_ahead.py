@@ -139,7 +139,7 @@ def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
     play(rows, twin, calls(40, 6, seed=2))
 
 
-@every_engine
+@pytest.mark.parametrize("kernel", [pytest.param("off", marks=pytest.mark.slow), "required"])
 def test_steps_that_are_taken_elsewhere_move_the_draws_too(kernel):
     rows, twin = (tensor_rows(TASKS * 5, seed=3) for _ in range(2))
     play(rows, twin, calls(20, 30))
@@ -217,17 +217,27 @@ def test_rows_with_all_switches_do_not_depend_on_how_a_batch_is_split(kernel):
         assert all(torch.equal(x[:, i : i + 1], y) for x, y in zip(whole, part, strict=True))
 
 
-def test_all_switches_compile_into_one_graph_and_map_with_vmap():
+@pytest.mark.slow
+def test_all_switches_compile_into_one_graph():
     rows = tensor_rows(SWITCHED, seed=1)
     rows.reset()
     params, uses = rows.params, rows.uses
     compiled = torch.compile(dynamics.step, fullgraph=True, backend="eager")
 
+    for action in scripts(24, len(SWITCHED), 3):
+        expected, found = (flat(step(rows.state, action, params, uses)) for step in (dynamics.step, compiled))
+        assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+        rows.reset(rows.step(action).done)
+
+
+def test_all_switches_map_with_vmap():
+    rows = tensor_rows(SWITCHED, seed=1)
+    rows.reset()
+    params, uses = rows.params, rows.uses
+
     for actions in scripts(24, 2 * len(SWITCHED), 3).view(24, 2, -1):
         expected = [flat(dynamics.step(rows.state, action, params, uses)) for action in actions]
         mapped = flat(torch.vmap(lambda action: dynamics.step(rows.state, action, params, uses))(actions))
-        found = flat(compiled(rows.state, actions[0], params, uses))
-        assert all(torch.equal(*pair) for pair in zip(found, expected[0], strict=True))
         assert all(torch.equal(x, torch.stack(y)) for x, y in zip(mapped, zip(*expected, strict=True), strict=True))
         rows.reset(rows.step(actions[0]).done)
 

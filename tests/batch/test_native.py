@@ -104,7 +104,7 @@ def test_the_compiled_environment_gives_the_same_data_alone_and_when_it_is_wrapp
         CTGraphEnv(tasks, seed=3, noise_bank=5, kernel=kernel) for kernel in ("off", "required", "required")
     )
     wrapped = TransformedEnv(inner, StepCounter(step_count_key="steps"))
-    actions = likely(tasks, 60)
+    actions = likely(tasks, 25)
 
     data, found, other = (record(env, actions) for env in (eager, alone, wrapped))
 
@@ -113,7 +113,7 @@ def test_the_compiled_environment_gives_the_same_data_alone_and_when_it_is_wrapp
     assert same(eager.rows.state, alone.rows.state) and same(eager.rows.state, inner.rows.state)
 
 
-@examples(40)
+@examples(20)
 @given(batches(), seeds)
 def test_any_tasks_compiled_give_the_bits_of_the_tensor_code(tasks, seed):
     rows, twin = (Rows(tasks, seed=seed, kernel="off") for _ in range(2))

@@ -50,13 +50,12 @@ def test_a_batch_of_eight_equals_two_batches_of_four():
     assert whole["next", "done"].any() and whole["observation"].unique().numel() > 200
 
 
-@pytest.mark.parametrize("row", range(8))
-def test_a_row_of_a_mixed_batch_equals_the_same_task_alone(row):
+def test_a_row_of_a_mixed_batch_equals_the_same_task_alone():
     mixed = rows_of(CTGraphEnv(MIXED, seed=5))
 
-    alone = rows_of(CTGraphEnv([MIXED[row]], seed=5, first_row=row), rows=slice(row, row + 1))
-
-    assert (mixed[row : row + 1] == alone).all()
+    for row, task in enumerate(MIXED):
+        alone = rows_of(CTGraphEnv([task], seed=5, first_row=row), rows=slice(row, row + 1))
+        assert (mixed[row : row + 1] == alone).all(), row
 
 
 def test_a_one_hot_row_of_a_mixed_batch_equals_the_same_task_alone():
@@ -113,11 +112,11 @@ def test_no_two_rows_share_their_sequence():
 
 
 def test_no_two_rows_share_a_draw_at_any_step():
-    rows, ticks = torch.arange(4096).view(-1, 1), torch.arange(64)
+    rows, ticks = torch.arange(1024).view(-1, 1), torch.arange(64)
 
     words = torch.stack(draw(torch.tensor(1), rows, ticks, STREAM_STEP), -1).view(-1, 4)
 
-    assert len(words.unique(dim=0)) == 4096 * 64
+    assert len(words.unique(dim=0)) == 1024 * 64
 
 
 def test_no_two_rows_see_the_same_noise():
@@ -138,7 +137,7 @@ def test_noise_is_new_at_every_observation():
 
 @pytest.mark.parametrize("p", [0.5, 0.9])
 def test_a_wait_state_is_kept_with_probability_p(p):
-    rows = 100_000
+    rows = 25_000
     env = CTGraphEnv([one_hot(p=p)] * rows, seed=1)
     env.reset()
     act(env, [0] * rows)
@@ -151,7 +150,7 @@ def test_a_wait_state_is_kept_with_probability_p(p):
 
 @pytest.mark.parametrize("p", [0.5, 0.9])
 def test_staying_once_says_nothing_about_staying_again(p):
-    rows = 100_000
+    rows = 25_000
     env = CTGraphEnv([one_hot(p=p)] * rows, seed=1, check_actions=False)
     env.reset()
     act(env, [0] * rows)
@@ -178,11 +177,11 @@ def test_every_row_of_a_batch_waits_with_its_own_p():
 
 def test_the_wait_the_id_and_the_angle_of_one_step_are_independent():
     task = confounding(p=0.5, read_rotation=1)
-    env = CTGraphEnv([task] * 50_000, seed=1)
+    env = CTGraphEnv([task] * 20_000, seed=1)
     env.reset()
-    act(env, [0] * 50_000)
+    act(env, [0] * 20_000)
 
-    observation = act(env, [0] * 50_000)["observation"][:, 0]
+    observation = act(env, [0] * 20_000)["observation"][:, 0]
 
     stayed, ids = env.state_type == WAIT, env.observation_id
     turned = (observation != task.images.images[ids]).flatten(1).any(1)

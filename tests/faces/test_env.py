@@ -300,13 +300,13 @@ def test_a_step_counter_gives_a_time_limit():
 def test_a_collector_collects_whole_episodes():
     torch.manual_seed(0)
     env = CTGraphEnv([surjective(2, 1, goal=(2,))] * 8)
-    collector = Collector(env, frames_per_batch=8 * 500, total_frames=8 * 500, auto_register_policy_transforms=True)
+    collector = Collector(env, frames_per_batch=8 * 200, total_frames=8 * 200, auto_register_policy_transforms=True)
 
     data = next(iter(collector))
     collector.shutdown()
 
     done, goal = data["next", "done"], data["next", "outcome"] == OUTCOME_GOAL
-    assert data.shape == (8, 500)
+    assert data.shape == (8, 200)
     assert torch.equal(data["is_init"][:, 1:], done[:, :-1])
     assert torch.equal(data["next", "episode_reward"] == 1, goal)
     assert binomial_p_value(goal.sum().item(), done.sum().item(), 1 / 27) >= ALPHA

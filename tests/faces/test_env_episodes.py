@@ -70,7 +70,7 @@ def test_an_optimal_episode_with_waiting_still_gets_exactly_one(p):
 
 @pytest.mark.parametrize("p", [0.5, 0.9])
 def test_the_waiting_of_an_optimal_episode_is_as_long_as_e_rho(p):
-    task, rows = surjective(2, 2, p, goal=(1, 2)), 20_000
+    task, rows = surjective(2, 2, p, goal=(1, 2)), 5_000
     env = CTGraphEnv([task] * rows, seed=1, check_actions=False)
 
     steps = play(env, navigation(seed=1))["step_count"].sum().item()
@@ -83,7 +83,7 @@ def test_the_waiting_of_an_optimal_episode_is_as_long_as_e_rho(p):
 
 @pytest.mark.parametrize(("b", "d", "p"), [(2, 2, 0.0), (3, 2, 0.0), (2, 4, 0.5)])
 def test_a_navigation_policy_gets_the_reward_with_probability_b_to_the_minus_d(b, d, p):
-    rows = 50_000
+    rows = 20_000
     env = CTGraphEnv([surjective(b, d, p, goal=(b,) * d)] * rows, seed=1, check_actions=False)
 
     last = play(env, navigation(seed=2))

@@ -265,6 +265,7 @@ def test_the_rows_of_an_environment_can_be_loaded_after_a_reset():
     assert_equal([env.step(0)[0] for _ in range(2)], first)
 
 
+@pytest.mark.slow
 def test_environments_in_processes_of_their_own_run_with_any_number_of_threads():
     code = """
 import gymnasium, numpy, ctgraph_rl.gym

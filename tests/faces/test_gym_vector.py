@@ -48,7 +48,7 @@ def both(tasks, mode, **kwargs):
 def test_the_vector_environment_equals_sync_vector_env_step_for_step(kind, mode):
     ours, theirs = both([VARIED[kind]] * 4, mode)
 
-    played = [play(envs, 11, 100) for envs in (ours, theirs)]
+    played = [play(envs, 11, 60) for envs in (ours, theirs)]
 
     assert_equal(*played)
     assert any(result[2].sum() > 1 for result in played[0] if len(result) == 5)
@@ -58,7 +58,7 @@ def test_the_vector_environment_equals_sync_vector_env_step_for_step(kind, mode)
 def test_rows_of_different_tasks_equal_sync_vector_env(mode):
     tasks = [task for name, task in VARIED.items() if name not in ("three branches", "one-hot")]
 
-    played = [play(envs, list(range(50, 50 + len(tasks))), 400) for envs in both(tasks, mode)]
+    played = [play(envs, list(range(50, 50 + len(tasks))), 120) for envs in both(tasks, mode)]
 
     assert_equal(*played)
 

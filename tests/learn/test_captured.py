@@ -13,6 +13,7 @@ from itertools import islice
 
 import pytest
 import torch
+from helpers.marks import others_slow
 from helpers.oracles import confounding
 from helpers.small_agents import POLICY_GRADIENTS, agent_of, parameters_equal
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -92,7 +93,7 @@ def test_no_step_of_the_tensor_engine_needs_the_host(name, request):
     assert {value.device for value in (*steps, *batch.state)} == {META}
 
 
-@pytest.mark.parametrize("name", POLICY_GRADIENTS)
+@pytest.mark.parametrize("name", others_slow(POLICY_GRADIENTS, "lstm_ppo", "ppo_count", "ppo_rnd"))
 def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swapped, request):
     env = CTGraphEnv([confounding(p=0.3)] * 16, kernel="off")
     agent = agent_of(compose, name, env).to(META)
@@ -132,7 +133,14 @@ def test_a_gpu_estimates_the_advantages_that_a_cpu_estimates(name, compose, monk
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("name", "boundaries"), [("ppo", "announced"), ("ppo", "hidden"), ("rl2", "hidden")])
+@pytest.mark.parametrize(
+    ("name", "boundaries"),
+    [
+        pytest.param("ppo", "announced", marks=pytest.mark.slow),
+        pytest.param("ppo", "hidden", marks=pytest.mark.slow),
+        ("rl2", "hidden"),
+    ],
+)
 def test_memory_that_is_used_again_and_again_changes_no_bit_of_a_run(name, boundaries, captured, monkeypatch):
     published = curricula.load("fo_b1_4tasks", num_frames=128)
     protocol = replace(published.protocol, boundaries=boundaries)

@@ -76,8 +76,10 @@ class Gossip(Exchange):
 
 @pytest.mark.parametrize(
     "exchange",
-    [Isolated(3, 1, 0.0, 0.0), L2D2C(3, 1, 1.0, 0.0)],
-    ids=["isolated", "all messages lost"],
+    [
+        pytest.param(Isolated(3, 1, 0.0, 0.0), id="isolated", marks=pytest.mark.slow),
+        pytest.param(L2D2C(3, 1, 1.0, 0.0), id="all messages lost"),
+    ],
 )
 def test_members_to_whom_nothing_comes_have_the_bits_of_runs_alone(make, exchange):
     members = make()

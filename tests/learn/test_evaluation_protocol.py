@@ -168,10 +168,14 @@ def trained(build: Callable[[], Any], curriculum: Curriculum) -> dict[str, Tenso
     return {**{name: value.clone() for name, value in agent.named_parameters()}, "rng": torch.get_rng_state()}
 
 
-@pytest.mark.parametrize("name", ["lstm_ppo", "dqn"])
 @pytest.mark.parametrize(
-    ("protocol", "greedy"),
-    [(Protocol(), True), (Protocol(boundaries="hidden"), False), (Protocol("one_hot", "hidden"), True)],
+    ("name", "protocol", "greedy"),
+    [
+        ("dqn", Protocol(boundaries="hidden"), False),
+        ("lstm_ppo", Protocol("one_hot", "hidden"), True),
+        pytest.param("dqn", Protocol(), True, marks=pytest.mark.slow),
+        pytest.param("lstm_ppo", Protocol(), True, marks=pytest.mark.slow),
+    ],
 )
 def test_agents_learn_the_same_weights_with_and_without_evaluation(compose, name, protocol, greedy):
     waiting = task(wait_prob=0.3)

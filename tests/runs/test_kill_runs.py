@@ -42,7 +42,8 @@ def start(run_dir: Path, checkout: Path) -> subprocess.Popen:
     )
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), pytest.param("SIGINT", 130, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_a_signal_saves_and_the_same_command_goes_on(checkout, tmp_path, monkeypatch, name, code):
     run_dir, whole = tmp_path / "run", tmp_path / "whole"
     process = start(run_dir, checkout)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.marks import others_slow
 from helpers.scripted import ONE, TWO
 from helpers.small_agents import TINY
 from helpers.stopped_runs import LEARNED, OWN, SETTINGS, bombs, learn_into, make_agent, stopped_run
@@ -101,7 +102,7 @@ def learned_again(agent, curriculum: Curriculum) -> list[dict]:
     return [{**m, "seconds": 0} for m in learn_curriculum(curriculum, agent).measurements]
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", others_slow(METHODS, "mas", "mask_blc", "packnet"))
 def test_an_agent_comes_back_with_its_method_to_play_every_task_and_to_learn_on(compose, tmp_path, name):
     method = OmegaConf.to_container(compose(f"method={name}").method)
     agent = learn_with(method | ({"heads": "multi"} if "heads" in method else {}), tmp_path)

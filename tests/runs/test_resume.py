@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.marks import others_slow
 from helpers.scripted import MIDDLE, ONE, THREE, TWO, of
 from helpers.small_agents import AGENTS as NAMES
 from helpers.small_agents import MINIBATCHES, REPLAY, TINY, TWO_GOALS, less
@@ -127,19 +128,32 @@ def check_some(learner: Learner, count: int | None = None) -> None:
         assert torch.equal(resumed.random, whole.random), state
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("name", others_slow(AGENTS, "lstm_ppo", "prioritized dqn", "rl2"))
 def test_every_agent_goes_on_as_if_never_stopped(learner, name):
     kind = "changing goals" if name == "rl2" else "announced"
 
     check_some(learner(CURRICULA[kind], name), 0)
 
 
-@pytest.mark.parametrize("kind", CURRICULA)
+@pytest.mark.parametrize(
+    "kind",
+    others_slow(
+        CURRICULA,
+        "hidden",
+        "ids with observations",
+        "rows apart",
+        "by episode, together",
+        "at random",
+        "drift",
+        "evaluated at the end only",
+        "changing goals",
+    ),
+)
 def test_every_kind_of_curriculum_goes_on_as_if_never_stopped(learner, kind):
     check_some(learner(CURRICULA[kind], "a2c"), 0)
 
 
-@pytest.mark.parametrize("kind", ["hidden", "drift"])
+@pytest.mark.parametrize("kind", others_slow(["hidden", "drift"], "drift"))
 def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
     check_some(learner(CURRICULA[kind], "qrdqn_lstm"), 1)
 

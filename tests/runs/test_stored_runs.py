@@ -29,7 +29,7 @@ every_run = pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 every_run_some_slow = pytest.mark.parametrize(
     "cell",
     [
-        pytest.param(cell, id=name, marks=[] if number % 4 == 0 else [pytest.mark.slow])
+        pytest.param(cell, id=name, marks=[] if number % 8 == 0 else [pytest.mark.slow])
         for number, (name, cell) in enumerate(CELLS.items())
     ],
 )

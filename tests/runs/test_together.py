@@ -17,8 +17,9 @@ from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.log import run_log, sums, tables
 from ctgraph_rl.report.page import write_report
-from ctgraph_rl.report.terminal import code_notes
+from ctgraph_rl.report.terminal import code_notes, group_size
 from ctgraph_rl.runs import checkpoints, config, train
+from ctgraph_rl.runs import together as runs_together
 from ctgraph_rl.runs.experts import find_or_train
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job
@@ -79,53 +80,58 @@ def stop_after(monkeypatch, count: int, module=train, name="offer_all") -> None:
     monkeypatch.setattr(module, name, killed)
 
 
-def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_beside_it(monkeypatch, capsys):
-    assert sweep(monkeypatch, SEEDS, "together=true", *PPO) == 0
-    assert "3 done" in capsys.readouterr().out
-    assert sweep(monkeypatch, SEEDS, "hydra.sweep.dir=alone", *PPO) == 0
-
-    for one, other in zip(runs(), runs("alone"), strict=True):
-        assert one.relative_to("runs") == other.relative_to("alone")
-        files = [{str(path.relative_to(each)) for path in each.rglob("*")} for each in (one, other)]
-        assert files[0] == files[1]
-        assert first_line(one)["config"] == first_line(other)["config"]
-        assert first_line(one)["together"] == [0, 1, 2] and "together" not in first_line(other)
-        assert load(one).agent.state_dict().keys() == load(other).agent.state_dict().keys()
-        assert f"seed={first_line(one)['config']['seed']}" in (one / ".hydra" / "overrides.yaml").read_text()
-        shown = compare(one, other).lines
-        assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
+@pytest.fixture(scope="module")
+def together(tmp_path_factory) -> Path:
+    """A sweep whose three seeds learned as one batch, without a stop."""
+    folder = tmp_path_factory.mktemp("together")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert sweep(patch, SEEDS, "together=true", *PPO) == 0
+    return folder / "runs"
 
 
-@pytest.mark.parametrize("method", [pytest.param("finetune", marks=pytest.mark.slow), "ewc"])
-def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit(monkeypatch, method):
-    settings = (SEEDS, "together=true", f"method={method}", *PPO)
-    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
+def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_beside_it(monkeypatch, together):
+    assert sweep(monkeypatch, "seed=1", "hydra.sweep.dir=alone", *PPO) == 0
+
+    [other] = runs("alone")
+    assert [first_line(run)["together"] for run in runs(str(together))] == 3 * [[0, 1, 2]]
+    one = together / other.relative_to("alone")
+    files = [{str(path.relative_to(each)) for path in each.rglob("*")} for each in (one, other)]
+    assert files[0] == files[1]
+    assert first_line(one)["config"] == first_line(other)["config"]
+    assert "together" not in first_line(other)
+    assert load(one).agent.state_dict().keys() == load(other).agent.state_dict().keys()
+    assert "seed=1" in (one / ".hydra" / "overrides.yaml").read_text()
+    shown = compare(one, other).lines
+    assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
+
+
+@pytest.mark.parametrize("method", ["finetune", pytest.param("ewc", marks=pytest.mark.slow)])
+def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(monkeypatch, capsys, together, method):
+    settings = ("together=true", f"method={method}", *PPO)
+    if method != "finetune":
+        assert sweep(monkeypatch, SEEDS, *settings, "hydra.sweep.dir=whole") == 0
+    whole = runs("whole" if method != "finetune" else str(together))
+    between_saves = (4, checkpoints.Checkpoints, "save")
+    between_results = (1, train.RunDirectory, "finish")
 
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
-        assert sweep(patch, *settings) == 130
-    with monkeypatch.context() as patch:  # between the saves of two seeds
-        stop_after(patch, 4, checkpoints.Checkpoints, "save")
-        assert sweep(patch, *settings) == 130
-    assert sweep(monkeypatch, *settings) == 0
-
-    assert len(runs()) == 3
-    assert all(same(one, other) for one, other in zip(runs(), runs("whole"), strict=True))
-    assert all((run / "restarts.jsonl").exists() for run in runs())
-
-
-def test_a_group_that_was_stopped_while_it_wrote_results_writes_the_others_down_to_the_last(monkeypatch):
-    settings = (SEEDS, "together=true", *PPO)
-    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
-
-    for finished in ([True, False, False], [True, True, False]):
+        assert sweep(patch, SEEDS, *settings) == 130
+    capsys.readouterr()
+    assert sweep(monkeypatch, "seed=1", *settings[1:]) == 1
+    assert "was begun with the seeds [0, 1, 2] together: resume it with together=true and" in capsys.readouterr().out
+    stops = [(between_saves, 0), (between_results, 1), (between_results, 2)]
+    for place, finished in stops:
         with monkeypatch.context() as patch:
-            stop_after(patch, 1, train.RunDirectory, "finish")
-            assert sweep(patch, *settings) == 130
-        assert [(run / "metrics.json").exists() for run in runs()] == finished
-    assert sweep(monkeypatch, *settings) == 0
+            stop_after(patch, *place)
+            assert sweep(patch, SEEDS, *settings) == 130
+        assert [(run / "metrics.json").exists() for run in runs()] == [number < finished for number in range(3)]
+    assert sweep(monkeypatch, "seed=0,1,2,3,4", *settings) == 0
 
-    assert all(same(one, other) for one, other in zip(runs(), runs("whole"), strict=True))
+    assert [first_line(run)["together"] for run in runs()] == 3 * [[0, 1, 2]] + 2 * [[3, 4]]
+    assert all(same(one, other) for one, other in zip(runs()[:3], whole, strict=True))
+    assert all((run / "restarts.jsonl").exists() for run in runs()[:3])
 
 
 @pytest.mark.slow
@@ -157,46 +163,61 @@ def test_a_group_that_meets_a_full_disk_at_a_file_of_its_results_is_resumed_bit_
         assert all(same(one, other) for one, other in zip(runs(f"full{full_at}"), runs("whole"), strict=True))
 
 
-def test_seeds_that_were_begun_together_are_not_resumed_otherwise(monkeypatch, capsys):
-    with monkeypatch.context() as patch:
-        stop_after(patch, 3)
-        sweep(patch, SEEDS, "together=true", *PPO)
-    capsys.readouterr()
+def test_what_is_done_is_left_as_it_is_and_one_seed_is_trained_alone(monkeypatch, together, capsys):
+    shutil.copytree(together, "runs")
+    before = [content(run)[0] for run in runs()]
 
-    assert sweep(monkeypatch, "seed=1", *PPO) == 1
-    assert "was begun with the seeds [0, 1, 2] together: resume it with together=true and" in capsys.readouterr().out
-    assert sweep(monkeypatch, "seed=0,1,2,3,4", "together=true", *PPO) == 0
-    assert [first_line(run)["together"] for run in runs()] == 3 * [[0, 1, 2]] + 2 * [[3, 4]]
+    assert sweep(monkeypatch, "seed=0,1,2,3", "together=true", *PPO) == 0
 
-
-def test_what_is_done_is_left_as_it_is_and_one_seed_is_trained_alone(monkeypatch):
-    sweep(monkeypatch, "seed=0,1", "together=true", *PPO)
-    before = [content(run) for run in runs()]
-
-    assert sweep(monkeypatch, SEEDS, "together=true", *PPO) == 0
-
-    assert [content(run)[0] for run in runs()[:2]] == [lines for lines, _ in before]
-    assert "together" not in first_line(runs()[2])
-    said = "2 of 3 runs are of seeds trained together, 2 at a time; they differ from others by rounding"
+    assert "4 done" in capsys.readouterr().out
+    assert [content(run)[0] for run in runs()[:3]] == before
+    assert "together" not in first_line(runs()[3])
+    said = "3 of 4 runs are of seeds trained together, 3 at a time; they differ from others by rounding"
     assert code_notes(find_runs(["runs"])[0]) == [said]
+    assert [group_size(run) for run in find_runs(["runs"])[0]] == [3, 3, 3, 1]
+
+
+@pytest.mark.slow
+def test_a_report_says_which_runs_were_trained_together(monkeypatch, together):
+    shutil.copytree(together, "runs")
+    sweep(monkeypatch, "seed=0,1,2,3", "together=true", *PPO)
+
     write_report(["runs"], Path("report"))
+
+    said = "3 of 4 runs are of seeds trained together, 3 at a time; they differ from others by rounding"
     page = Path("report", "report.html").read_text()
-    assert said in page and "1 run: " in page and "; trained in a group of 2 seeds" in page
+    assert said in page and "1 run: " in page and "; trained in a group of 3 seeds" in page
 
 
-def test_seeds_that_cannot_be_one_batch_are_trained_as_alone_one_after_the_other(monkeypatch, capsys):
+def test_seeds_that_cannot_be_one_batch_are_run_as_alone_one_after_the_other(monkeypatch, capsys):
+    ran = []
+
+    def run_job(cfg, run_dir):
+        ran.append((cfg.seed, run_dir.name.split("-")[2]))
+        if cfg.seed == 0:
+            raise FloatingPointError("the loss is NaN")
+
+    monkeypatch.setattr(runs_together, "run_job", run_job)
+    code = sweep(monkeypatch, "seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "together=true")
+
+    said = capsys.readouterr()
+    assert (code, ran) == (1, [(0, "seed0"), (1, "seed1")])
+    assert "note: seeds are trained one after the other, as LSTMPPO cannot be" in said.err
+    assert "seed 0: FloatingPointError: the loss is NaN" in said.out
+
+
+@pytest.mark.slow
+def test_seeds_that_cannot_be_one_batch_are_trained_as_alone(monkeypatch):
     settings = ("seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "agent.num_steps=8")
 
     assert sweep(monkeypatch, *settings, "together=true") == 0
-    assert "note: seeds are trained one after the other, as LSTMPPO cannot be" in capsys.readouterr().err
     sweep(monkeypatch, *settings, "hydra.sweep.dir=alone")
 
     assert all(same(one, other) for one, other in zip(runs(), runs("alone"), strict=True))
 
 
-def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(monkeypatch, capsys):
+def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(monkeypatch, capsys, together):
     settings = (SEEDS, "together=true", *PPO)
-    assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
     start = Group.start_task
 
     def spoiled(group, task=None):
@@ -210,7 +231,7 @@ def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(mon
     assert "2 done, 1 failed" in shown and "FloatingPointError: seed 0: loss_objective is nan in block 1" in shown
 
     done, failed = [runs()[number] for number in (1, 2)], runs()[0]
-    assert all(same(run, Path("whole", run.relative_to("runs"))) for run in done)
+    assert all(same(run, together / run.relative_to("runs")) for run in done)
     assert [name for name in ("metrics.json", "agent.pt", "checkpoints", "failed.txt") if (failed / name).exists()] == [
         "failed.txt"
     ]
@@ -302,6 +323,7 @@ def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_roundi
     assert note in code_notes([read_run(runs()[0]), read_run(Path("other"))]) and not code_notes([read_run(runs()[0])])
 
 
+@pytest.mark.slow
 def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatch, whole):
     finish = (train.RunDirectory, "finish", 1)
     places = ((train, "offer_all", 2), (checkpoints.Checkpoints, "save", 2), finish, finish)

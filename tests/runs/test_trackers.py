@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import warnings
 from importlib.util import find_spec
@@ -223,7 +224,7 @@ def test_a_resumed_run_sends_all_it_measured_to_a_folder_made_anew(tmp_path):
 
 
 def test_a_run_that_replaces_another_leaves_no_files_of_its_tracker(runs, compose, tmp_path):
-    run(compose(*SHORT, "logger=csv"), tmp_path)
+    shutil.copytree(runs["csv"], tmp_path, dirs_exist_ok=True)
     assert (tmp_path / FOLDER).exists()
 
     run(compose(*SHORT, "overwrite=true"), tmp_path)

@@ -48,10 +48,10 @@ def test_the_bound_is_that_of_adwin():
 def test_a_fall_is_suspected_within_a_hundred_episodes_and_a_rise_is_not():
     detector = ADWIN(**DEFAULTS)
 
-    assert set(verdicts(detector, episodes(800, 0.2))) == {None}
-    assert set(verdicts(detector, episodes(800, 0.9, seed=1))) == {None}
+    assert set(verdicts(detector, episodes(320, 0.2))) == {None}
+    assert set(verdicts(detector, episodes(400, 0.9, seed=1))) == {None}
     assert SUSPICION in verdicts(detector, episodes(104, 0.2, seed=2))
-    assert detector.kept[0].mean == pytest.approx(0.9, abs=0.1) and detector.kept[0].number > 500
+    assert detector.kept[0].mean == pytest.approx(0.9, abs=0.1) and detector.kept[0].number > 250
 
 
 def test_a_return_that_does_not_change_is_suspected_in_few_of_40_streams():

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, Scripted, of
 from helpers.small_agents import MINIBATCHES, REPLAY, TINY, made, saved_and_loaded, weights_for
 
@@ -200,10 +201,14 @@ def test_a_buffer_that_holds_no_whole_row_is_refused_where_rows_are_replayed(com
 # Runs
 
 
+ENOUGH = ("cka_rl", "clear", "ewc", "mask_amsc", "mask_lc", "mask_sc", "multitask", "packnet", "scratch", "si")
+"""Methods of which each keeps something of another kind in its state."""
+
+
 @pytest.mark.parametrize(
     ("agent", "method"),
     [
-        pytest.param(agent, method, marks=[pytest.mark.slow] if other else [])
+        pytest.param(agent, method, marks=[pytest.mark.slow] if other or method not in ENOUGH else [])
         for number, method in enumerate(METHODS)
         for place, agent in enumerate(AGENTS)
         if (other := (number + place) % len(AGENTS)) in (0, 2)
@@ -222,7 +227,7 @@ def test_two_agents_go_on_with_every_method_as_if_never_stopped(compose, agent, 
     check_policies(its, whole)
 
 
-@pytest.mark.parametrize("method", ["ewc", "ewc_published", "mas"])
+@pytest.mark.parametrize("method", others_slow(["ewc", "ewc_published", "mas"], "mas"))
 def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_that_are_kept(compose, method):
     its = life(compose, "lstm_ppo", method, "method.num_samples=64")
 
@@ -320,7 +325,7 @@ def test_fine_tuning_is_the_agent_itself(compose, agent):
     assert made(compose, "method", "finetune")().attach(alone, CURRICULUM) is alone
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", others_slow(AGENTS, "a2c", "dqn"))
 def test_the_hooks_of_no_method_change_no_bit(compose, agent):
     alone = life(compose, agent, "finetune")
     attached = Life(alone.curriculum, lambda *specs: Method().attach(alone.make_agent(*specs), alone.curriculum))

@@ -23,8 +23,14 @@ MULTI = {
 }
 
 
-@pytest.mark.parametrize("agent", ["dqn", "lstm_ppo", "ppo"])
-@pytest.mark.parametrize("name", MULTI)
+@pytest.mark.parametrize(
+    ("agent", "name"),
+    [
+        pytest.param(agent, name, marks=[pytest.mark.slow] if (place + number) % 3 else [])
+        for place, agent in enumerate(("dqn", "ppo", "lstm_ppo"))
+        for number, name in enumerate(MULTI)
+    ],
+)
 def test_output_layers_are_swapped_with_the_task_and_not_held(compose, agent, name):
     attached = with_method(compose, agent, MULTI[name]())
     method, inside = attached.method, attached.method.weights.in_heads

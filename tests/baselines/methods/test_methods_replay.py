@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, of
 from helpers.small_agents import TASKS, batches, same, saved_and_loaded, small, stay, weights_for, with_method
 from torch import Tensor
@@ -254,7 +255,9 @@ COUNTED = {
 """Methods, and the bytes that their docstrings count for three tasks."""
 
 
-@pytest.mark.parametrize("name", COUNTED)
+@pytest.mark.parametrize(
+    "name", others_slow(COUNTED, "CLEAR", "EWC multi", "EWC online", "MAS", "MaskLC", "PackNet", "SI", "Scratch")
+)
 def test_what_is_stored_is_what_is_counted(compose, name):
     make, counted = COUNTED[name]
     method = make()
@@ -324,7 +327,7 @@ def check_close(one: AgentWithMethod, other: AgentWithMethod) -> None:
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-2)
 
 
-@pytest.mark.parametrize("name", COMPILED)
+@pytest.mark.parametrize("name", others_slow(COMPILED, "cka_rl", "clear", "ewc", "packnet"))
 def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(compose, name):
     eager, whole = two_tasks(compose, name), two_tasks(compose, name, whole=True)
 
@@ -355,15 +358,16 @@ def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, comp
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "mask_ri" else pytest.param(name, marks=pytest.mark.slow) for name in COMPILED]
+    ("name", "order"),
+    [("mask_ri", (0, 1)), *(pytest.param(name, (0, 1, 2, 0), marks=pytest.mark.slow) for name in COMPILED)],
 )
-def test_tasks_and_agents_of_one_structure_share_a_compiled_step(compose, compile_by, name):
+def test_tasks_and_agents_of_one_structure_share_a_compiled_step(compose, compile_by, name, order):
     compiled = []
     compile_by(lambda graph, *_, **__: compiled.append(graph) or graph)
 
     for _ in range(2):
         attached = with_method(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true")
-        for number in (0, 1, 2, 0):
+        for number in order:
             stay(attached, number)
 
     assert len(compiled) == (4 if name in COMBINING else 1)
