@@ -9,5 +9,7 @@ import pytest
 
 
 def others_slow(values: Iterable[Any], *kept: Any) -> list[Any]:
-    """All values, of which those that are not kept in the default run are slow."""
-    return [value if value in kept else pytest.param(value, marks=pytest.mark.slow) for value in values]
+    """All values, or tuples of values, of which those that are not kept in the default run are slow."""
+    several = [value if isinstance(value, tuple) else (value,) for value in values]
+    wanted = [value if isinstance(value, tuple) else (value,) for value in kept]
+    return [pytest.param(*value, marks=[] if value in wanted else [pytest.mark.slow]) for value in several]

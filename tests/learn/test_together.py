@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
+from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
 from helpers.small_agents import BATCHED, TINY, saved_and_loaded
 
@@ -27,9 +28,11 @@ SEEDS = (0, 3, 8)
 
 COMPILED = [("ppo", "scratch"), ("ppo_published", "finetune"), ("prioritized dqn", "finetune")]
 
-SLOW = pytest.mark.slow
-
 METHODS = ("scratch", "l2", "ewc", "ewc_published", "mask_ri", "mask_lc", "mask_blc")
+
+EACH = [*((name, "finetune") for name in BATCHED), *(("ppo", method) for method in METHODS)]
+
+SOME = [("a2c", "mask_lc"), ("ppo", "ewc"), ("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
 
 CURRICULUM = of(Block(ONE, 80), Block(THREE, 120), Block(ONE, 56), task_id="at_boundaries")
 """Blocks of no whole number of batches, which are of 32 frames, and a task that returns."""
@@ -110,14 +113,7 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [
-        ("ppo_rnd", "finetune"),
-        ("prioritized dqn", "finetune"),
-        ("ppo", "ewc"),
-        ("ppo", "mask_lc"),
-        *(pytest.param(n, "finetune", marks=SLOW) for n in BATCHED if n not in ("ppo_rnd", "prioritized dqn")),
-        *(pytest.param("ppo", method, marks=SLOW) for method in METHODS if method not in ("ewc", "mask_lc")),
-    ],
+    others_slow(EACH, ("ppo_rnd", "finetune"), ("prioritized dqn", "finetune"), ("ppo", "ewc"), ("ppo", "mask_lc")),
 )
 def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
     make, monkeypatch, name, method
@@ -176,14 +172,7 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     return value.double() if value.is_floating_point() else value
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("a2c", "finetune"),
-        *(pytest.param(name, "finetune", marks=SLOW) for name in BATCHED if name != "a2c"),
-        *(pytest.param("ppo", method, marks=SLOW) for method in METHODS),
-    ],
-)
+@pytest.mark.parametrize(("name", "method"), others_slow(EACH, ("a2c", "finetune")))
 def test_each_seed_ends_near_its_run_alone(make, name, method):
     its = make(name, method)
 
@@ -196,15 +185,7 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("a2c", "mask_lc"),
-        pytest.param("ppo", "ewc", marks=SLOW),
-        pytest.param("ppo_published", "mask_lc", marks=SLOW),
-        pytest.param("prioritized dqn", "finetune", marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize(("name", "method"), others_slow(SOME, ("a2c", "mask_lc")))
 def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(make, monkeypatch, name, method):
     act, compared = Group._act, []
 
@@ -222,7 +203,7 @@ def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(ma
     assert all(compared)
 
 
-@SLOW
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "method"), COMPILED)
 def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeypatch, name, method):
     its = make(
@@ -278,8 +259,8 @@ def in_double(stack: Stack) -> Stack:
     ("name", "method", "largest", "settings"),
     [
         ("a2c", "ewc", 0, []),
-        pytest.param("ppo_published", "ewc_published", 512, ["agent.compile=true"], marks=SLOW),
-        pytest.param("ppo_published", "mask_lc", 512, ["agent.compile=true"], marks=SLOW),
+        pytest.param("ppo_published", "ewc_published", 512, ["agent.compile=true"], marks=pytest.mark.slow),
+        pytest.param("ppo_published", "mask_lc", 512, ["agent.compile=true"], marks=pytest.mark.slow),
     ],
 )
 def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_other_by_the_agents_own_code(
@@ -298,14 +279,7 @@ def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_o
         assert agent.state_dict().keys() == alone.state_dict().keys()
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("prioritized dqn", "finetune"),
-        pytest.param("ppo", "ewc", marks=SLOW),
-        pytest.param("ppo_published", "mask_lc", marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize(("name", "method"), others_slow(SOME, ("prioritized dqn", "finetune")))
 def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
     its = make(name, method)
 
@@ -319,14 +293,7 @@ def test_another_seed_beside_it_changes_no_bit_of_a_seed(make, name, method):
 
 
 @pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("a2c", "mask_lc"),
-        pytest.param("ppo_published", "mask_lc", marks=SLOW),
-        pytest.param("ppo", "ewc", marks=SLOW),
-        pytest.param("a2c", "scratch", marks=SLOW),
-        pytest.param("prioritized dqn", "l2", marks=SLOW),
-    ],
+    ("name", "method"), others_slow([*SOME, ("a2c", "scratch"), ("prioritized dqn", "l2")], ("a2c", "mask_lc"))
 )
 def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_path, name, method):
     its, kept = make(name, method), []
@@ -361,14 +328,7 @@ def spoil(monkeypatch, numbers=(1,)) -> None:
     monkeypatch.setattr(Group, "learn", spoiled)
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("a2c", "finetune"),
-        pytest.param("ppo", "ewc", marks=SLOW),
-        pytest.param("prioritized dqn", "finetune", marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize(("name", "method"), others_slow([("a2c", "finetune"), *SOME[1:]], ("a2c", "finetune")))
 def test_a_seed_that_is_not_finite_fails_alone_and_changes_no_bit_of_another(make, monkeypatch, tmp_path, name, method):
     its, kept = make(name, method), []
     group, logs = its.learn()

@@ -86,7 +86,7 @@ def test_status_runs_nothing_and_knows_why_cells_failed(learned, monkeypatch, ca
 
 
 def test_status_names_every_cell_and_the_end_of_a_sweep_the_first(learned, monkeypatch, capsys):
-    monkeypatch.setattr("ctgraph_rl.runs.status.SHOWN", 2)
+    monkeypatch.setattr("ctgraph_rl.runs.sweep.SHOWN", 2)
 
     said = [sweep(monkeypatch, "seed=range(-4,0)", f"hydra.sweeper.status={status}") for status in ("true", "false")]
 
@@ -373,7 +373,6 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
 
     (tmp_path / "metrics.json").write_text("{}")  # done before, so it tells nothing of the rate
-
     cells = dict.fromkeys([tmp_path, tmp_path / "b"], Outcome())
     with SweepProgress(cells, console=Console(file=shown)) as progress:
         progress._stop.wait(1.5)

@@ -193,7 +193,7 @@ def test_seeds_that_cannot_be_one_batch_are_run_as_alone_one_after_the_other(mon
     ran = []
 
     def run_job(cfg, run_dir):
-        ran.append((cfg.seed, run_dir.name.split("-")[2]))
+        ran.append((cfg.seed, run_dir.name.split("-")[1]))
         if cfg.seed == 0:
             raise FloatingPointError("the loss is NaN")
 
