@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.marks import others_slow
 from helpers.paths import CHECKOUT
 from helpers.small_agents import (
     AGENTS,
@@ -15,6 +14,7 @@ from helpers.small_agents import (
     agent_of,
     batches,
     learnt_from,
+    others_slow,
     parameters_equal,
     saved_and_loaded,
 )

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.marks import others_slow
-from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of
+from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of, others_slow
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase

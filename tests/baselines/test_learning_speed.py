@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.marks import others_slow
-from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, parameters_equal, saved_and_loaded
+from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, others_slow, parameters_equal, saved_and_loaded
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn

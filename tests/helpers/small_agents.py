@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule
@@ -51,6 +53,13 @@ TINY = [f"agent.num_envs={ROWS}", f"agent.num_steps={STEPS}", "agent.hidden_size
 MINIBATCHES = ["agent.num_minibatches=2", "agent.num_epochs=2"]
 REPLAY = ["agent.num_updates=2", "agent.batch_size=8", "agent.buffer_size=96", "agent.target_update_interval=3"]
 """Overrides that make agents tiny: 32 frames a batch."""
+
+
+def others_slow(values: Iterable[Any], *kept: Any) -> list[Any]:
+    """All values, or tuples of values, of which those that are not kept in the default run are slow."""
+    several = [value if isinstance(value, tuple) else (value,) for value in values]
+    wanted = [value if isinstance(value, tuple) else (value,) for value in kept]
+    return [pytest.param(*value, marks=[] if value in wanted else [pytest.mark.slow]) for value in several]
 
 
 def less(name: str) -> list[str]:

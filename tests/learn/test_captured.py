@@ -13,9 +13,8 @@ from itertools import islice
 
 import pytest
 import torch
-from helpers.marks import others_slow
 from helpers.oracles import confounding
-from helpers.small_agents import POLICY_GRADIENTS, agent_of, parameters_equal
+from helpers.small_agents import POLICY_GRADIENTS, agent_of, others_slow, parameters_equal
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 

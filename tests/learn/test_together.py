@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
-from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first_training, lines, of
-from helpers.small_agents import BATCHED, TINY, saved_and_loaded
+from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
 
 from baselines import together
 from baselines.learner import total_loss

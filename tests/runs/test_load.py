@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.kill_runs import equal
-from helpers.marks import others_slow
 from helpers.scripted import ONE, TWO
-from helpers.small_agents import TINY
+from helpers.small_agents import TINY, others_slow
 from helpers.stopped_runs import LEARNED, OWN, SETTINGS, bombs, learn_into, make_agent, stopped_run
 from helpers.sweeping import command_line
 from hydra.utils import instantiate

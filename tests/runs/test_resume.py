@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
-from helpers.marks import others_slow
 from helpers.scripted import MIDDLE, ONE, THREE, TWO, of
 from helpers.small_agents import AGENTS as NAMES
-from helpers.small_agents import MINIBATCHES, REPLAY, TINY, TWO_GOALS, less
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, TWO_GOALS, less, others_slow
 
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.lifelong import OfferCheckpoint

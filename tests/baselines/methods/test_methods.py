@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers.kill_runs import equal
-from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, Scripted, of
-from helpers.small_agents import MINIBATCHES, REPLAY, TINY, made, saved_and_loaded, weights_for
+from helpers.small_agents import MINIBATCHES, REPLAY, TINY, made, others_slow, saved_and_loaded, weights_for
 
 from baselines.methods.importance import Samples
 from baselines.methods.method import Method, TaskMethod

@@ -8,9 +8,18 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.marks import others_slow
 from helpers.scripted import ONE, THREE, TWO, of
-from helpers.small_agents import TASKS, batches, same, saved_and_loaded, small, stay, weights_for, with_method
+from helpers.small_agents import (
+    TASKS,
+    batches,
+    others_slow,
+    same,
+    saved_and_loaded,
+    small,
+    stay,
+    weights_for,
+    with_method,
+)
 from torch import Tensor
 
 from baselines.learner import functional_gradient_step
