@@ -61,7 +61,9 @@ class Labelling(NamedTuple):
 def detection_delay(labelling: Labelling) -> Tensor:
     """Return the frames from each change of task to the first alarm, before the next change; NaN for a missed one.
 
-    Changes that were missed are left out of the mean, and counted. Alarms are at ends of batches.
+    Changes that were missed are left out of the mean, and counted. Alarms are at ends of batches. An alarm at the frame
+    of the change counts with delay 0. The oracle detects so by design; any other detector has seen only frames of the
+    old task then, and its detection is a coincidence.
     """
     return _delays(labelling)
 
