@@ -51,7 +51,7 @@ from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 30
+SECONDS = 120
 """For one case; most take a hundredth of a second."""
 
 CASES = {"constructors": 1300, "runs": 250, "files": 450}

@@ -256,3 +256,11 @@ def test_counts_start_anew_with_a_task_and_are_saved(small_agent):
     agent.start_task(0)
 
     assert (agent.seen.counts.sum().item(), other.seen.counts.sum().item()) == (0, 128)
+
+
+def test_observations_on_either_side_of_the_middle_of_their_range_differ_in_sign():
+    counts = SimHashCounts(1, 255, 1)
+    counts.projection.fill_(1.0)
+
+    assert counts(torch.tensor([[127]], dtype=torch.uint8)).tolist() == [1]
+    assert counts(torch.tensor([[128]], dtype=torch.uint8)).tolist() == [1]

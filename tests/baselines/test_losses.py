@@ -103,6 +103,7 @@ def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(nam
                 assert norms[number] == pytest.approx(norm.item(), rel=1e-12)
                 others[number].step()
         stack.write()
+        stack.write()  # writes no step twice
         for number, parameters in enumerate(own):
             parameters[0].data.copy_(kept[0][number].mT.detach())
             parameters[1].data.copy_(kept[1][number].detach())

@@ -216,6 +216,6 @@ def test_a_browser_filters_and_sorts(board, tmp_path):
     changed.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page).replace("</body>", script))
     options = ("--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom")
 
-    dom = subprocess.run([BROWSER, *options, changed.as_uri()], capture_output=True, text=True, timeout=120).stdout
+    dom = subprocess.run([BROWSER, *options, changed.as_uri()], capture_output=True, text=True, timeout=600).stdout
 
     assert 'data-found="true true true true"' in dom

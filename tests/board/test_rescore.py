@@ -7,13 +7,14 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 
 from ctgraph_rl import RunLog
+from ctgraph_rl.board import rerun, verify
 from ctgraph_rl.board import rescore as module
-from ctgraph_rl.board import verify
 from ctgraph_rl.board.rescore import RESCORED, rescore
 from ctgraph_rl.board.submission import Submission, log_sum, packed, read_log, read_submission
 from ctgraph_rl.log import provenance
@@ -186,3 +187,18 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
     assert "- tiny-seed0: config.yaml: expected equal settings, found agent.gamma=0.99 instead of 0.98" in (
         capsys.readouterr().out.splitlines()
     )
+
+
+def test_numbers_of_the_first_line_of_a_log_count_and_three_differing_values_are_shown(monkeypatch):
+    monkeypatch.setattr(rerun, "NUMBERS", 2)
+    log = SimpleNamespace(
+        measurements=[{"kind": "run", "numbers": 2}, {"kind": "training", **dict.fromkeys("abcd", 1)}]
+    )
+    other = SimpleNamespace(
+        measurements=[{"kind": "run", "numbers": 2}, {"kind": "training", **dict.fromkeys("abcd", 2)}]
+    )
+    submission = SimpleNamespace(log=lambda run: log, config={"device": "cuda"}, versions={})
+    run = SimpleNamespace(machine="", cpu="")
+
+    assert rerun.why_other_bits(submission, [run])[0] == "device cuda"
+    assert rerun.first_difference(log, other) == "first in line 2, training: a 1 and 2, b 1 and 2, c 1 and 2"

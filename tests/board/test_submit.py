@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.board import submit as module
-from ctgraph_rl.board.method import read_method
+from ctgraph_rl.board.method import fact_rules, read_method
 from ctgraph_rl.board.rules import oracle_rule
 from ctgraph_rl.board.submission import log_sum, read_submission
 from ctgraph_rl.board.submit import submit
@@ -362,3 +363,13 @@ def test_the_logs_of_experts_are_submitted_and_their_metrics_are_those_of_the_ru
     shutil.rmtree("runs/experts")
     with pytest.raises(ValueError, match=r"was trained with experts, runs/experts/.* cannot be found: submit from the"):
         submit([Path("runs")], Path("again"), method, one)
+
+
+def test_what_a_method_keeps_is_compared_with_the_largest_agent_of_its_runs():
+    method = {"given": {}, "compute": {"hours": None}, "bytes_per_task": 100}
+    runs = [SimpleNamespace(agent_bytes=number) for number in (299, None, 300, 1)]
+
+    rules = fact_rules(method, {"given": {}, "compute": {"hours": 0.0}}, runs, num_tasks=4)
+
+    assert rules[-1][0]
+    assert not fact_rules(method, {"given": {}, "compute": {"hours": 0.0}}, runs[:2], num_tasks=4)[-1][0]

@@ -12,6 +12,7 @@ import pytest
 import curricula
 from ctgraph_rl import CTGraph, Task
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
+from curricula import meta_json
 from curricula.meta_json import MOST_BYTES, Pool
 from curricula.published import environment, one_wait_image
 
@@ -294,3 +295,9 @@ def test_the_tasks_are_those_of_from_json(tmp_path):
     (first, *_) = read.tasks
     assert first == Task.from_json(tmp_path / "envs" / "s1d2.json", (1, 1))
     assert read.tasks[2] == replace(first, goal=(2, 1))
+
+
+def test_a_list_may_be_as_long_as_is_allowed_and_no_longer(tmp_path, monkeypatch):
+    monkeypatch.setattr(meta_json, "MOST_TASKS", 3)
+
+    assert [meta_json._ints_rule("filter_tasks", [*range(number)])[0] for number in range(5)] == [0, 1, 1, 1, 0]

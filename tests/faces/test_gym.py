@@ -276,7 +276,7 @@ envs.close()
 """
     threads = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
 
-    found = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, timeout=120)
+    found = subprocess.run([sys.executable, "-c", code], env=threads, capture_output=True, text=True, timeout=600)
 
     assert found.stdout.strip() == "(2, 1, 12, 12)", found.stderr
 

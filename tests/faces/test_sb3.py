@@ -103,6 +103,7 @@ def test_attributes_and_methods_are_those_of_the_batch():
     assert envs.has_attr("task_pool") and not envs.has_attr("task_poll")
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False, False]
     assert envs.render().shape == (2 * 192, 384, 3)
+    assert envs.unwrapped.metadata == envs.unwrapped.envs.metadata
     assert len(envs.env_method("render")) == 2
     with pytest.raises(ValueError, match=r"the rows are one batch: indices must be None, got \[0\]"):
         envs.env_method("set_tasks", pool, indices=[0])

@@ -180,3 +180,20 @@ def test_seeds_of_the_ladder_have_the_losses_that_each_has_alone(name, monkeypat
     group.gradient_step(seen[0])
     group.stack.write()
     assert not torch.equal(learners[0].weights[0], before)
+
+
+def test_acting_is_captured_again_where_rows_have_other_tasks(small_agent):
+    one, other = confounding(), confounding(goal=(2, 2))
+    env = CTGraphEnv([one] * 2, task_pool=[one, other])
+    agent = small_agent("ppo", [one])
+    act = CapturedAct(env, agent.policy, start_of_episodes(env, agent.initial_state))
+    regions = []
+
+    for task in (one, other, None):
+        if task is not None:
+            env.set_tasks([task] * 2)
+        act(dict(env.reset().items(True, True)))
+        regions.append(act._region)
+
+    assert regions[0] is not regions[1]
+    assert regions[1] is regions[2]

@@ -31,7 +31,7 @@ from baselines.methods.multitask import Multitask
 from ctgraph_rl import Block, Recorder, learn_curriculum, make_agent, scores
 from ctgraph_rl.checks import did_you_mean
 from ctgraph_rl.log.run_log import metrics_text
-from ctgraph_rl.runs.config import composed, curriculum_of
+from ctgraph_rl.runs.config import composed, curriculum_of, with_names
 from ctgraph_rl.runs.job import run_job
 from curricula import su_b1_4tasks
 
@@ -226,3 +226,11 @@ def test_a_sweep_of_an_application_of_ones_own_runs_each_job_in_its_folder(tmp_p
     assert done.returncode == 0, done.stderr
     found = {path.relative_to(tmp_path): path.read_text() for path in tmp_path.rglob("result.txt")}
     assert found == {Path(f"out/{seed}/result.txt"): f"program {seed} " for seed in range(3)}
+
+
+def test_a_file_that_cannot_be_composed_is_a_value_error(tmp_path):
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent" / "mine.yaml").write_text("defaults: [nothing]\n")
+
+    with pytest.raises(ValueError, match="nothing"):
+        with_names({"agent": "mine"}, tmp_path)

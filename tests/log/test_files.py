@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import json
 import os
 import signal
 import subprocess
@@ -14,18 +15,20 @@ from unittest.mock import Mock
 import pytest
 from helpers.stopped_runs import StopsAfter, learn_into
 
+from ctgraph_rl import disk
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log import files
-from ctgraph_rl.log.files import LOCK, locked
+from ctgraph_rl.log.files import LOCK, LOG, METRICS, locked
+from ctgraph_rl.log.sums import SUMS, stored_sums
 from ctgraph_rl.runs.status import status_of
 
 HOLD = """
-import sys, time
+import signal, sys
 from pathlib import Path
 from ctgraph_rl.log.files import locked
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
-    time.sleep(60)
+    signal.pause()
 """
 
 
@@ -242,3 +245,23 @@ def test_a_run_whose_directory_is_moved_says_so_at_the_next_write_and_writes_not
     (tmp_path / "moved").rename(tmp_path / "run")
     learn_into(tmp_path / "run")
     assert (tmp_path / "run" / "metrics.json").exists() and (tmp_path / "run" / "restarts.jsonl").exists()
+
+
+def test_a_named_file_is_written_whole_and_a_link_to_it_through_the_link(tmp_path, monkeypatch):
+    whole = []
+    monkeypatch.setattr(disk, "write_whole", lambda path, content: whole.append(path.name))
+    (tmp_path / "old").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "old")
+
+    for name in ("new", "old", "link"):
+        disk.write_named(tmp_path / name, "text")
+
+    assert whole == ["new", "old"]
+    assert (tmp_path / "old").read_text() == "text"
+
+
+@pytest.mark.parametrize("files", [{LOG: {}}, {METRICS: {}, "other": {}}, {METRICS: 1}])
+def test_sums_without_that_of_the_metrics_or_of_anything_else_are_none(tmp_path, files):
+    (tmp_path / SUMS).write_text(json.dumps({"files": files}))
+
+    assert stored_sums(tmp_path) == {}

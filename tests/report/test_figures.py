@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 from helpers.made_runs import write_run
@@ -16,6 +17,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
+from ctgraph_rl.report.figures import heatmaps
 from ctgraph_rl.report.figures.heatmaps import draw_matrices
 from ctgraph_rl.report.figures.labels import draw_labels, label_strips
 from ctgraph_rl.report.figures.learning_curves import draw_mean, draw_tasks
@@ -137,3 +139,11 @@ def test_without_labels_of_a_detector_there_is_no_figure_of_them_and_with_them_i
         found = label_strips(sections(runs)[0])
     assert found is not None and "an oracle in evaluation alone" in found.caption
     assert label_notes(runs)[0].startswith("1 of 2 runs have labels of a detector: each task is played with the label")
+
+
+@pytest.mark.parametrize(("number", "said"), [(5, True), (6, False)])
+def test_the_caption_of_a_map_tells_of_intervals_up_to_the_last_that_has_them(monkeypatch, number, said):
+    monkeypatch.setattr(heatmaps, "draw_matrices", lambda section, result: None)
+    section, result = SimpleNamespace(labels=("task",) * number), SimpleNamespace(agent="ppo", n=3)
+
+    assert ("In brackets" in heatmaps.transfer_maps(section, result, {}).caption) == said

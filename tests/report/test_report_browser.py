@@ -54,7 +54,7 @@ def opened(page, profile) -> Page:
     quiet = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking")
     offline = ("--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}")
     command = [BROWSER, *quiet, *offline, "--virtual-time-budget=20000", "--dump-dom", page.as_uri()]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     return Page(result.stdout)
 

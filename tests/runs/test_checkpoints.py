@@ -59,6 +59,7 @@ def test_the_last_two_are_kept(tmp_path):
 
     assert [int(file.stem) for file in checkpoints.files()] == [2 * 10**12, 192]
     assert checkpoints.newest()["frames"] == 2 * 10**12
+    assert checkpoints.newest_frames == 2 * 10**12
 
 
 def test_a_file_torn_at_any_byte_is_refused_and_named(tmp_path):

@@ -72,7 +72,7 @@ def test_a_signal_to_the_process_of_a_run_saves_and_the_same_command_goes_on(
         time.sleep(0.01)
     process.send_signal(getattr(signal, name))
 
-    assert process.wait(60) == code
+    assert process.wait() == code
     assert process.stderr is not None
     line = f"{name}: saving after this update ... saved; the same command resumes from there"
     assert line in process.stderr.read().splitlines()

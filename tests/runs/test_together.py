@@ -381,3 +381,12 @@ def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch
     assert not list(Path("seed1").glob("run.jsonl"))
     run()
     assert groups() == [[0, 1, 2], None, [0, 1, 2], [0, 2], None, [0, 2]]
+
+
+def test_seeds_that_have_failed_are_an_error_of_the_group(tmp_path, monkeypatch):
+    failed = {0: FloatingPointError("the loss is NaN"), 1: OSError("no disk")}
+    monkeypatch.setattr(runs_together, "is_finished", lambda cfg, run_dir: False)
+    monkeypatch.setattr(runs_together, "_marked", lambda left: failed)
+
+    with pytest.raises(RuntimeError, match=r"^FloatingPointError: the loss is NaN; OSError: no disk$"):
+        run_as_one([({}, tmp_path)])

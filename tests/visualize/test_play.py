@@ -288,7 +288,7 @@ def test_an_interrupt_ends_the_game_cleanly():
     os.write(terminal, b"\x03")
 
     _, status = os.waitpid(child, 0)
-    listener.join(5)
+    listener.join(120)
 
     assert status == 0
     assert "▀".encode() in told and b"38;2;" in told

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,8 +34,7 @@ def main() -> None:
     given = parser.parse_args()
     seed, mutants = sample.stored()
     if given.draw is not None:
-        gone = sample.lost(mutants)
-        seed, mutants = given.draw, sample.draw(given.draw, NUMBER, [one for one in mutants if one not in gone])
+        seed, mutants = given.draw, drawn(given.draw, mutants)
         sample.store(seed, mutants)
     trial.import_third_party()
     with tempfile.TemporaryDirectory() as folder:
@@ -48,6 +48,13 @@ def main() -> None:
     sys.exit(share(mutants) < 0.95)
 
 
+def drawn(seed: int, mutants: Sequence[Mutant]) -> list[Mutant]:
+    """Draw others of the same wings for mutants whose line is gone, or a whole sample where there is none."""
+    shares = Counter(mutant.wing for mutant in mutants) or sample.shares_of_wings(NUMBER)
+    gone = sample.lost(mutants)
+    return sample.draw(seed, shares, [mutant for mutant in mutants if mutant not in gone])
+
+
 def killer_of(copy: Path, mutant: Mutant, near: bool) -> str:
     """Return a test that fails with a mutant in the copy, the one that is known if it does; "" if none does."""
     if fate(mutant) in (LOST, EQUIVALENT):
@@ -56,7 +63,7 @@ def killer_of(copy: Path, mutant: Mutant, near: bool) -> str:
         for tests, workers in trials(mutant, near):
             failed = trial.first_failure(copy, tests, workers)
             if failed is None:
-                return mutant.killer or tests[0]
+                return mutant.killer or f"{tests[0]}::{min(sample.default_tests(CHECKOUT / tests[0]))}"
             if failed:
                 return failed.partition("[")[0]
     return ""

@@ -6,7 +6,7 @@ import ast
 import json
 import random
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import groupby
@@ -20,12 +20,12 @@ STORED = Path(__file__).with_name("sample.json")
 PACKAGES = ("baselines", "ctgraph_rl", "curricula", "hydra_plugins")
 
 EXCLUDED = {
-    "ctgraph_rl/board/isolate.py": "tmp",
     "baselines/_stable.py": "measures speed",
     "ctgraph_rl/benchmark": "measures speed",
     "baselines/benchmark.py": "measures speed",
     "baselines/ladder.py": "measures speed",
     "baselines/_roofline.py": "measures speed",
+    "ctgraph_rl/core/region.py": "captures on a GPU",
 }
 """Modules of which nothing is drawn, and why. Texts, imports and annotations are left out by the operators."""
 
@@ -72,30 +72,51 @@ def store(seed: int, mutants: Iterable[Mutant]) -> None:
     STORED.write_text(json.dumps({"seed": seed, "mutants": listed}, indent=1) + "\n")
 
 
-def draw(seed: int, number: int, kept: Sequence[Mutant] = ()) -> list[Mutant]:
-    """Draw mutants of all wings, at most one of a line, and keep those that there are.
+def draw(seed: int, shares: Mapping[str, int], kept: Sequence[Mutant] = ()) -> list[Mutant]:
+    """Draw mutants, at most one of a line, and keep those that there are.
 
     An operator is drawn first, so that rare ones are in the sample, then a line that it applies to.
+
+    Args:
+        seed: decides what is drawn.
+        shares: mutants of each wing, those that are kept among them.
+        kept: mutants that stay.
     """
     generator = random.Random(seed)
-    wings = {wing: _wing_changes(paths) for wing, paths in groupby(_modules(), key=_folder)}
-    shares = _shares({wing: len({place for place, _ in found}) for wing, found in wings.items()}, number)
     mutants = list(kept)
-    for wing, found in wings.items():
-        taken = {(mutant.path, mutant.before) for mutant in mutants}
-        while sum(mutant.wing == wing for mutant in mutants) < shares[wing]:
+    taken = {(mutant.path, mutant.before) for mutant in mutants}
+    for wing, found in _by_wing().items():
+        while sum(mutant.wing == wing for mutant in mutants) < shares.get(wing, 0):
             operator = generator.choice(sorted({change.operator for _, change in found}))
-            (path, _), change = generator.choice([one for one in found if one[1].operator == operator])
-            one = Mutant(path, change.before, change.after, change.function)
-            if (path, change.before) not in taken and parses(replaced((CHECKOUT / path).read_text(), change)):
+            path, change = generator.choice([one for one in found if one[1].operator == operator])
+            source = (CHECKOUT / path).read_text()
+            if (path, change.before) not in taken and parses(replaced(source, change)):
                 taken.add((path, change.before))
-                mutants.append(one)
+                mutants.append(Mutant(path, change.before, change.after, change.function))
     return sorted(mutants, key=lambda mutant: (mutant.wing, mutant.path))
+
+
+def shares_of_wings(number: int) -> dict[str, int]:
+    """Return how many mutants of all are to be of each wing, by its lines that an operator applies to."""
+    lines = {wing: len({(path, change.line) for path, change in found}) for wing, found in _by_wing().items()}
+    whole = sum(lines.values())
+    shares = {wing: min(size, max(LEAST, number * size // whole)) for wing, size in lines.items()}
+    for wing in sorted(lines, key=lambda wing: shares[wing] - number * lines[wing] / whole):
+        if sum(shares.values()) >= number:
+            break
+        shares[wing] += 1
+    return shares
 
 
 def lost(mutants: Iterable[Mutant]) -> list[Mutant]:
     """Return the mutants whose line is no longer there."""
     return [mutant for mutant in mutants if mutant.change() is None]
+
+
+def lines_gone(mutants: Sequence[Mutant]) -> list[Mutant]:
+    """Return the mutants whose line is nowhere in its module; faster than `lost`, which looks in its function."""
+    lines = {path: _lines(CHECKOUT / path) for path in {mutant.path for mutant in mutants}}
+    return [mutant for mutant in mutants if mutant.before not in lines[mutant.path]]
 
 
 def default_tests(path: Path) -> set[str]:
@@ -119,6 +140,10 @@ def _is_left_out(marks: str) -> bool:
     return any(f"pytest.mark.{name}" in re.sub(r"marks=pytest\.mark\.\w+", "", marks) for name in ("slow", "slurm"))
 
 
+def _lines(path: Path) -> set[str]:
+    return {line.strip() for line in path.read_text().splitlines()} if path.is_file() else set()
+
+
 @cache
 def _changes(path: Path) -> list[Change]:
     return changes(path.read_text()) if path.is_file() else []
@@ -135,17 +160,9 @@ def _folder(path: str) -> str:
     return path.rpartition("/")[0]
 
 
-def _wing_changes(paths: Iterable[str]) -> list[tuple[tuple[str, int], Change]]:
-    """All changes of modules, each with its path and line."""
-    return [((path, change.line), change) for path in paths for change in _changes(CHECKOUT / path)]
-
-
-def _shares(sizes: dict[str, int], number: int) -> dict[str, int]:
-    """Mutants of each wing by its number of lines, which are `number` in all."""
-    whole = sum(sizes.values())
-    shares = {wing: min(size, max(LEAST, int(number * size / whole))) for wing, size in sizes.items()}
-    for wing in sorted(sizes, key=lambda wing: shares[wing] - number * sizes[wing] / whole):
-        if sum(shares.values()) >= number:
-            break
-        shares[wing] += 1
-    return shares
+def _by_wing() -> dict[str, list[tuple[str, Change]]]:
+    """All changes of the modules of each wing, each with its path."""
+    return {
+        wing: [(path, change) for path in paths for change in _changes(CHECKOUT / path)]
+        for wing, paths in groupby(_modules(), key=_folder)
+    }
