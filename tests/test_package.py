@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from email.parser import Parser
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 import ctgraph_rl
 from ctgraph_rl.runs.train import RESULTS
 
+BADGE = "https://img.shields.io/badge/python-"
 TINY = ["curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8"]
 
 
@@ -94,3 +96,15 @@ def test_the_wheel_runs_from_an_empty_directory_and_writes_only_under_runs(wheel
     written = {path.name for path in run_dir.iterdir()}
     assert written == {".hydra", *RESULTS}
     assert [path.name for path in (tmp_path / "empty").iterdir()] == ["runs"]
+
+
+def test_readme_names_the_versions_of_python_of_the_package(checkout):
+    """CI reads them from pyproject.toml, too."""
+    project = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    readme = (checkout / "README.md").read_text(encoding="utf-8")
+
+    versions = [each.split(" :: ")[-1] for each in project["classifiers"] if ":: Python :: 3." in each]
+
+    assert f"With Python {versions[0]} to {versions[-1]}." in readme
+    assert f"![Python {versions[0]} to {versions[-1]}]({BADGE}{'%20%7C%20'.join(versions)}-blue)" in readme
+    assert project["requires-python"] == f">={versions[0]}"

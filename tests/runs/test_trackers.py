@@ -6,17 +6,15 @@ import re
 import shutil
 import sys
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import torch
 from torchrl.record.loggers.common import Logger
 
 from ctgraph_rl import Recorder
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.run import run
-from ctgraph_rl.runs.config import plain, run_name, target
+from ctgraph_rl.runs.config import plain, run_name
 from ctgraph_rl.runs.read import flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker, csv_logger, scalars
 from curricula import su_b1_4tasks
@@ -246,25 +244,6 @@ def test_a_missing_tracker_says_what_to_install_before_anything_is_written(name,
 def test_a_mode_that_wandb_does_not_have_is_refused(compose, tmp_path):
     with pytest.raises(ValueError, match=r"^logger\.mode must be one of offline, online, got 'disabled'$"):
         run(compose(*SHORT, "logger=wandb", "logger.mode=disabled"), tmp_path)
-
-
-@pytest.mark.parametrize("name", PACKAGES)
-def test_an_installed_tracker_writes_into_the_run_directory_and_nowhere_else(name, compose, tmp_path, monkeypatch):
-    if find_spec(name) is None:
-        pytest.skip(f"needs {name}")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    before = torch.random.get_rng_state()
-    cfg = compose(f"logger={name}")
-
-    with Tracker(target(cfg, "logger"), tmp_path / "run", dict(flat(plain(cfg)))) as tracker:
-        tracker(TRAINING)
-
-    written = b"".join(path.read_bytes() for path in (tmp_path / "run" / FOLDER).rglob("*") if path.is_file())
-    assert b"train/loss_value" in written and b"agent.num_envs" in written
-    assert list((tmp_path / "here").iterdir()) == []
-    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_the_page_names_every_tracker_and_every_key(checkout):
