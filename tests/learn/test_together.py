@@ -171,9 +171,9 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     return value.double() if value.is_floating_point() else value
 
 
-@pytest.mark.parametrize(("name", "method"), others_slow(EACH, ("a2c", "finetune")))
+@pytest.mark.parametrize(("name", "method"), others_slow(EACH, ("a2c", "finetune"), ("dqn", "finetune")))
 def test_each_seed_ends_near_its_run_alone(make, name, method):
-    its = make(name, method)
+    its = make(name, method, *["agent.target_update_interval=1"] * ("dqn" in name))  # within the first batch
 
     group, logs = its.learn()
 
