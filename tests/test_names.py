@@ -76,6 +76,7 @@ def test_a_terminal_gets_one_line_without_controls(name):
 
 
 @given(NAMES)
+@settings(max_examples=50)
 def test_markdown_shows_a_name_as_text(name):
     shown = escape.markdown_text(name)
 
@@ -87,6 +88,7 @@ def test_markdown_shows_a_name_as_text(name):
 
 
 @given(NAMES, NAMES)
+@settings(max_examples=50)
 def test_a_cell_of_a_markdown_table_is_one_cell(name, other):
     row = f"| {escape.markdown_text(name)} | {escape.markdown_text(other)} |"
 
