@@ -83,7 +83,7 @@ class MaskExchange(Exchange):
         require((not lack, f"{name} needs masks, which {len(lack)} of {len(methods)} members lack; {one}: {fix}"))
         self.methods: list[Any] = methods
         first = self.methods[0].constant
-        others = [number for number, method in enumerate(methods) if not torch.equal(first, method.constant)]
+        others = [number for number, method in enumerate(self.methods) if not torch.equal(first, method.constant)]
         have = f"{len(others)} of {len(methods)} members have another than member 0"
         require((not others, f"{name} needs one network behind all masks, and {have}: set method.backbone_seed"))
         self.returns: list[dict[int, float]] = [{} for _ in methods]

@@ -167,17 +167,14 @@ def test_a_list_that_contains_itself_is_left_to_the_rules():
     assert plain(endless) is endless
 
 
-def rollout(**arguments: Any) -> torch.Tensor:
-    return CTGraphEnv([ct_su_b1()] * 2, **arguments).rollout(4)["observation"]
-
-
 @pytest.mark.parametrize("number", [np.int64, torch.tensor, float])
 def test_environments_take_them(number):
     vector = CTGraphVectorEnv(number(2), depth=number(1), goal=np.array([1]))
     single = CTGraphGymEnv(depth=number(1), goal=torch.tensor([1]), wait_prob=np.float32(0.5))
-    env = CTGraphEnv([ct_su_b1()], task_ids={ct_su_b1(): np.int64(1)}, num_task_ids=number(3))
+    ids = {ct_su_b1(): np.int64(1)}
+    env = CTGraphEnv([ct_su_b1()], number(3), number(1), task_ids=ids, num_task_ids=number(3))
 
-    assert rollout(seed=number(3), first_row=number(1)).equal(rollout(seed=3, first_row=1))
+    assert (env.rows.seed.tolist(), env.rows.row.tolist()) == ([3], [1])
     assert vector.reset(seed=number(4))[0].shape == (2, 1, 12, 12)
     assert single.reset(seed=number(4))[1]["task"] == 0
     assert env.reset()["task_id"].tolist() == [[0, 1, 0]]
