@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from ctgraph_rl.batch.specs import checked_num_ids
 from ctgraph_rl.checks import require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
+from ctgraph_rl.tasks.task import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -27,6 +30,9 @@ class SB3VecEnv(VecEnv):
     Args:
         num_envs: number of rows.
         task: see `CTGraphVectorEnv`, as for all others but the autoreset mode.
+        task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
+            ``observation`` and ``task_id``, uint8 [num_envs, num_task_ids]: the row's id as one-hot.
+        num_task_ids: length of ``task_id``; None: just enough.
         kwargs: see `CTGraphVectorEnv`.
 
     Example:
@@ -36,18 +42,37 @@ class SB3VecEnv(VecEnv):
     """
 
     @takes_numbers
-    def __init__(self, num_envs: int, task: Any = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        task: Any = None,
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        length = checked_num_ids(task_ids, num_task_ids)
         self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
-        super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
+        space: spaces.Space[Any] = self.envs.single_observation_space
+        self._ids: NDArray[np.uint8] | None = None
+        if task_ids is not None:
+            without = [each for each in self.envs.task_pool if each not in task_ids]
+            require((not without, f"task_ids must name every task of the pool, got none for {without[:3]}"))
+            self._ids = np.eye(length, dtype=np.uint8)[[int(task_ids[each]) for each in self.envs.task_pool]]
+            space = spaces.Dict({"observation": space, "task_id": spaces.Box(0, 1, (length,), np.uint8)})
+        super().__init__(num_envs, space, self.envs.single_action_space)
         self.metadata = self.envs.metadata
 
-    def reset(self) -> NDArray[np.uint8]:
+    def _shown(self, observation: NDArray[np.uint8], tasks: Any) -> Any:
+        """Observations with the ids of tasks, if there are ids."""
+        return observation if self._ids is None else {"observation": observation, "task_id": self._ids[tasks]}
+
+    def reset(self) -> Any:
         """Start an episode in all rows, with the seeds that ``seed`` was given before."""
         observation, infos = self.envs.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = _by_row(infos)
-        return observation
+        return self._shown(observation, infos["task"])
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
         """Take actions for the next `step_wait`."""
@@ -62,8 +87,9 @@ class SB3VecEnv(VecEnv):
             begun, final = _by_row(batch), _by_row(batch["final_info"])
             for i in ended:
                 self.reset_infos[i] = begun[i]
-                infos[i] |= final[i] | {"terminal_observation": batch["final_obs"][i]}
-        return observation, rewards.astype(np.float32), done, infos
+                last = self._shown(batch["final_obs"][i], final[i]["task"])
+                infos[i] |= final[i] | {"terminal_observation": last}
+        return self._shown(observation, batch["task"]), rewards.astype(np.float32), done, infos
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -76,8 +102,10 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the batch, once for every row; a space is that of one row."""
-        name = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
-        return [getattr(self.envs, name.get(attr_name, attr_name)) for _ in self._get_indices(indices)]
+        name = {"action_space": "single_action_space"}
+        owner = self if attr_name == "observation_space" else self.envs
+        found = getattr(owner, attr_name if owner is self else name.get(attr_name, attr_name))
+        return [found for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the batch; ``indices`` must be None."""

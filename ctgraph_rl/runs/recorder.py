@@ -37,15 +37,17 @@ class Recorder:
 
     A policy is one of
 
-    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions;
+    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions. Where its
+      second argument is named ``task_id``, it gets the one-hot task ids there, uint8 [n, num_task_ids], or None where
+      the protocol shows none;
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
       is None, and ``episode_start``, bool [n], says which rows start an episode;
     - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol says so;
     - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.evaluate.LogitsPolicy`;
     - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
 
-    Observations are NumPy arrays. Where the protocol shows task ids with observations, they are a dict of
-    ``observation`` and ``task_id``, uint8 [n, num_task_ids]. A function draws its own random numbers: where the
+    Observations are NumPy arrays. Where the protocol shows task ids with observations, any other function and
+    ``predict`` get a dict of ``observation`` and ``task_id``. A function draws its own random numbers: where the
     protocol is greedy it should take its best action.
 
     Use it as a context manager, or call `close`::
@@ -358,12 +360,20 @@ def adapt(policy: Any, greedy: bool, num_actions: int, shows_ids: bool = False) 
         return as_policy(policy, num_actions)
     require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
     positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    taken = [p for p in signature(policy).parameters.values() if p.kind in positional and p.default is p.empty]
+    places = [p for p in signature(policy).parameters.values() if p.kind in positional]
+    if [p.name for p in places[1:2]] == ["task_id"]:
+        return _NumpyPolicy(lambda shown, state, start: (policy(*_parts(shown)), None))
+    taken = [p for p in places if p.default is p.empty]
     fits = len(taken) in (1, 3)
     require(
         (fits, f"policy must take (observation) or (observation, state, episode_start), not {len(taken)} arguments")
     )
     return _NumpyPolicy(policy if len(taken) == 3 else lambda observation, state, start: (policy(observation), None))
+
+
+def _parts(shown: Any) -> tuple[Any, Any]:
+    """Return observations and one-hot task ids; None where the protocol shows none."""
+    return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
 
 
 class _NumpyPolicy:

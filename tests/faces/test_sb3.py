@@ -20,6 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+import curricula
 from baselines import _stable
 from ctgraph_rl.gym import CTGraphGymEnv, make_task
 from ctgraph_rl.sb3 import SB3VecEnv
@@ -198,3 +199,29 @@ def test_the_benchmark_counts_the_first_episode_of_each_row_and_no_later_one(mon
     monkeypatch.setattr(_stable, "batch", lambda task, num_rows: Envs())
 
     assert agent.success() == 0.5
+
+
+def test_task_ids_are_shown_as_one_hot_also_at_the_end_of_an_episode_and_after_a_change():
+    curriculum = curricula.load("ct8")
+    first, second = curriculum.tasks[:2]
+    ids = {first: 2, second: 0}
+    envs = SB3VecEnv(2, first, task_pool=(first, second), task_ids=ids, num_task_ids=4)
+
+    begun = envs.reset()
+    envs.env_method("set_tasks", [second, second])
+    done = np.zeros(2, dtype=np.bool_)
+    while not done.all():  # both rows play the same episode
+        shown, _, done, infos = envs.step(np.array([1, 1]))
+
+    assert begun["task_id"].tolist() == [[0, 0, 1, 0]] * 2
+    assert envs.observation_space.contains({key: value[0] for key, value in begun.items()})
+    assert envs.get_attr("observation_space")[0] == envs.observation_space
+    assert shown["task_id"].tolist() == [[1, 0, 0, 0]] * 2
+    assert [info["terminal_observation"]["task_id"].tolist() for info in infos] == [[0, 0, 1, 0]] * 2
+
+
+def test_task_ids_that_leave_a_task_of_the_pool_out_are_refused():
+    first, second = curricula.load("ct8").tasks[:2]
+
+    with pytest.raises(ValueError, match="task_ids must name every task of the pool"):
+        SB3VecEnv(2, first, task_pool=(first, second), task_ids={first: 0})
