@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers.scripted import DECISION_ID, ONE, TWO, curriculum
 from torch import nn
 
+import curricula
 from ctgraph_rl import Block, Protocol, Recorder, evaluate
 from curricula import su_b1_4tasks
 
@@ -124,3 +126,21 @@ def test_a_module_that_gives_no_logits_is_refused_with_what_to_write(module, mes
         Recorder(su_b1_4tasks(num_frames=256)).evaluate(module, 0)
 
     assert "write one that does, or a function of a TensorDict that sets 'action'" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in ("ct8", "su_b1_4tasks") else pytest.mark.slow) for n in curricula.names()]
+)
+def test_a_function_with_a_second_argument_task_id_plays_every_curriculum(name):
+    curriculum = curricula.load(name)
+    lengths = []
+
+    def policy(images, task_id=None):
+        lengths.append(None if task_id is None else task_id.shape[1])
+        return np.zeros(len(images), dtype=np.int64)
+
+    with Recorder(replace(curriculum, evaluation=replace(curriculum.evaluation, tasks="all", every=0))) as recorder:
+        recorder.evaluate(policy, curriculum.num_frames)
+
+    shown = curriculum.protocol.task_id == "one_hot"
+    assert set(lengths) == {curriculum.protocol.length(len(curriculum.tasks)) if shown else None}

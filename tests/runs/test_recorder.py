@@ -397,21 +397,3 @@ def test_stable_baselines3_is_measured_by_the_protocol(tmp_path):
     assert recorder.log.performance().shape == (5, 4)
     assert recorder.metrics["average_performance"].value == 0.0  # without memory, a little training: at most luck
     assert (tmp_path / "sb3" / "performance.csv").read_text().count("\n") == 6
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n in ("ct8", "su_b1_4tasks") else pytest.mark.slow) for n in curricula.names()]
-)
-def test_a_function_with_a_second_argument_task_id_plays_every_curriculum(name):
-    curriculum = curricula.load(name)
-    lengths = []
-
-    def policy(images, task_id=None):
-        lengths.append(None if task_id is None else task_id.shape[1])
-        return np.zeros(len(images), dtype=np.int64)
-
-    with Recorder(replace(curriculum, evaluation=replace(curriculum.evaluation, tasks="all", every=0))) as recorder:
-        recorder.evaluate(policy, curriculum.num_frames)
-
-    shown = curriculum.protocol.task_id == "one_hot"
-    assert set(lengths) == {curriculum.protocol.length(len(curriculum.tasks)) if shown else None}
