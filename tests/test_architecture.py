@@ -21,6 +21,7 @@ from ctgraph_rl.core import rewards
 FLOORS = (
     ("ctgraph_rl", "checks", "metrics"),
     ("disk",),
+    ("strict",),
     ("core", "portable"),
     ("tasks",),
     ("packages", "batch", "agent", "curricula"),

@@ -12,6 +12,7 @@ import yaml
 
 from ctgraph_rl.checks import did_you_mean, is_int, is_real, is_shallow, require
 from ctgraph_rl.disk import read_regular
+from ctgraph_rl.strict import named, yaml_value
 from ctgraph_rl.tasks.protocol import Protocol
 
 TEMPLATE = """\
@@ -70,10 +71,8 @@ def read_method(path: Path) -> dict[str, Any]:
         ValueError: for what is no YAML, a missing or unknown key, and values out of range; names all of them.
         OSError: if it cannot be read.
     """
-    try:
-        method = yaml.safe_load(read_regular(path, MOST_BYTES))
-    except (yaml.YAMLError, RecursionError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} must be YAML: {' '.join(str(error).split())}") from None
+    with named(path):
+        method = yaml_value(read_regular(path, MOST_BYTES))
     try:
         check_method(method)
     except ValueError as error:

@@ -8,7 +8,6 @@ and so are single-task experts.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import shutil
@@ -32,6 +31,7 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.portable import VARIABLES, cpu_model
+from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 RERUN = "rerun"
@@ -392,7 +392,7 @@ def _frames(run_dir: Path) -> int:
             lines = file.read(TAIL).split(b"\n")[:-1]
         for line in reversed(lines):
             with suppress(ValueError, AttributeError):
-                frames = json.loads(line).get("frames")
+                frames = json_value(line, finite=False).get("frames")
                 if is_int(frames, 0):
                     return frames
     return 0

@@ -26,7 +26,7 @@ from ctgraph_rl.board.submission import (
     experts_of,
     log_sum,
 )
-from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.checks import is_real
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import csv_text
@@ -37,6 +37,7 @@ from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
 from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences
+from ctgraph_rl.strict import parquet_rows
 
 RESCORED = "rescored"
 
@@ -206,7 +207,7 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
     for run, log in logs.items():
         try:
             cells = _metric_cells(run, scores(log, submission.curriculum, submission.experts(run)))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError) as error:
             wrong.append(Check(METRICS, "metrics of the log", "none", False, run.run, note=str(error)))
             continue
         stated = {name: list(row.values()) for name, row in submission.metrics.get(run.run, {}).items()}
@@ -248,9 +249,10 @@ def _number(cell: str) -> object:
 
 def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Check]:
     """Return the checks of ``evaluations.parquet``: one for each row that differs, or one for all."""
-    expected = _table(evaluations_parquet(logs))
+    table = evaluations_parquet(logs)
+    expected = parquet_rows(table, table)
     try:
-        found = _table(read_regular(submission.path / EVALUATIONS, MOST_BYTES), len(expected))
+        found = parquet_rows(read_regular(submission.path / EVALUATIONS, MOST_BYTES), table)
     except ValueError as error:
         return [Check(EVALUATIONS, f"{len(expected)} rows", "a file that cannot be read", False, note=str(error))]
     pairs = enumerate(zip_longest(expected, found, fillvalue=NO_ROW), 1)
@@ -266,20 +268,3 @@ def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, s
     names = [name for name in {**one, **other} if one.get(name) != other.get(name)]
     first, second = (listed(f"{name}={row.get(name)}" for name in names) for row in (one, other))
     return first, second
-
-
-def _table(content: bytes, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the rows of a Parquet file.
-
-    Raises:
-        ValueError: for what is none, and for more rows than it should have.
-    """
-    from pyarrow import ArrowException, BufferReader, parquet
-
-    try:
-        file = parquet.ParquetFile(BufferReader(content))
-        rows = file.metadata.num_rows
-        require((most is None or rows <= most, f"it has {rows:,} rows, the logs give {most}"))
-        return file.read().to_pylist()
-    except (ArrowException, OSError) as error:
-        raise ValueError(str(error)) from None

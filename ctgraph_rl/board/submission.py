@@ -13,20 +13,15 @@ No code of the folder is ever run when it is read.
 
 from __future__ import annotations
 
-import csv
 import gzip
 import hashlib
-import io
 import json
 import re
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from ctgraph_rl.board.method import read_method
 from ctgraph_rl.board.tracks import Track, track
@@ -37,6 +32,7 @@ from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.runs.settings import as_before
+from ctgraph_rl.strict import MAX_DEPTH, csv_rows, files_below, named, sha256_of, unpacked, yaml_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 METHOD, CONFIG, VERSIONS, RUNS, LOGS = "method.yaml", "config.yaml", "versions.txt", "runs.csv", "logs"
@@ -48,10 +44,10 @@ FILES = (METHOD, CONFIG, VERSIONS, CURRICULUM, RUNS, EVALUATIONS, METRICS)
 VERIFICATION = "verification.json"
 """The file that a verification writes."""
 
-MOST_BYTES_OF_A_FILE = 2**28
-"""Largest file but the logs that is read: 256 MiB."""
+MOST_BYTES_OF_A_FILE, MOST_BYTES_OF_A_TABLE = 2**28, 2**26
+"""Largest file but the logs that is read, 256 MiB, and largest CSV file."""
 
-MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**20, 16
+MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**18, 16
 
 MOST_RUNS, MOST_SECONDS = 10_000, 1e9
 
@@ -182,16 +178,14 @@ class Submission:
     def metrics(self) -> dict[str, dict[str, dict[str, str]]]:
         """Cells of ``metrics.csv`` by run and metric; see `METRIC_COLUMNS`."""
         found: dict[str, dict[str, dict[str, str]]] = {}
-        for row in _rows(self.path / METRICS, METRIC_COLUMNS):
+        for row in _rows(self.path / METRICS, METRIC_COLUMNS, ["run", "metric"]):
             found.setdefault(row["run"], {})[row["metric"]] = row
         return found
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 over the sums of all files but verifications and hidden ones, in the order of their names."""
-        lines = (
-            f"{name} {hashlib.sha256((self.path / name).read_bytes()).hexdigest()}\n" for name in _names(self.path)
-        )
+        lines = [f"{name} {sha256_of(self.path / name, MOST_BYTES)}\n" for name in _names(self.path)]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -209,10 +203,11 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     """
     path = Path(path)
     require((path.is_dir(), f"{path} must be the folder of a submission"))
-    links = [str(each.relative_to(path)) for each in path.rglob("*") if each.is_symlink()]
+    names = [str(each) for each in _files(path)]
+    odd = [name for name in names if name != name.encode("utf-8", "replace").decode()]
     missing = [name for name in (*FILES, LOGS) if not (path / name).exists()]
     require(
-        (not links, f"{path} has links, {', '.join(links[:3])}: put the files in their place"),
+        (not odd, f"{path} has names that are not UTF-8, {', '.join(map(ascii, odd[:3]))}: give them others"),
         (not missing, f"{path} lacks {', '.join(missing)}: ctgraph-rl submit RUNS --to DIR writes all of them"),
     )
     method, runs = read_method(path / METHOD), read_runs(path / RUNS)
@@ -240,7 +235,7 @@ def read_runs(path: Path) -> tuple[SubmittedRun, ...]:
         ValueError: for other columns, cells out of range, and a run or seed that is there twice.
         OSError: if it cannot be read.
     """
-    rows = _rows(path, COLUMNS)
+    rows = _rows(path, COLUMNS, ["run"])
     require((0 < len(rows) <= MOST_RUNS, f"{path} must have 1..{MOST_RUNS:,} runs, got {len(rows):,}"))
     runs = [_run(row, f"{path}: line {number}") for number, row in enumerate(rows, 2)]
     names, seeds = [run.run.lower() for run in runs], [run.seed for run in runs]
@@ -262,7 +257,7 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     whole = {**numbers, **{f"group {number}": number for number in group}}
     whole |= {"agent_bytes": row["agent_bytes"]} if row["agent_bytes"] else {}
     sums = {"log_sha256": row["log_sha256"]} | ({"agent_sha256": row["agent_sha256"]} if row["agent_sha256"] else {})
-    is_time = re.fullmatch(r"\d+(\.\d+)?", row["seconds"]) is not None and float(row["seconds"]) <= MOST_SECONDS
+    is_time = re.fullmatch(r"[0-9]+(\.[0-9]+)?", row["seconds"]) is not None and float(row["seconds"]) <= MOST_SECONDS
     require(
         (NAME.fullmatch(row["run"]) is not None, f"{place}: run must be a name of a file, got {row['run']!r:.80}"),
         (
@@ -270,7 +265,10 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
             f"{place}: state must be {FINISHED} or {FAILED}, got {row['state']!r:.80}",
         ),
         *(
-            (re.fullmatch(r"\d{1,19}", value) is not None, f"{place}: {key} must be an integer >= 0, got {value!r:.80}")
+            (
+                re.fullmatch(r"[0-9]{1,19}", value) is not None,
+                f"{place}: {key} must be an integer >= 0, got {value!r:.80}",
+            )
             for key, value in whole.items()
         ),
         *(
@@ -284,28 +282,17 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     return SubmittedRun(**values | {"agent_bytes": int(row["agent_bytes"]) if row["agent_bytes"] else None})
 
 
-def _rows(path: Path, columns: Mapping[str, str]) -> list[dict[str, str]]:
-    """Return the rows of a CSV file with exactly these columns."""
-    text = read_regular(path, MOST_BYTES_OF_A_FILE).decode("utf-8", "replace")
-    try:
-        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
-    except csv.Error as error:
-        raise ValueError(f"{path} must be CSV: {error}") from None
-    header = rows[0] if rows else []
-    require(
-        (header == list(columns), f"{path} must have the columns {', '.join(columns)}, got {', '.join(header):.200}")
-    )
-    widths = {len(row) for row in rows}
-    require((widths == {len(columns)}, f"{path} must have {len(columns)} cells in every line"))
-    return [dict(zip(columns, map(from_csv, row), strict=True)) for row in rows[1:]]
+def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str]) -> list[dict[str, str]]:
+    """Return the rows of a CSV file with exactly these columns, of which some are a key."""
+    with named(path):
+        rows = csv_rows(read_regular(path, MOST_BYTES_OF_A_TABLE), list(columns), key)
+    return [{name: from_csv(cell) for name, cell in row.items()} for row in rows]
 
 
 def _config(path: Path) -> dict[str, Any]:
     """Return the configuration of all runs."""
-    try:
-        config = yaml.safe_load(read_regular(path, MOST_BYTES_OF_A_CONFIGURATION))
-    except (yaml.YAMLError, RecursionError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} must be YAML: {' '.join(str(error).split())}") from None
+    with named(path):
+        config = yaml_value(read_regular(path, MOST_BYTES_OF_A_CONFIGURATION))
     plain = isinstance(config, dict) and is_shallow(config, MAX_NESTING)
     require((plain, f"{path} must hold settings by name, got {config!r:.80}"))
     require(("seed" not in config, f"{path} must leave out the seed, which {RUNS} lists"))
@@ -316,8 +303,10 @@ def _versions(path: Path) -> dict[str, str]:
     """Return what ``versions.txt`` says, by names."""
     lines = read_regular(path, MOST_BYTES_OF_A_CONFIGURATION).decode("utf-8", "replace").splitlines()
     pairs = {name: version for name, _, version in (line.removeprefix("# ").partition("==") for line in lines)}
+    once = len(pairs) == len(lines)
     wrong = [name for name, version in pairs.items() if not version]
     require(
+        (once, f"{path} has a name twice: leave one out"),
         (not wrong, f"{path} must have lines such as torch==2.9.0, got {wrong[:1]!r:.80}"),
         (MACHINE in pairs, f"{path} must have a line # {MACHINE}==KIND, of the machine that computed {METRICS}"),
     )
@@ -360,15 +349,8 @@ def read_log(path: Path) -> RunLog:
         ValueError: if it is no log, or larger than a log may be.
         OSError: if it cannot be read.
     """
-    unpack = zlib.decompressobj(31)  # the format of gzip
-    try:
-        content = unpack.decompress(read_regular(path, MOST_BYTES), MOST_BYTES + 1)
-    except zlib.error as error:
-        raise ValueError(f"{path} is no file of gzip: {error}; restore it") from None
-    require(
-        (len(content) <= MOST_BYTES, f"{path} holds more than {MOST_BYTES:,} bytes, which a log may have"),
-        (unpack.eof or len(content) > MOST_BYTES, f"{path} ends too early: restore it"),
-    )
+    with named(path):
+        content = unpacked(read_regular(path, MOST_BYTES), MOST_BYTES)
     return RunLog.of_content(content, path)
 
 
@@ -393,8 +375,25 @@ def counted(measurement: Mapping[str, Any]) -> dict[str, Any]:
     return {**kept, "config": as_before(kept.get("config") or {})}
 
 
+def _files(path: Path) -> list[Path]:
+    """Return all files of a submission.
+
+    Raises:
+        ValueError: for links, what is no file, too large ones, and folders within too many others.
+    """
+    files, deep = files_below(path)
+    links = [str(each.relative_to(path)) for each in files if each.is_symlink()]
+    large = [str(each.relative_to(path)) for each in files if each.name and each.lstat().st_size > MOST_BYTES]
+    require(
+        (not deep, f"{path} has folders within more than {MAX_DEPTH} others: remove them"),
+        (not links, f"{path} has links, {', '.join(links[:3])}: put the files in their place"),
+        (not large, f"{path} has files of more than {MOST_BYTES:,} bytes, {', '.join(large[:3])}: remove them"),
+    )
+    return files
+
+
 def _names(path: Path) -> Iterator[str]:
     """Yield the names of all files of a submission but verifications and hidden ones, sorted."""
-    files = (each.relative_to(path) for each in path.rglob("*") if each.is_file())
+    files = (each.relative_to(path) for each in _files(path))
     shown = (each for each in files if not any(part.startswith(".") for part in each.parts))
     yield from sorted(each.as_posix() for each in shown if each.as_posix() != VERIFICATION)

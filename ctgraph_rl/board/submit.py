@@ -223,7 +223,15 @@ def _write(
 
 def _yaml(content: Mapping[str, Any]) -> str:
     """Return plain values as YAML."""
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
+    return yaml.dump(dict(content), Dumper=_WithoutAliases, sort_keys=False, allow_unicode=True, width=120)
+
+
+class _WithoutAliases(yaml.SafeDumper):
+    """Writes a value that is there twice twice."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Return that no value is named."""
+        return True
 
 
 def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> tuple[bool, str]:

@@ -14,6 +14,7 @@ from ctgraph_rl.log.escape import csv_text, markdown_text
 from ctgraph_rl.metrics.record import MASTERED
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
+from ctgraph_rl.strict import files_below
 
 MEASURES = ("learning_time", "share_learned", "final_return")
 
@@ -43,7 +44,7 @@ def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
     Raises:
         ValueError: if there is none; and see `read_collective`.
     """
-    folders = [log.parent for path in paths for log in sorted(Path(path).rglob(COLLECTIVE))]
+    folders = [log.parent for path in paths for log in files_below(Path(path), (COLLECTIVE,))[0]]
     require((bool(folders), f"no {COLLECTIVE} in or below {', '.join(map(str, paths))}: run one with exchange=l2d2c"))
     return [read_collective(folder) for folder in dict.fromkeys(folders)]
 

@@ -5,15 +5,19 @@ Runs of earlier versions have no `ctgraph_rl.log.sums.SUMS`: of theirs it is che
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
-from ctgraph_rl.log.run_log import RunLog
-from ctgraph_rl.log.sums import SUMS, TABLES, stored_sums, sum_of
+from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
+from ctgraph_rl.log.sums import SUMS, TABLES, stored_sums
+from ctgraph_rl.strict import json_value, sha256_of
+
+MOST_BYTES_OF_A_FILE = 2**33
+"""Largest file whose sum is computed: 8 GiB."""
 
 
 def damaged(run_dir: Path) -> list[str]:
@@ -26,7 +30,7 @@ def damaged(run_dir: Path) -> list[str]:
 
 def _is_same(path: Path, stored: Mapping[str, Any]) -> bool:
     there = path.is_file() and path.stat().st_size == stored.get("bytes")
-    return there and sum_of(path.read_bytes()) == stored
+    return there and sha256_of(path, MOST_BYTES_OF_A_FILE) == stored.get("sha256")
 
 
 def _is_log(path: Path) -> bool:
@@ -36,11 +40,11 @@ def _is_log(path: Path) -> bool:
 
 
 def _is_json(path: Path) -> bool:
-    return isinstance(json.loads(path.read_bytes()), dict)
+    return isinstance(json_value(read_regular(path, MOST_BYTES)), dict)
 
 
 def _ends_with_a_line(path: Path) -> bool:
-    return path.read_bytes().endswith(b"\n")
+    return read_regular(path, MOST_BYTES).endswith(b"\n")
 
 
 _CHECKS: dict[str, Callable[[Path], bool]] = {

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ctgraph_rl.checks import LARGEST_INT, is_int, is_real, is_shallow, require
+from ctgraph_rl.strict import MAX_NESTING, json_value
 
 MOST = 10**6
 """Largest number of a block or task: tables are as long."""
 
 MOST_FRAMES = 2**63 - 1
 
-MAX_NESTING = 32
-"""Most objects and lists within each other; a configuration has 5 or so."""
+LARGEST = 1e100
+"""Largest number that is measured: sums of squares of such numbers are finite."""
 
 
 def _is_number(value: object) -> bool:
-    return value is None or is_real(value)
+    return value is None or is_real(value, -LARGEST, LARGEST)
 
 
 def _is_text(value: object) -> bool:
@@ -41,6 +41,20 @@ def _are_sources(value: object) -> bool:
     return all(each is None or isinstance(each, str) for each in values)
 
 
+def _are_seeds(value: object) -> bool:
+    """Whether it lists the seeds of a group."""
+    return value is None or (isinstance(value, list) and all(is_int(seed) for seed in value))
+
+
+def _are_experts(value: object) -> bool:
+    """Whether it says of each single-task expert at least its task."""
+    each = value if isinstance(value, list) else [None]
+    return all(
+        isinstance(one, Mapping) and is_int(one.get("task"), 1, MOST) and _are_seeds(one.get("together"))
+        for one in each
+    )
+
+
 RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "kind": (_is_text, "a text"),
     "schema": (is_int, "an integer"),
@@ -48,14 +62,20 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "trained": (_are_blocks, f"lists of numbers of tasks in 1..{MOST:,}"),
     "tasks": (_are_texts, "a list of texts"),
     "numbers": (is_int, "an integer"),
-    "sources": (_are_sources, "an object of texts"),
+    **dict.fromkeys(("sources", "versions"), (_are_sources, "an object of texts")),
+    "together": (_are_seeds, "a list of seeds"),
+    "experts": (
+        _are_experts,
+        "a list of objects with a task and, where seeds were trained together, the list of those",
+    ),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
     "task": (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}"),
     "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),
     "held_out": (lambda value: isinstance(value, bool), "true or false"),
     **dict.fromkeys(("moment", "label"), (_is_text, "a text")),
     **dict.fromkeys(
-        ("seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"), (_is_number, "a number")
+        ("seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"),
+        (_is_number, f"a number of at most {LARGEST:g}"),
     ),
 }
 """Rules for the fields of a measurement."""
@@ -70,10 +90,7 @@ def parsed(line: bytes) -> dict[str, Any]:
     Raises:
         ValueError: for what is no object with a ``kind``, as the torn last line of a run that was killed.
     """
-    try:
-        measurement = json.loads(line)
-    except RecursionError:
-        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
+    measurement = json_value(line, finite=False)  # settings may be infinite
     if not (isinstance(measurement, dict) and "kind" in measurement):
         raise ValueError(f"a measurement is an object with a kind, got {line!r:.80}")
     return measurement

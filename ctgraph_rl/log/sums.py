@@ -15,6 +15,7 @@ from uuid import uuid4
 
 from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
+from ctgraph_rl.strict import json_value
 
 SUMS = "sums.json"
 """The file with the sums."""
@@ -51,9 +52,9 @@ def is_complete(run_dir: Path) -> bool:
 def stored_sums(run_dir: Path) -> Mapping[str, Mapping[str, Any]]:
     """Return the stored sum of each file, none where they cannot be read."""
     try:
-        files = json.loads(read_regular(run_dir / SUMS, MOST_BYTES_OF_SUMS))["files"]
+        files = json_value(read_regular(run_dir / SUMS, MOST_BYTES_OF_SUMS))["files"]
         ours = METRICS in files and all(name in RESULTS and isinstance(files[name], dict) for name in files)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
     return files if ours else {}
 

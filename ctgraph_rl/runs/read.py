@@ -19,10 +19,11 @@ from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
+from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of, metrics_of
 from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
+from ctgraph_rl.strict import files_below, one_line_of, too_deep
 
 MODIFIED = " (modified)"
 """Ending of the name of a curriculum that differs from the published one of this name."""
@@ -138,21 +139,23 @@ def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
     found, problems = [], []
     refused: dict[Path, Path] = {}
     for path in paths:
-        logs = sorted(Path(path).rglob(LOG))
-        marks = [mark.parent for mark in sorted(Path(path).rglob(FAILURE)) if not (mark.parent / LOG).exists()]
-        for folder in marks:
-            refused.setdefault(folder.resolve(), folder)
-        if not logs and not marks:
+        files, deep = files_below(Path(path), (LOG, FAILURE))
+        problems += [Problem(each, too_deep(each)) for each in deep]
+        if not files:
             problems.append(Problem(Path(path), no_run(Path(path))))
-        for log in logs:
+        for file in files:
             try:
-                found.append(read_run(log.parent))
-            except (OSError, ValueError) as error:
-                problems.append(Problem(log.parent, str(error)))
+                if file.name == LOG:
+                    run = read_run(file.parent)
+                    found.append(((*run.configuration, run.seed), run))
+                elif not (file.parent / LOG).exists():
+                    refused.setdefault(file.parent.resolve(), file.parent)
+            except Exception as error:  # a broken directory is never an end for others
+                problems.append(Problem(file.parent, one_line_of(error, file)))
     problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused.values()]
     runs: dict[tuple[Any, ...], Run] = {}
-    for run in [run for run in found if run.group[0] != EXPERT] or found:
-        twin = runs.setdefault((*run.configuration, run.seed), run)
+    for key, run in [each for each in found if each[1].group[0] != EXPERT] or found:
+        twin = runs.setdefault(key, run)
         if twin.path.resolve() != run.path.resolve():
             problems.append(Problem(run.path, f"{twin.path} and {run.path} are one run twice; the second is left out"))
     return list(runs.values()), problems
@@ -233,11 +236,9 @@ def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
         torn = ", with a torn last line" if log.torn_lines else ""
         return {}, f"{_failure(path) or 'unfinished'}{torn}"
     try:
-        metrics = json.loads(read_regular(file, MOST_BYTES_OF_METRICS))
-    except (OSError, ValueError, RecursionError) as error:
+        return metrics_of(read_regular(file, MOST_BYTES_OF_METRICS)), None
+    except (OSError, ValueError) as error:
         return {}, f"{file} cannot be read: {error}"
-    ours = isinstance(metrics, dict) and metrics and all(_is_metric(metric) for metric in metrics.values())
-    return (metrics, None) if ours else ({}, f"{file} does not hold metrics of ours")
 
 
 def _failure(path: Path) -> str | None:
@@ -248,12 +249,6 @@ def _failure(path: Path) -> str | None:
         return None
     except (OSError, ValueError) as error:
         return f"failed: {error}"
-
-
-def _is_metric(metric: Any) -> bool:
-    """Return whether it has the fields that tables show of a metric."""
-    value = metric.get("value") if isinstance(metric, dict) else ""
-    return (value is None or is_real(value)) and {"value", "definition", "undefined"} <= metric.keys()
 
 
 def _history(log: RunLog) -> History:

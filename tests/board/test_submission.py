@@ -68,7 +68,7 @@ def test_what_is_no_submission_is_refused_with_the_file(submission, file, conten
     [
         ("tiny-seed1,", "../tiny-seed1,", r"line 3: run must be a name of a file, got '../tiny-seed1'"),
         ("tiny-seed1,1,", "tiny-seed1,0,", "runs.csv has a seed twice: 0"),
-        ("tiny-seed1,1,", "tiny-seed0,1,", "runs.csv names a run twice: tiny-seed0"),
+        ("tiny-seed1,1,", "tiny-seed0,1,", "runs.csv lines 2 and 3 are both of tiny-seed0"),
         ("tiny-seed1,1,", "tiny-seed1,x,", "line 3: seed must be an integer >= 0, got 'x'"),
         (",{seconds}", "," + 400 * "9", r"line 2: seconds must be a number in 0..1,000,000,000, got '9999"),
         (",{seconds}", ",1000000000.1", r"line 2: seconds must be a number in 0..1,000,000,000, got '1000000000.1'"),

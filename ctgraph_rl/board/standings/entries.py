@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,6 +19,7 @@ from ctgraph_rl.disk import read_regular
 from ctgraph_rl.report.bounds import bounds_of_curriculum
 from ctgraph_rl.report.intervals import Bounds, within_bounds
 from ctgraph_rl.runs.read import Problem
+from ctgraph_rl.strict import files_below, json_value, one_line_of, too_deep
 
 LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 """How far a submission was verified, in rising order; ``failed``: a verification found a difference."""
@@ -27,7 +27,7 @@ LEVELS = ("failed", "submitted", "rescored", "rerun", "held_out")
 OF_FILES = {"none": "failed", **{level: level for level in LEVELS[2:]}}
 """Levels by the names that ``verification.json`` gives them."""
 
-NUMBER = re.compile(r"-?\d+(\.\d+)?(e[+-]?\d+)?")
+NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
 """A value in ``metrics.csv``."""
 
 MOST_BYTES = 2**24
@@ -128,14 +128,16 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
     found: dict[str, Entry] = {}
     problems = []
     for path in map(Path, paths):
-        folders = sorted(file.parent for file in path.rglob(METHOD) if (file.parent / RUNS).is_file())
+        files, deep = files_below(path, (METHOD,))
+        folders = [file.parent for file in files if (file.parent / RUNS).is_file()]
+        problems += [Problem(each, too_deep(each)) for each in deep]
         if not folders:
             problems.append(Problem(path, f"{path} holds no submission: ctgraph-rl submit RUNS --to DIR makes one"))
         for folder in folders:
             try:
                 entry = entry_of(read_submission(folder, config_dir=config_dir))
-            except (OSError, ValueError) as error:
-                problems.append(Problem(folder, f"{folder}: {error}"))
+            except Exception as error:  # a broken submission is never an end for others
+                problems.append(Problem(folder, f"{folder}: {one_line_of(error, folder)}"))
                 continue
             twin = found.setdefault(entry.digest, entry)
             if twin.folder.resolve() != folder.resolve():
@@ -206,8 +208,8 @@ def verification_of(submission: Submission) -> Verification:
     if not path.is_file():
         return Verification("submitted")
     try:
-        found = _plain(json.loads(read_regular(path, MOST_BYTES)))
-    except (OSError, ValueError, RecursionError) as error:
+        found = _plain(json_value(read_regular(path, MOST_BYTES)))
+    except (OSError, ValueError) as error:
         why = f"{VERIFICATION} counts for nothing, {error}; verify the submission again"
         return Verification("submitted", why_none=why)
     if found["digest"] != submission.digest:
@@ -242,7 +244,8 @@ def _checks(found: Any) -> list[Check] | None:
     checks = [Check(*(each.get(name, "") for name in Check._fields)) for each in found]
     fit = all(each.passed is None or isinstance(each.passed, bool) for each in checks)
     texts = [getattr(each, name) for each in checks for name in Check._fields if name != "passed"]
-    return checks if fit and all(isinstance(text, str) for text in texts) else None
+    known = all(set(each) <= {*Check._fields} for each in found)
+    return checks if fit and known and all(isinstance(text, str) for text in texts) else None
 
 
 def shown_level(level: str) -> str:

@@ -1,0 +1,342 @@
+"""Readers of files that strangers wrote: one for each format, which takes what has one meaning and refuses the rest.
+
+What two programs could read as two things is refused, such as a key that is there twice, and so is what would take more
+memory or time than its file says. Every error is a ``ValueError`` of one line.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import stat
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctgraph_rl.checks import is_shallow, require
+
+MAX_NESTING = 32
+"""Most objects and lists within each other."""
+
+LONGEST_NUMBER = 40
+"""Digits of an integer."""
+
+LONG_NUMBER = re.compile("[0-9]" * (LONGEST_NUMBER + 1))
+
+MAX_DEPTH = 32
+"""Folders within each other in which files are looked for."""
+
+LONGEST_CELL = 2**16
+"""Bytes of a text in a Parquet file."""
+
+BYTES_PER_CELL, LEAST_TABLE = 64, 2**20
+"""Largest Parquet file, for each cell that it should have, and for a file of any size."""
+
+CODECS = ("SNAPPY", "UNCOMPRESSED")
+"""Compressions of Parquet files: none makes more than some twenty times its size."""
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name a file in errors about what it holds."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path} {error}") from None
+
+
+def json_value(content: bytes, finite: bool = True) -> Any:
+    """Return the value of a JSON text in UTF-8.
+
+    Args:
+        content: the text.
+        finite: whether NaN and infinity are refused, which Python writes and JSON does not have.
+
+    Raises:
+        ValueError: for what is no JSON, a key that is twice in an object, an integer of too many digits, too many
+            objects and lists within each other.
+    """
+    text = content.decode("utf-8")
+    own: dict[str, Any] = {"parse_int": _integer} if LONG_NUMBER.search(text) else {}
+    own |= {"parse_constant": _no_number, "parse_float": _real} if finite else {}
+    try:
+        value = json.loads(text, object_pairs_hook=_unique, **own)
+    except RecursionError:
+        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
+    require((is_shallow(value, MAX_NESTING), f"nested more than {MAX_NESTING} deep"))
+    return value
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object; refuse one that has a key twice."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"key {next(key for key in keys if keys.count(key) > 1)!r:.80} occurs twice in one object")
+    return found
+
+
+def _integer(digits: str) -> int:
+    require(
+        (len(digits) <= LONGEST_NUMBER + 1, f"an integer has {len(digits):,} digits, the limit is {LONGEST_NUMBER}")
+    )
+    return int(digits)
+
+
+def _real(digits: str) -> float:
+    value = float(digits)
+    require((math.isfinite(value), f"{digits:.80} is beyond what a float64 holds"))
+    return value
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+class _Plain(yaml.SafeLoader):
+    """Reads plain values: no aliases, no numbers of other bases, no dates, no key twice."""
+
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse what stands for something else, and too deep values, before they are made."""
+        event = self.peek_event()
+        require(
+            (not isinstance(event, yaml.AliasEvent), "aliases (*name) are not read: write the value in its place"),
+            (getattr(event, "anchor", None) is None, "anchors (&name) are not read: leave them out"),
+            (self.depth < MAX_NESTING, f"nested more than {MAX_NESTING} deep"),
+        )
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Return the values by keys."""
+        found: dict[Any, Any] = {}
+        for key_node, value_node in node.value:
+            require((isinstance(key_node, yaml.ScalarNode), "a key must be a text or a number"))
+            key = self.construct_object(key_node)
+            require((key not in found, f"key {key!r:.80} occurs twice"))
+            found[key] = self.construct_object(value_node, deep=True)
+        return found
+
+    def construct_number(self, node: Any) -> Any:
+        """Return an integer or a float in decimal digits."""
+        text = self.construct_scalar(node)
+        shown = f"{text:.40} is read as a number by some programs alone: put it in quotes, or write decimal digits"
+        require(
+            (NUMBER.fullmatch(text) is not None, shown), (LONG_NUMBER.search(text) is None, f"{text:.40}: too long")
+        )
+        is_whole = node.tag.endswith(":int")
+        return int(text) if is_whole else float(text.replace(".inf", "inf").replace(".nan", "nan"))
+
+
+NUMBER = re.compile(r"[-+]?(0|[1-9][0-9]*|[0-9]+\.[0-9]*([eE][-+]?[0-9]+)?|\.[0-9]+([eE][-+]?[0-9]+)?|\.inf)|\.nan")
+
+TAGS = ("null", "bool", "str", "seq", "map")
+
+_Plain.yaml_constructors = {
+    **{f"tag:yaml.org,2002:{name}": yaml.SafeLoader.yaml_constructors[f"tag:yaml.org,2002:{name}"] for name in TAGS},
+    **dict.fromkeys(("tag:yaml.org,2002:int", "tag:yaml.org,2002:float"), _Plain.construct_number),
+    None: yaml.SafeLoader.yaml_constructors[None],
+}
+
+
+def yaml_value(content: bytes) -> Any:
+    """Return the value of a YAML text in UTF-8.
+
+    Raises:
+        ValueError: for what is no YAML of plain values, aliases, and a key that is there twice.
+    """
+    try:
+        return yaml.load(content.decode("utf-8"), Loader=_Plain)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"must be YAML: {' '.join(str(error).split())}") from None
+
+
+def csv_rows(content: bytes, columns: Sequence[str], key: Sequence[str]) -> list[dict[str, str]]:
+    """Return the rows of a CSV text in UTF-8 with exactly these columns.
+
+    Args:
+        content: the text.
+        columns: names, in order.
+        key: columns whose cells together are in one row alone.
+
+    Raises:
+        ValueError: for other columns, a row of another width, and two rows of one key.
+    """
+    try:
+        rows = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
+    except csv.Error as error:
+        raise ValueError(f"must be CSV: {error}") from None
+    header = rows[0] if rows else []
+    require((header == list(columns), f"must have the columns {', '.join(columns)}, got {', '.join(header):.200}"))
+    wrong = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
+    require((wrong is None, f"must have {len(columns)} cells in every line, line {wrong} has others"))
+    found = [dict(zip(columns, row, strict=True)) for row in rows[1:]]
+    lines: dict[tuple[str, ...], int] = {}
+    for number, row in enumerate(found, 2):
+        first = lines.setdefault(tuple(row[name] for name in key), number)
+        same = f"lines {first} and {number} are both of {', '.join(row[name] for name in key):.200}"
+        require((first == number, f"{same}: leave one out"))
+    return found
+
+
+def unpacked(content: bytes, most: int) -> bytes:
+    """Return what a file of gzip holds.
+
+    Raises:
+        ValueError: for what is none, more than ``most`` bytes, a torn file, and what follows its end.
+    """
+    unpack = zlib.decompressobj(31)  # the format of gzip
+    try:
+        found = unpack.decompress(content, most + 1)
+    except zlib.error as error:
+        raise ValueError(f"is no file of gzip: {error}; restore it") from None
+    require((len(found) <= most, f"holds more than {most:,} bytes, the limit"))
+    require(
+        (unpack.eof, "ends too early: restore it"),
+        (not unpack.unused_data, "has more after its end, which programs read or leave out: restore it"),
+    )
+    return found
+
+
+def parquet_rows(content: bytes, like: bytes) -> list[dict[str, Any]]:
+    """Return the rows of a Parquet file that should be as another one; nothing is unpacked before its form is known.
+
+    Args:
+        content: the file.
+        like: one with the same columns and as many rows.
+
+    Raises:
+        ValueError: for what is none, other columns, more rows, and texts of more than `LONGEST_CELL` bytes.
+    """
+    from pyarrow import ArrowException, BufferReader, parquet
+
+    wanted = parquet.ParquetFile(BufferReader(like))
+    cells = wanted.metadata.num_rows * wanted.metadata.num_columns
+    most = LEAST_TABLE + BYTES_PER_CELL * cells
+    require((len(content) <= most, f"it has {len(content):,} bytes, {most:,} are enough for its rows"))
+    texts = [field.name for field in wanted.schema_arrow if str(field.type) == "string"]
+    try:
+        _check_table(parquet.read_metadata(BufferReader(content)), wanted.metadata)
+        table = parquet.ParquetFile(BufferReader(content), read_dictionary=texts).read()
+    except (ArrowException, OSError, OverflowError, MemoryError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
+    for name in texts:
+        for chunk in table.column(name).chunks:
+            longest = max((len(text) for text in chunk.dictionary.to_pylist() if text is not None), default=0)
+            require((longest <= LONGEST_CELL, f"a text in {name} has {longest:,} bytes, the limit is {LONGEST_CELL:,}"))
+    return table.to_pylist()
+
+
+def _check_table(given: Any, wanted: Any) -> None:
+    """Refuse a Parquet file of another form than was wanted, by what it says of itself."""
+    rows = given.num_rows
+    require((rows <= wanted.num_rows, f"it has {rows:,} rows, the logs give {wanted.num_rows:,}"))
+    columns, known = ([_form(each.schema.column(i)) for i in range(each.num_columns)] for each in (given, wanted))
+    require((columns == known, f"it has the columns {_listed(columns)}, the logs give {_listed(known)}"))
+    groups = [given.row_group(number) for number in range(min(given.num_row_groups, rows + 1))]
+    parts = [group.column(i) for group in groups for i in range(group.num_columns)]
+    require(
+        (given.num_row_groups <= rows + 1, f"it has {given.num_row_groups:,} groups of {rows:,} rows"),
+        (sum(group.num_rows for group in groups) == rows, "its groups have other numbers of rows than it says"),
+        (all(part.compression in CODECS for part in parts), f"its compression must be one of {', '.join(CODECS)}"),
+        (all(0 <= part.num_values <= rows for part in parts), "a column has other numbers of values than it has rows"),
+    )
+
+
+def _form(column: Any) -> tuple[str, str, str, int]:
+    """Return the name and the type of a column; that of a list has a longer path and deeper levels."""
+    return column.path, column.physical_type, str(column.logical_type), column.max_repetition_level
+
+
+def _listed(columns: Sequence[tuple[str, str, str, int]]) -> str:
+    return f"{', '.join(f'{path} {kind}' for path, kind, _, _ in columns):.200}"
+
+
+def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[Path]]:
+    """Return the files in or below a folder, sorted, and the folders that are too deep to look into.
+
+    Links to folders are not followed, and count as files.
+
+    Args:
+        folder: need not exist.
+        names: of the files; empty for all.
+    """
+    files, deep = [], []
+    waiting = [(folder, 0)]
+    while waiting:
+        where, depth = waiting.pop()
+        for entry in _entries(where):
+            if entry.is_dir(follow_symlinks=False):
+                if depth + 1 < MAX_DEPTH:
+                    waiting.append((where / entry.name, depth + 1))
+                else:
+                    deep.append(where / entry.name)
+            elif not names or entry.name in names:
+                files.append(where / entry.name)
+    return sorted(files), sorted(deep)
+
+
+def one_line_of(error: Exception, file: Path) -> str:
+    """Return why something cannot be read, in one line; of an error that no rule foresees, also its kind."""
+    foreseen = isinstance(error, (OSError, ValueError)) and not isinstance(error, UnicodeError)
+    said = " ".join(str(error).split())
+    return said if foreseen else f"{file} cannot be read ({type(error).__name__}: {said:.200})"
+
+
+def too_deep(folder: Path) -> str:
+    """Return why nothing is looked for in a folder."""
+    return f"{folder} is more than {MAX_DEPTH} folders deep, and is not looked into: name it, or one above it"
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    """Return what is in a folder; nothing where it cannot be read."""
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except OSError:
+        return []
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of a regular file.
+
+    Raises:
+        ValueError: for what is no regular file.
+    """
+    found = path.lstat()
+    require((stat.S_ISREG(found.st_mode), f"{path} must be a regular file"))
+    return found.st_size
+
+
+def blocks_of(path: Path, most: int) -> Iterator[bytes]:
+    """Yield the content of a regular file in parts.
+
+    Raises:
+        ValueError: for one of more than ``most`` bytes.
+    """
+    size = size_of(path)
+    require((size <= most, f"{path} has {size:,} bytes, the limit is {most:,}"))
+    with path.open("rb") as file:
+        while part := file.read(2**20):
+            yield part
+
+
+def sha256_of(path: Path, most: int) -> str:
+    """Return the SHA-256 of a regular file of at most ``most`` bytes, which is not read into memory as a whole."""
+    found = hashlib.sha256()
+    for part in blocks_of(path, most):
+        found.update(part)
+    return found.hexdigest()
