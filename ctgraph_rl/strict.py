@@ -1,4 +1,4 @@
-"""Readers of files that strangers wrote: one for each format, which takes what has one meaning and refuses the rest.
+"""Readers of files of other people: one for each format, which takes what has one meaning and refuses the rest.
 
 What two programs could read as two things is refused, such as a key that is there twice, and so is what would take more
 memory or time than its file says. Every error is a ``ValueError`` of one line.

@@ -37,6 +37,7 @@ OF_RUNS = (
     "the code has changed since the runs",
     "no agent can be built",
     "this runs the code of others",
+    "the code of others is not run",
     "the runs have numbers version",
     "... had 8 threads",
 )
