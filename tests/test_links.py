@@ -38,6 +38,7 @@ ALLOWED = {
     ("baselines._startup", "TemporaryDirectory"): "a new folder",
     ("ctgraph_rl.benchmark.sizes", "TemporaryDirectory"): "a folder of its own",
     ("ctgraph_rl.board.isolate", "os.open"): "reads a folder",
+    ("ctgraph_rl.board.submit", "yaml.dump"): "into a text",
     ("ctgraph_rl.board.relearn", "run_dir.mkdir"): "in the folder of a process",
     ("ctgraph_rl.core.kernel", "folder.mkdir"): "the user's own cache, which no other can write to",
     ("ctgraph_rl.core.kernel", "tempfile.TemporaryDirectory"): "as above",

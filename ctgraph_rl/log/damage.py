@@ -10,8 +10,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG, METRICS
+from ctgraph_rl.log.measurement import LARGEST
 from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.sums import SUMS, TABLES, stored_sums
 from ctgraph_rl.strict import json_value, sha256_of
@@ -59,3 +61,23 @@ def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
         return path.is_file() and check(path) if path.exists() or path.name == LOG else True
     except (OSError, ValueError, RecursionError):
         return False
+
+
+def metrics_of(content: bytes) -> dict[str, Any]:
+    """Return what `metrics_text` has written, as plain values by name.
+
+    Raises:
+        ValueError: for what are no metrics.
+    """
+    found = json_value(content)
+    ours = isinstance(found, dict) and bool(found) and all(map(_is_metric, found.values()))
+    require((ours, "it does not hold metrics of ours"))
+    return found
+
+
+def _is_metric(metric: Any) -> bool:
+    """Return whether it has the fields that tables show of a metric."""
+    if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
+        return False
+    number = metric["value"] is None or is_real(metric["value"], -LARGEST, LARGEST)
+    return number and isinstance(metric["definition"], str) and isinstance(metric["undefined"], str | None)

@@ -34,12 +34,11 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_path, is_real, require
+from ctgraph_rl.checks import as_path, require
 from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
-from ctgraph_rl.log.measurement import LARGEST, check, parsed
+from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable
-from ctgraph_rl.strict import json_value
 
 MOST_CELLS = 10**7
 """Largest table that is made of a log."""
@@ -401,23 +400,3 @@ def metrics_text(metrics: Mapping[str, Any]) -> bytes:
     """Return the content of a file of metrics."""
     content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
     return (json.dumps(content, indent=2) + "\n").encode()
-
-
-def metrics_of(content: bytes) -> dict[str, Any]:
-    """Return what `metrics_text` has written, as plain values by name.
-
-    Raises:
-        ValueError: for what are no metrics.
-    """
-    found = json_value(content)
-    ours = isinstance(found, dict) and bool(found) and all(map(_is_metric, found.values()))
-    require((ours, "it does not hold metrics of ours"))
-    return found
-
-
-def _is_metric(metric: Any) -> bool:
-    """Return whether it has the fields that tables show of a metric."""
-    if not (isinstance(metric, dict) and {"value", "definition", "undefined"} <= metric.keys()):
-        return False
-    number = metric["value"] is None or is_real(metric["value"], -LARGEST, LARGEST)
-    return number and isinstance(metric["definition"], str) and isinstance(metric["undefined"], str | None)

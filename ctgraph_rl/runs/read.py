@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.labels import Span, label_spans
+from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
-from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of, metrics_of
+from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
 from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from ctgraph_rl import strict
-from ctgraph_rl.log.run_log import RunLog, metrics_of
+from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.run_log import RunLog
 
 LINE = b'{"kind": "run", "curriculum": "a", "config": {"seed": 0}}\n'
 

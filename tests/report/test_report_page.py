@@ -334,8 +334,14 @@ FAULTS = [
     (middle, "run.jsonl: line 4 is no measurement"),
     (torn, "unfinished, with a torn last line"),
     (lambda run: (run / "metrics.json").write_text('{"a": 1'), "metrics.json cannot be read: "),
-    (lambda run: (run / "metrics.json").write_text('{"a": 1}'), "metrics.json does not hold metrics of ours"),
-    (lambda run: (run / "metrics.json").write_text("[]"), "metrics.json does not hold metrics of ours"),
+    (
+        lambda run: (run / "metrics.json").write_text('{"a": 1}'),
+        "metrics.json cannot be read: it does not hold metrics of ours",
+    ),
+    (
+        lambda run: (run / "metrics.json").write_text("[]"),
+        "metrics.json cannot be read: it does not hold metrics of ours",
+    ),
 ]
 
 
