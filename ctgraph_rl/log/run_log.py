@@ -178,16 +178,14 @@ class RunLog:
     @classmethod
     def of_content(cls, content: bytes, path: Path | str) -> RunLog:
         """Return the log whose file has this content; see `read`. Errors name ``path``."""
-        log = cls()
-        log._num_bytes = len(content)
-        most = FEW + len(content) // BYTES_OF_A_NUMBER
         *lines, last = content.split(b"\n")
+        log, most = cls(), FEW + len(content) // BYTES_OF_A_NUMBER
+        log._num_bytes = len(content)
         for number, line in enumerate(lines, 1):
             try:
                 log.measurements.append(parsed(line))
             except ValueError as error:
-                why = f"{path}: line {number} is no measurement; restore the file ({error})"
-                raise ValueError(why) from None
+                raise ValueError(f"{path}: line {number} is no measurement; restore the file ({error})") from None
         if last:  # without an end: the run was killed while it wrote
             try:
                 log.measurements.append(parsed(last))
