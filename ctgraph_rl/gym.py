@@ -173,7 +173,9 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         **changes: Any,
     ) -> None:
         within = f"num_envs must be an integer in 1..{MOST_ROWS}, got {num_envs!r:.80}"
-        require((is_int(num_envs, 1, MOST_ROWS), within))
+        limit = changes.get("max_episode_steps")
+        whole = f'this batch truncates no episode, got max_episode_steps={limit!r:.80}; vectorization_mode="sync" does'
+        require((is_int(num_envs, 1, MOST_ROWS), within), ("max_episode_steps" not in changes, whole))
         rows = as_tuple(task)
         given = rows if isinstance(rows, tuple) else (task,)
         require((len(given) in (1, num_envs), f"task must be one, or one per row of {num_envs}, got {len(given)}"))

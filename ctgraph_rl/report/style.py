@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
+from ctgraph_rl.visualize.style import import_matplotlib
 
 STYLE = Path(__file__).with_name("style.mplstyle")
 
@@ -33,7 +34,10 @@ def require_packages() -> None:
     """
     for name in PACKAGES:
         try:
-            import_module(name)
+            if name == "matplotlib":
+                import_matplotlib()
+            else:
+                import_module(name)
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(f"the report needs {name}: pip install 'ctgraph_rl[report]'") from error
 

@@ -6,6 +6,8 @@ A grey print and any colour vision keep the kinds apart.
 from __future__ import annotations
 
 import io
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,25 @@ MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", St
 Point = tuple[float, float]
 
 
+def import_matplotlib() -> None:
+    """Import matplotlib, also where MPLBACKEND names a backend that is not there: figures of this package use none.
+
+    Raises:
+        ModuleNotFoundError: without matplotlib.
+    """
+    backend = os.environ.get("MPLBACKEND")
+    try:
+        import matplotlib
+    except ValueError:
+        os.environ.pop("MPLBACKEND", None)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+            del sys.modules[name]  # half imported
+        try:
+            import matplotlib  # noqa: F401
+        finally:
+            os.environ.update({} if backend is None else {"MPLBACKEND": backend})
+
+
 def new_figure(width: float, height: float) -> Any:
     """Return an empty figure, sizes in inches.
 
@@ -30,9 +51,11 @@ def new_figure(width: float, height: float) -> Any:
         ModuleNotFoundError: without matplotlib; names the extra to install.
     """
     try:
-        from matplotlib.figure import Figure
+        import_matplotlib()
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("figures need matplotlib: pip install 'ctgraph_rl[plot]'") from error
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 

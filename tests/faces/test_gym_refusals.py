@@ -168,3 +168,13 @@ def test_tasks_outside_of_the_pool_and_of_another_number_are_refused():
         CTGraphVectorEnv(0)
     with pytest.raises(ValueError, match=r"num_envs must be an integer in 1\.\.16777216, got 1000"):
         CTGraphVectorEnv(10**200)
+
+
+def test_a_batch_truncates_no_episode_and_says_which_mode_does():
+    with pytest.raises(ValueError, match='truncates no episode, got max_episode_steps=5; vectorization_mode="sync"'):
+        gymnasium.make_vec("ctgraph/CTGraph-v0", num_envs=2, max_episode_steps=5)
+
+    env = gymnasium.make_vec("ctgraph/CTGraph-v0", num_envs=2, vectorization_mode="sync", max_episode_steps=2)
+    env.reset(seed=0)
+    env.step(np.array([0, 0]))
+    assert env.step(np.array([0, 0]))[3].any()

@@ -1,8 +1,10 @@
 """Pictures of tasks, the command that makes them, and the page that shows them."""
 
 import json
+import os
 import re
 import shlex
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -319,3 +321,17 @@ def test_the_pages_pictures_are_made_by_its_commands_and_small():
     stored = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}
     assert set(shown) == set(stored) <= set(made)
     assert max(stored.values()) < 60_000
+
+
+def test_a_backend_that_is_not_there_matters_to_no_figure(tmp_path):
+    program = (
+        "import os, sys\nfrom ctgraph_rl.report.style import new_figure, require_packages, style\n"
+        "require_packages()\nwith style():\n    new_figure(1, 1).savefig(sys.argv[1])\n"
+        "assert os.environ['MPLBACKEND'] == 'nonsense'"
+    )
+    env = {**os.environ, "MPLBACKEND": "nonsense"}
+
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.png")], capture_output=True, env=env)
+
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.png").stat().st_size > 0
