@@ -270,7 +270,7 @@ def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictCon
 
 @contextmanager
 def _hydra_of_its_own() -> Iterator[None]:
-    """Let Hydra begin anew, in one thread at a time, and put back what it was.
+    """Let Hydra start from nothing, in one thread at a time, and put back what it was.
 
     A program's own Hydra then keeps its ``version_base`` and the name of its job, on which the directories of its
     further jobs depend, and its resolvers.
