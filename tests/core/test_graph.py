@@ -48,13 +48,13 @@ def test_a_branching_factor_too_large_for_int64_is_refused():
         CTGraph(2**62, 1)
 
 
-@pytest.mark.parametrize("depth", [0, -1, True, 2.0, "2", None])
+@pytest.mark.parametrize("depth", [0, -1, True, 2.5, "2", None])
 def test_a_depth_that_is_not_a_positive_integer_is_refused(depth):
     with pytest.raises(ValueError, match=f"depth must be an integer >= 1, got {depth!r}"):
         CTGraph(2, depth)
 
 
-@pytest.mark.parametrize("branching_factor", [1, 0, -2, True, 2.0, None])
+@pytest.mark.parametrize("branching_factor", [1, 0, -2, True, 2.5, None])
 def test_a_branching_factor_below_two_is_refused(branching_factor):
     with pytest.raises(ValueError, match=f"branching_factor must be an integer >= 2, got {branching_factor!r}"):
         CTGraph(branching_factor, 2)

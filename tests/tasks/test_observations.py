@@ -236,7 +236,7 @@ def test_paper_images_have_their_size(size):
     assert images.images.dtype == torch.uint8
 
 
-@pytest.mark.parametrize("size", [0, -4, 6, 13, 12.0, True])
+@pytest.mark.parametrize("size", [0, -4, 6, 13, 12.5, True])
 def test_a_size_that_is_not_a_multiple_of_four_is_refused(size):
     with pytest.raises(ValueError, match=f"size must be a positive multiple of 4, got {size!r}"):
         PaperImages(5, size=size)

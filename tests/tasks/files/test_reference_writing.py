@@ -84,7 +84,7 @@ def test_the_written_file_holds_the_content_and_can_be_read(tmp_path):
     assert Task.from_json(path, goal=(2, 1)) == task
 
 
-@pytest.mark.parametrize("general_seed", [-1, 2**32, 1.0, None])
+@pytest.mark.parametrize("general_seed", [-1, 2**32, 1.5, None])
 def test_a_general_seed_out_of_range_is_refused(general_seed):
     with pytest.raises(ValueError, match=r"general_seed must be in \[0, 2\*\*32\), got"):
         Task.from_json(SHIPPED_2023, goal=(1, 1)).to_json(general_seed=general_seed)
