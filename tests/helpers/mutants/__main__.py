@@ -39,6 +39,9 @@ def main() -> None:
     trial.import_third_party()
     with tempfile.TemporaryDirectory() as folder:
         copy = trial.copy_checkout(Path(folder))
+        broken = trial.first_failure(copy, sorted({mutant.killer for mutant in mutants if mutant.killer}))
+        if broken != "":
+            sys.exit(f"{broken or 'the killers'} cannot run or fails without any mutant: mend that first")
         for number, mutant in enumerate(mutants):
             if given.only in mutant.path and not (given.alive and mutant.killer):
                 mutants[number] = replace(mutant, killer=killer_of(copy, mutant, given.near))
