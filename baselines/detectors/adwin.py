@@ -16,7 +16,7 @@ from torch import Tensor
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
-from ctgraph_rl.checks import at_least_one, is_int, is_real, require
+from ctgraph_rl.checks import LARGEST_INT, at_least_one, is_int, is_real, require
 
 
 class Returns(NamedTuple):
@@ -68,7 +68,10 @@ class ADWIN(Detector):
             (is_real(delta, 0, 1) and 0 < delta < 1, f"delta must be in (0, 1), got {delta!r}"),
             *at_least_one(clock=clock, max_buckets=max_buckets, min_window_length=min_window_length),
             *at_least_one(num_trial_episodes=num_trial_episodes),
-            (is_int(grace_period, 0), f"grace_period must be an integer >= 0, got {grace_period!r}"),
+            (
+                is_int(grace_period, 0, LARGEST_INT),
+                f"grace_period must be an integer in [0, 2**63), got {grace_period!r}",
+            ),
         )
         self.delta, self.num_trial_episodes = delta, num_trial_episodes
         make = _river_adwin()

@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from baselines.detectors.seen import Seen, Verdict
 from baselines.methods.self_labelled import SelfLabelled
-from ctgraph_rl.checks import TakesNumbers, at_least_one, is_int, require
+from ctgraph_rl.checks import TakesNumbers, at_least_one, at_most, is_int, require
 
 if TYPE_CHECKING:
     from ctgraph_rl.agent import Method
     from ctgraph_rl.tasks.curriculum import Curriculum
+
+
+MOST_LABELS = 2**20
+"""As many as there may be task ids; each has room of its own."""
 
 
 class Detector(TakesNumbers):
@@ -41,6 +45,7 @@ class Detector(TakesNumbers):
         labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)
         require(
             (labels, f"max_labels must be an integer >= 1, got {'null' if max_labels is None else repr(max_labels)}"),
+            *at_most(MOST_LABELS, max_labels=max_labels),
             *at_least_one(patience=patience),
             *(() if snapshot_every is None else at_least_one(snapshot_every=snapshot_every)),
         )

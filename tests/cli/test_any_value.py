@@ -110,7 +110,8 @@ def settings_of(cfg: DictConfig, file: str) -> list[str]:
 
 def differs_in_kind(value: Any, usual: Any) -> bool:
     """Whether a value cannot be meant where another one is usual; null and lists may stand for what is not there."""
-    if value is None or usual is None or isinstance(usual, (list, str)) or isinstance(value, list):
+    alike = type(value) is type(usual) is bool or value is None or usual is None
+    if alike or isinstance(usual, (list, str)) or isinstance(value, list):
         return False
     numbers = (int, float)
     both = type(value) in numbers and type(usual) in numbers

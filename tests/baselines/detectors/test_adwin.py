@@ -140,7 +140,7 @@ def test_without_river_the_error_names_the_extra(monkeypatch):
         ({"delta": 0.0}, r"delta must be in \(0, 1\), got 0.0"),
         ({"delta": "x"}, r"delta must be in \(0, 1\), got 'x'"),
         ({"clock": 0, "num_trial_episodes": 0}, "clock must be an integer >= 1, got 0; num_trial_episodes must be"),
-        ({"grace_period": -1}, "grace_period must be an integer >= 0, got -1"),
+        ({"grace_period": -1}, r"grace_period must be an integer in \[0, 2\*\*63\), got -1"),
     ],
 )
 def test_a_setting_out_of_range_is_refused_by_name(changed, message):
