@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
+from inspect import unwrap
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
@@ -186,7 +187,9 @@ def is_of_this_package(name: str) -> bool:
         found = resolve_name(name)
     except (ImportError, AttributeError, ValueError):
         return False
-    made = found.func if isinstance(found, partial) else found
+    made = unwrap(found)
+    if isinstance(made, partial):
+        made = unwrap(made.func)
     return is_ours(str(getattr(made, "__module__", None)))
 
 

@@ -213,7 +213,7 @@ def test_a_users_own_switch_is_asked_with_the_last_task_and_new_words(together):
     [
         (lambda: ByEpisode(0), r"episodes must be an integer in 1..2\*\*31, got 0"),
         (lambda: ByEpisode(2**31 + 1), r"episodes must be an integer in 1..2\*\*31, got 2147483649"),
-        (lambda: ByEpisode(1.0), r"episodes must be an integer in 1..2\*\*31, got 1.0"),
+        (lambda: ByEpisode(1.5), r"episodes must be an integer in 1..2\*\*31, got 1.5"),
         (lambda: Drift(True), r"episodes must be an integer in 1..2\*\*31, got True"),
         (lambda: Drift(3, together=1), "together must be true or false, got 1"),
         (lambda: ByEpisode(3, together=None), "together must be true or false, got None"),

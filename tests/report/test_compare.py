@@ -187,10 +187,13 @@ def test_seeds_that_experts_were_trained_with_are_named_and_are_no_measurement(p
     assert code == 0 and lines[-1] == "seeds of experts trained together: different, task 1 [0, 1] and None"
 
 
-def test_an_odd_list_of_experts_is_compared_as_it_is(pair, said):
+def test_an_odd_list_of_experts_is_refused_with_its_line(pair, said):
     change(pair[0], 1, experts=[1])
 
-    assert "experts [1] and None" in said(*pair)[1][0]
+    code, lines, error = said(*pair)
+
+    assert (code, lines) == (2, [])
+    assert "run.jsonl: line 2: experts must be a list of objects with a task" in error
 
 
 def test_no_path_is_obeyed_by_a_terminal(pair, said, tmp_path):

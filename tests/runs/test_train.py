@@ -14,6 +14,7 @@ from helpers.kill_runs import differences
 from helpers.stopped_runs import LEARNED, Stopped, StopsAfter, flip_bit, learn_into, make_agent, stopped_run
 
 from ctgraph_rl import Block, RunLog
+from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.train import new_agent, train
 from ctgraph_rl.tasks.curriculum import Evaluation
@@ -42,7 +43,6 @@ def newest(run_dir: Path) -> Path:
 
 def about(monkeypatch, **changes) -> None:
     """Let the machine and versions of this process seem others."""
-    provenance = train.__globals__["provenance"]
     monkeypatch.setattr("ctgraph_rl.runs.train.provenance", lambda *given: {**provenance(*given), **changes})
 
 
