@@ -240,6 +240,11 @@ def is_plain(value: Any) -> bool:
     return value is None or isinstance(value, str | bool | int) or not math.isnan(value)
 
 
+def test_a_parquet_file_of_an_unknown_compression_is_refused_and_does_not_end_the_process():
+    with pytest.raises(ValueError, match="its compression is unknown"):
+        READERS["parquet"](mangled(table(), random.Random(1111)))
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_readers_raise_nothing_but_value_errors(name):
     check_fuzzed(name, range(50))
