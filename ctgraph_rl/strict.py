@@ -267,7 +267,7 @@ def _ends_process(look: Callable[[], object]) -> bool:
     child = os.fork()
     if child == 0:
         try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what the C++ library says as it aborts
+            os.close(2)  # to which the C++ library writes as it aborts
             look()
         finally:
             os._exit(0)
