@@ -66,10 +66,14 @@ def json_value(content: bytes, finite: bool = True) -> Any:
             objects and lists within each other.
     """
     text = content.decode("utf-8")
-    own: dict[str, Any] = {"parse_int": _integer} if LONG_NUMBER.search(text) else {}
-    own |= {"parse_constant": _no_number, "parse_float": _real} if finite else {}
     try:
-        value = json.loads(text, object_pairs_hook=_unique, **own)
+        value = json.loads(
+            text,
+            object_pairs_hook=_unique,
+            parse_int=_integer if LONG_NUMBER.search(text) else None,
+            parse_constant=_no_number if finite else None,
+            parse_float=_real if finite else None,
+        )
     except RecursionError:
         raise ValueError(f"nested more than {MAX_NESTING} deep") from None
     require((is_shallow(value, MAX_NESTING), f"nested more than {MAX_NESTING} deep"))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 MOST_LABELS = 2**20
-"""As many as there may be task ids; each has room of its own."""
+"""The largest number of labels, equal to that of task ids; memory grows with each."""
 
 
 class Detector(TakesNumbers):

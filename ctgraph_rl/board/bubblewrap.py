@@ -25,7 +25,7 @@ OPTIONS = (
     *("--unshare-all", "--unshare-user", "--disable-userns", "--cap-drop", "ALL"),
     *("--new-session", "--die-with-parent"),
 )
-"""Name spaces of its own and no further ones, no capability, no terminal, and an end with the process that watches."""
+"""New name spaces but no further ones, no capability, no terminal; the process ends when its watcher ends."""
 
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc/alternatives", "/etc/ld.so.cache")
 """Programs and libraries."""
