@@ -13,16 +13,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.paths import CHECKOUT
 
 from ctgraph_rl.board import bubblewrap, isolate
-
-NOBODY = 65534
 
 CODE = Path(__file__).with_name("attacks.py")
 
@@ -41,28 +38,21 @@ SPACES = (["--unshare-all"], [])
 
 
 @pytest.fixture(scope="module")
-def user(request: pytest.FixtureRequest) -> dict[str, Any]:
+def user(request: pytest.FixtureRequest, ordinary: dict[str, Any]) -> dict[str, Any]:
     """Arguments of `subprocess.run` by which a process is of root, or of an ordinary user."""
     if request.param == "root" and os.geteuid() != 0:
         pytest.skip("these tests do not run as root")
     if request.param == "ordinary user" and os.geteuid() == 0:
-        return {"user": NOBODY, "group": NOBODY, "extra_groups": []}
+        return ordinary
     return {}
 
 
 @pytest.fixture(scope="module")
-def python(user: dict[str, Any]) -> str:
+def python(user: dict[str, Any], find_python: Callable[[dict[str, Any]], str]) -> str:
     """An interpreter that the user may run."""
     if bubblewrap.version() is None or bubblewrap.version() < bubblewrap.OLDEST:
         pytest.skip("needs bubblewrap")
-    code = "import sys; sys.exit(sys.version_info < (3, 11))"
-    for path in (sys.executable, "/usr/bin/python3"):
-        try:
-            if subprocess.run([path, "-c", code], cwd="/", **user).returncode == 0:
-                return path
-        except OSError:
-            continue
-    pytest.skip("no Python that an ordinary user may run")
+    return find_python(user)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +64,7 @@ def place(user: dict[str, Any], python: str) -> Iterator[Path]:
     shutil.copy(CODE, folder / "code")
     (folder / "hidden" / "secret").write_text("secret")
     for path in (folder, *folder.rglob("*")) if user else ():
-        os.chown(path, NOBODY, NOBODY)
+        os.chown(path, user["user"], user["group"])
     yield folder
     shutil.rmtree(folder)
 
@@ -103,18 +93,17 @@ def outside(place: Path) -> Iterator[dict[str, Any]]:
 class Attacker:
     """Starts attacks as a user."""
 
-    def __init__(self, place: Path, python: str, user: dict[str, Any], outside: dict[str, Any]) -> None:
-        self.user, self.python, self.folder = user, python, place / "work"
+    def __init__(self, place: Path, package: str, python: str, user: dict[str, Any], outside: dict[str, Any]) -> None:
+        self.user = user
+        self.python = python
+        self.folder = place / "work"
+        self.code = str(place / "code" / CODE.name)
+        self.environment = {"PYTHONPATH": package, "PATH": os.environ["PATH"], "MY_TOKEN": "secret"}
         self.spec = {"folder": str(place / "work"), "code": str(place / "code"), **outside}
 
     def command(self, attacks: list[str], how: str = "around", **more: Any) -> list[str]:
         """Return the command of attacks."""
-        return [self.python, str(CODE), how, json.dumps({**self.spec, "attacks": attacks, **more}), "outside-marker"]
-
-    @property
-    def environment(self) -> dict[str, str]:
-        """Of that command."""
-        return {"PYTHONPATH": str(CHECKOUT), "PATH": os.environ["PATH"], "MY_TOKEN": "secret"}
+        return [self.python, self.code, how, json.dumps({**self.spec, "attacks": attacks, **more}), "outside-marker"]
 
     def tries(self, *attacks: str, **more: Any) -> dict[str, str]:
         """Return what came of attacks, by name."""
@@ -126,8 +115,8 @@ class Attacker:
 
 
 @pytest.fixture
-def attacker(place: Path, python: str, user: dict[str, Any], outside: dict[str, Any]) -> Attacker:
-    return Attacker(place, python, user, outside)
+def attacker(place: Path, package: str, python: str, user: dict[str, Any], outside: dict[str, Any]) -> Attacker:
+    return Attacker(place, package, python, user, outside)
 
 
 both = pytest.mark.parametrize("user", ["root", "ordinary user"], indirect=True)
