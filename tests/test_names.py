@@ -66,6 +66,7 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u20
 MARKDOWN = MarkdownIt("commonmark").enable("table").enable("strikethrough")
 
 
+@settings(deadline=None)
 @given(NAMES)
 def test_a_terminal_gets_one_line_without_controls(name):
     line = escape.terminal_text(name)
@@ -76,7 +77,7 @@ def test_a_terminal_gets_one_line_without_controls(name):
 
 
 @given(NAMES)
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 def test_markdown_shows_a_name_as_text(name):
     shown = escape.markdown_text(name)
 
@@ -88,7 +89,7 @@ def test_markdown_shows_a_name_as_text(name):
 
 
 @given(NAMES, NAMES)
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 def test_a_cell_of_a_markdown_table_is_one_cell(name, other):
     row = f"| {escape.markdown_text(name)} | {escape.markdown_text(other)} |"
 
@@ -104,6 +105,7 @@ KNOWN_TO_LATEX = re.compile(
 )
 
 
+@settings(deadline=None)
 @given(NAMES)
 def test_latex_gets_no_command_and_no_special_character(name):
     left = KNOWN_TO_LATEX.sub("", escape.latex_text(name))
@@ -111,6 +113,7 @@ def test_latex_gets_no_command_and_no_special_character(name):
     assert not re.search(r'[\\&%$#_{}~^<>|"\[*\n]', left)
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.lists(st.one_of(NAMES, st.sampled_from([0.5, -1.0]), st.none()), min_size=2, max_size=4), min_size=1)
 )
