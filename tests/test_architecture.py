@@ -82,7 +82,22 @@ CATALOGUES = ("baselines", "baselines.detectors", "baselines.exchanges", "baseli
 """Folders of one file for each of many things of a kind."""
 
 LONG_FILES: dict[str, str] = {}
-"""Files of more than 400 lines, and why."""
+"""Files of more than 500 lines, and why."""
+
+LONG_FUNCTIONS = [
+    "baselines.benchmark.main",
+    "ctgraph_rl.batch.params._observation_params",
+    "ctgraph_rl.batch.rows.__init__",
+    "ctgraph_rl.benchmark.main",
+    "ctgraph_rl.board.rescore._of_the_log",
+    "ctgraph_rl.learn.together.learn_together",
+    "ctgraph_rl.report.figures.labels.draw_labels",
+    "make._parser",
+    "studies.collectives.runs.measured",
+    "studies.no_labels.figures.draw_strips",
+    "studies.no_labels.runs.measured",
+]
+"""Functions of more than 400 tokens that are older than the rule; no others join them."""
 
 ANY_NUMBER = ("require", "groups")
 """Functions whose arguments are alike, and as many as there are."""
@@ -124,10 +139,16 @@ def test_a_folder_has_at_most_14_modules():
     assert architecture.full_folders(modules, 14, CATALOGUES) == []
 
 
-def test_a_file_has_at_most_400_lines():
+def test_a_file_has_at_most_500_lines():
     modules = [*modules_of_packages(), *modules_of_results(), *modules_of_tests()]
 
-    assert architecture.long_files(modules, 400, LONG_FILES) == []
+    assert architecture.long_files(modules, 500, LONG_FILES) == []
+
+
+def test_a_function_has_at_most_400_tokens():
+    modules = [*modules_of_packages(), *modules_of_results()]
+
+    assert architecture.long_functions(modules, 400) == LONG_FUNCTIONS
 
 
 def test_a_call_has_at_most_five_positional_arguments():

@@ -137,6 +137,24 @@ def test_full_folders_and_long_files_are_found():
     assert architecture.long_files(found, 2, ["ctgraph_rl.core.c"]) == []
 
 
+def test_long_functions_are_found_without_comments_and_docstrings():
+    text = """
+def short():
+    'A text.'
+    # a comment
+    return 1
+
+class C:
+    def long(self):
+        a = 1
+        return a
+"""
+    found = modules(core__a=text)
+
+    assert [module.functions for module in found if module.name == "ctgraph_rl.core.a"] == [(("short", 2), ("long", 5))]
+    assert architecture.long_functions(found, 4) == ["ctgraph_rl.core.a.long"]
+
+
 def test_a_call_with_too_many_positional_arguments_is_found():
     found = modules(here="f(1, 2, 3)\ng.h(1, 2, *rest)\nf(1, 2, c=3)\nrequire(1, 2, 3)")
 

@@ -6,7 +6,10 @@ A rule takes modules and returns its findings, one text for each place that brea
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -63,6 +66,9 @@ class Module:
 
     private: tuple[str, ...] = ()
     """Private names of other modules of ours that it uses."""
+
+    functions: tuple[tuple[str, int], ...] = ()
+    """Functions and how many tokens of code their bodies have, without comments and docstrings."""
 
     @property
     def folder(self) -> str:
@@ -182,7 +188,25 @@ def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
         calls=tuple(reader.calls),
         by_name=tuple(reader.by_name),
         private=tuple(reader.private),
+        functions=tuple(_sizes_of_functions(tree, text)),
     )
+
+
+NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+
+
+def _sizes_of_functions(tree: ast.Module, text: str) -> list[tuple[str, int]]:
+    """Functions and the number of tokens in their bodies."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    lines = [token.start[0] for token in tokens if token.type not in NO_CODE]
+    sizes = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            body = node.body if ast.get_docstring(node) is None else node.body[1:]
+            if body:
+                size = bisect_right(lines, body[-1].end_lineno) - bisect_left(lines, body[0].lineno)
+                sizes.append((node.name, size))
+    return sizes
 
 
 def sources_of(*folders: str, root: Path = CHECKOUT) -> dict[str, str]:
@@ -329,6 +353,11 @@ def full_folders(modules: Iterable[Module], most: int, catalogues: Iterable[str]
 
 def long_files(modules: Iterable[Module], most: int, exceptions: Iterable[str]) -> list[str]:
     return sorted(module.name for module in modules if module.num_lines > most and module.name not in exceptions)
+
+
+def long_functions(modules: Iterable[Module], most: int) -> list[str]:
+    """Functions of more tokens than allowed."""
+    return sorted(f"{module.name}.{name}" for module in modules for name, size in module.functions if size > most)
 
 
 def long_calls(modules: Iterable[Module], most: int, exceptions: Iterable[str] = ()) -> list[str]:
