@@ -119,29 +119,34 @@ def test_the_page_says_of_gpus_what_was_measured(gpu):
     assert (report is None) == ("Not measured: no GPU was at hand." in page)
 
 
+TASKS = {"environment, SU": "SU", "environment, CO": "CO", "environment, SU with noise": "SU, noise 10"}
+COMPARED = [
+    (ladder.COPY, ""),
+    ("rollout, fused and captured", "SU"),
+    ("rollout, fused and captured", "CO"),
+]
+
+
 def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
     report = json.loads(gpu.FILE.read_text())
-    page = gpu.PAGE.read_text(encoding="utf-8")
+    page = (CHECKOUT / "docs" / "explanation" / "speed.md").read_text(encoding="utf-8")
     rates = {(row["way"], row["task"], row["rows"]): row["per_second"] for row in report["environment"]}
     learned = {(row["way"], row["rows"]): row["per_second"] for row in report["learning"]}
-    fused, captured = "rollout, fused and captured", "rollout, captured"
-    su, co, plain_su, plain_co = (rates[way, task, 65_536] / 1e9 for way in (fused, captured) for task in ("SU", "CO"))
-    copied = rates[gpu.ladder.COPY, "", 65_536] / 1e9
-    noisy, plain_noisy = (rates[way, "SU, noise 10", 65_536] / 1e9 for way in (fused, captured))
-    ppo, compiled, lstm = (
-        learned[f"{name} captured", 65_536] / 1e6 for name in ("ppo,", "ppo, compiled and", "lstm_ppo,")
-    )
+    ways = ("rollout", "rollout, captured", "rollout, fused and captured")
+    rows = {name: [f"{rates[way, task, 65_536] / 1e6:,.0f}" for way in ways] for name, task in TASKS.items()}
+    ways = ("step by step", "captured", "compiled and captured")
+    rows["PPO on CT-FO-B1"] = [f"{learned[f'ppo, {way}', 65_536] / 1e6:.1f}" for way in ways]
+    rows["LSTM-PPO on CT-SU-B1"] = [*(f"{learned[f'lstm_ppo, {way}', 65_536] / 1e6:.1f}" for way in ways[:2]), ""]
+    copied, su, co = (rates[way, task, 65_536] / 1e9 for way, task in COMPARED)
     few, few_lstm = (learned[f"{name} captured", 256] / 1e6 for name in ("ppo, compiled and", "lstm_ppo,"))
     minutes = 1024 * gpu.learning.MAIN_JOB / learned["lstm_ppo, 1,024 seeds as one job", 262_144] / 60
 
+    assert re.findall(r"^\| ((?:environment,|PPO|LSTM-PPO) .*) \|$", page.split("## GPUs")[1], re.MULTILINE) == [
+        " | ".join([name, *cells]).rstrip() for name, cells in rows.items()
+    ]
     for sentence in (
-        f"Fused steps reach {su:.1f} billion observations a second (SU) and {co:.1f} billion (CO), "
-        f"{su / copied:.2f} and {co / copied:.2f} of a copy",
-        f"two microseconds: {plain_su:.2f} (SU) and {plain_co:.2f} billion (CO).",
-        f"each pixel: {noisy:.1f} billion, fused, and {plain_noisy:.2f} without",
-        f"PPO learns from {ppo:.0f} million steps a second at 65,536 environments, and from {compiled:.0f} million "
-        f"compiled; LSTM-PPO from {lstm:.1f} million.",
-        f"PPO learns from {few:.2f} million and LSTM-PPO from {few_lstm:.2f} million.",
+        f"Compiled steps of SU and CO reach {su / copied:.2f} and {co / copied:.2f} of a copy",
+        f"PPO learns from {few:.2f} million steps a second and LSTM-PPO from {few_lstm:.2f} million.",
         f"1,024 seeds of the main job would take {minutes:.1f} minutes",
     ):
         assert sentence in " ".join(page.split())
@@ -150,6 +155,7 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
     study += f"{14_336e6 / published / 3600:.0f} hours for F"
     assert study in " ".join((CHECKOUT / "docs" / "how-to" / "sweeps.md").read_text(encoding="utf-8").split())
     readme = " ".join((CHECKOUT / "README.md").read_text(encoding="utf-8").split())
+    ppo = learned["ppo, captured", 65_536] / 1e6
     said = f"One H100, 65,536 environments: fused steps take {su:.1f} billion a second"
     assert f"{said}, and PPO trains on {ppo:.0f} million" in readme
 

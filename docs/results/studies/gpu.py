@@ -1,7 +1,7 @@
 """Measures a GPU within half an hour, in a checkout on a machine with one.
 
 It runs the tests marked ``cuda`` and the ladders of the environment and of learning, writes gpu.json after each part,
-and the section on GPUs of docs/explanation/speed.md from it. Commit both. Ctrl-C ends a part with what it has. Where
+and the section on GPUs of docs/reference/speed_table.md from it. Commit both. Ctrl-C ends a part with what it has. Where
 there is no GPU, it writes the section alone, from the gpu.json that is there.
 """
 
@@ -24,7 +24,7 @@ from ctgraph_rl.benchmark import configurations, ladder, machine
 from ctgraph_rl.log.provenance import versions
 from studies.raw import HERE
 
-FILE, PAGE = HERE / "gpu.json", HERE.parent / "explanation" / "speed.md"
+FILE, PAGE = HERE / "gpu.json", HERE.parent / "reference" / "speed_table.md"
 TESTS = ("-m", "pytest", "-q", "-m", "cuda", "-n", "0", "tests/learn/test_cuda.py")
 SECTION = re.compile(r"(?<=<!-- gpu -->\n).*?(?=<!-- end of gpu -->)", re.DOTALL)
 
