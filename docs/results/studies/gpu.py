@@ -1,8 +1,8 @@
 """Measures a GPU within half an hour, in a checkout on a machine with one.
 
 It runs the tests marked ``cuda`` and the ladders of the environment and of learning, writes gpu.json after each part,
-and the section on GPUs of docs/reference/speed_table.md from it. Commit both. Ctrl-C ends a part with what it has. Where
-there is no GPU, it writes the section alone, from the gpu.json that is there.
+and the section on GPUs of docs/reference/speed_table.md from it. Commit both. Ctrl-C ends a part with what it has.
+Where there is no GPU, it writes the section alone, from the gpu.json that is there.
 """
 
 from __future__ import annotations
