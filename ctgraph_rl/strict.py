@@ -54,12 +54,13 @@ def named(path: Path) -> Iterator[None]:
         raise ValueError(str(error) if str(path) in str(error) else f"{path} {error}") from None
 
 
-def json_value(content: bytes, finite: bool = True) -> Any:
+def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) -> Any:
     """Return the value of a JSON text in UTF-8.
 
     Args:
         content: the text.
         finite: whether NaN and infinity are refused, which Python writes and JSON does not have.
+        nesting: most objects and lists within each other.
 
     Raises:
         ValueError: for what is no JSON, a key that is twice in an object, an integer of too many digits, too many
@@ -75,8 +76,8 @@ def json_value(content: bytes, finite: bool = True) -> Any:
             parse_float=_real if finite else None,
         )
     except RecursionError:
-        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
-    require((is_shallow(value, MAX_NESTING), f"nested more than {MAX_NESTING} deep"))
+        raise ValueError(f"nested more than {nesting} deep") from None
+    require((is_shallow(value, nesting), f"nested more than {nesting} deep"))
     return value
 
 

@@ -10,7 +10,6 @@ list, or, by ``task_label_mode``, its place in the curriculum (``curriculum_inde
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,8 +20,9 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from ctgraph_rl.checks import is_int, is_shallow, require, takes_numbers
+from ctgraph_rl.checks import is_int, require, takes_numbers
 from ctgraph_rl.disk import read_regular
+from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
@@ -152,13 +152,10 @@ def _read(path: Path) -> dict[str, Any]:
     """
     with _named(path):
         try:
-            content = json.loads(read_regular(path, MOST_BYTES))
+            content = json_value(read_regular(path, MOST_BYTES), finite=False, nesting=MOST_NESTING)
         except OSError as error:
             raise ValueError(f"must be a file that can be read: {error.strerror or error}") from error
-        except RecursionError as error:
-            raise ValueError(f"must be nested at most {MOST_NESTING} levels deep") from error
         require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
-        require((is_shallow(content, MOST_NESTING), f"must be nested at most {MOST_NESTING} levels deep"))
     return content
 
 

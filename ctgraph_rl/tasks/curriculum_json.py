@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -26,6 +25,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import read_regular, write_whole
+from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
@@ -165,21 +165,11 @@ def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, M
 def _parse(data: bytes) -> Mapping[str, Any]:
     """The object that a file holds."""
     try:
-        content = json.loads(data, object_pairs_hook=_without_repeats)
-    except RecursionError:
-        raise ValueError(f"nested more than {MAX_NESTING} deep") from None
+        content = json_value(data, finite=False, nesting=MAX_NESTING)  # `_check_form` says where a number is not
     except ValueError as error:
         raise ValueError(f"must be JSON: {error}") from error
     require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
     return content
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    known = dict(pairs)
-    if len(known) < len(pairs):
-        [(repeated, _)] = Counter(key for key, _ in pairs).most_common(1)
-        raise ValueError(f"key {[repeated]!r:.80} occurs twice in one object")
-    return known
 
 
 def _check_form(value: Any, nesting: int = 1) -> None:

@@ -17,6 +17,7 @@ from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.disk import read_regular, write_whole
+from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
@@ -97,8 +98,8 @@ def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, M
     except (OSError, ValueError) as error:
         raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
     try:
-        content = json.loads(data)
-    except (ValueError, RecursionError) as error:
+        content = json_value(data, finite=False)
+    except ValueError as error:
         raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
     require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))
     return str(path_or_dict), content

@@ -17,7 +17,7 @@ import pytest
 from ctgraph_rl import cli
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.rescore import Check, rescore
-from ctgraph_rl.board.standings.entries import entry_of, read_entries, verification_of
+from ctgraph_rl.board.standings.entries import FIELDS, entry_of, read_entries, verification_of
 from ctgraph_rl.board.standings.page import write_board
 from ctgraph_rl.board.submission import VERIFICATION, read_submission
 
@@ -68,6 +68,13 @@ def test_a_level_is_that_of_the_verification_of_these_very_files(submission, cou
     )
 
 
+def test_the_board_knows_all_fields_that_a_verification_writes(submission):
+    path = verify.write_verification(submission, [Check("what", "1", "1", True)])
+
+    assert set(json.loads(path.read_text())) == set(FIELDS)
+    assert verification_of(submission) == ("rescored", True, "")
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -79,6 +86,7 @@ def test_a_level_is_that_of_the_verification_of_these_very_files(submission, cou
         ({"level": "rerun"}, "its checks give the level held_out, not rerun"),
         ({"checks": []}, "its checks give the level none, not held_out"),
         ({"checks": [{"what": "all", "passed": 1, "level": "rescored"}]}, "its checks must be a list of checks"),
+        ({"signed_by": "me"}, "it has unknown fields, signed_by"),
         ({"bits": "no"}, "its bits must be true or false, got 'no'"),
     ],
 )

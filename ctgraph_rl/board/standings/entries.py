@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from ctgraph_rl.board import verify
 from ctgraph_rl.board.method import track_version
 from ctgraph_rl.board.rescore import MEASURES, Check
+from ctgraph_rl.board.rules import listed
 from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.checks import require
@@ -32,6 +33,12 @@ NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
 
 MOST_BYTES = 2**24
 """Largest ``verification.json`` that is read."""
+
+FIELDS = (
+    *("schema", "level", "bits", "digest", "number", "cells", "held_out_seeds", "isolation", "checks"),
+    *("machine", "num_threads", "cpu", "versions"),
+)
+"""Of ``verification.json``; others are unknown."""
 
 DIGITS = 12
 """Of a digest, for readers."""
@@ -224,12 +231,14 @@ def _plain(found: Any) -> dict[str, Any]:
         ValueError: for what is no verification.
     """
     given = {"bits": True, **(found if isinstance(found, dict) else {})}
+    unknown = [name for name in given if name not in FIELDS]
     schema, level, bits = (given.get(key) for key in ("schema", "level", "bits"))
     checks = _checks(given.get("checks"))
     require(
         (type(schema) is int and schema == verify.SCHEMA, f"its schema must be {verify.SCHEMA}, got {schema!r:.80}"),
         (isinstance(level, str) and level in OF_FILES, f"its level must be {', '.join(OF_FILES)}, got {level!r:.80}"),
         (isinstance(bits, bool), f"its bits must be true or false, got {bits!r:.80}"),
+        (not unknown, f"it has unknown fields, {listed(unknown)}"),
         (checks is not None, "its checks must be a list of checks with what, level and passed"),
     )
     reached = verify.level_of(checks or ())

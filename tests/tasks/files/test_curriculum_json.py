@@ -241,12 +241,14 @@ def test_wrong_json_is_refused_with_the_key(content, place, value, message):
 NO_JSON = [
     (b"", "must be JSON: Expecting value"),
     (b"\xff\xfe\x00", "must be JSON"),
+    (b"\xef\xbb\xbf{}", "must be JSON: Unexpected UTF-8 BOM"),
+    ("{}".encode("utf-16"), "must be JSON: 'utf-8' codec can't decode"),
     (b"[1]", "must hold a JSON object, got list"),
     (b'{"name": NaN}', "name: must be a finite number, got nan"),
     (b'{"name": -Infinity}', "name: must be a finite number, got -inf"),
     (b'{"name": 1e999}', "name: must be a finite number, got inf"),
-    (b'{"version": 1' + b"0" * 5000 + b"}", "must be JSON: Exceeds the limit"),
-    (b'{"a": 1, "a": 2}', r"key \['a'\] occurs twice"),
+    (b'{"version": 1' + b"0" * 5000 + b"}", "must be JSON: an integer has 5,001 digits"),
+    (b'{"a": 1, "a": 2}', "key 'a' occurs twice"),
     (b'{"a": ' + b"[" * 20 + b"]" * 20 + b"}", "nested more than 16 deep"),
     (b'{"a": ' + b"[" * 200_000 + b"]" * 200_000 + b"}", "nested more than 16 deep"),
 ]
