@@ -1,7 +1,7 @@
 """REINFORCE: policy gradients of whole returns minus a learned baseline; one gradient step a batch, no memory.
 
-Williams 1992 (Machine Learning 8, 229-256). An episode that the end of a batch cuts off
-is bootstrapped with the baseline's value; there is no bonus for entropy.
+Williams 1992 (Machine Learning 8, 229-256). Batches should be several times as long as an episode: one that the end of
+a batch cuts off is bootstrapped with the baseline's value. There is no bonus for entropy.
 """
 
 from __future__ import annotations

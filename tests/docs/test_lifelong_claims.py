@@ -304,3 +304,16 @@ def test_every_sentence_of_the_readings_is_tested():
     masks = PAGE.read_text(encoding="utf-8").split("## Methods, agents and what changes between tasks")[0]
 
     assert sorted(sentences(" ".join(readings(masks)))) == sorted([*reads.sentences(), *NO_DATA])
+
+
+def test_the_papers_claims_compare_means_over_curricula_with_a_pair_for_each_seed_that_has_all():
+    from studies.lifelong import pairs
+
+    measured = {("mask_lc", name, "0"): value for name, value in zip(pairs.MASKS, (0.25, 0.5, 1.0), strict=True)}
+    measured |= {("mask_lc", pairs.MASKS[0], "10"): 1.0}
+    rows = PAGE.read_text(encoding="utf-8").split("### The paper's claims")[1].split("\n## ")[0].split("\n| ")[3:]
+
+    assert pairs.over_curricula(measured) == {("mask_lc", "0"): 1.75 / 3}
+    assert len(rows) == 8
+    assert {row.split(" | ")[2] for row in rows} == {"10"}
+    assert min(float(row.split(" | ")[4]) for row in rows) == round(2 / 2**10, 3)

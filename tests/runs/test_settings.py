@@ -7,12 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.sweeping import command_line
 
 from ctgraph_rl import load, run
 from ctgraph_rl.log import sources
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS
 from ctgraph_rl.runs import job, read, settings
 from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.config import run_name
 
 SHORT = ("curriculum=fo_b1_4tasks", "curriculum.num_frames=64", "evaluation.num_episodes=2")
 YAML = """
@@ -68,8 +70,8 @@ def test_a_setting_that_is_added_with_the_value_for_as_before_is_the_same_run(co
     assert command("agent.cell=gru", added="lstm") != before
 
 
-def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch):
-    whole = (command() / AGENT).read_bytes()
+def stop_after_a_block(monkeypatch, start, *overrides: str) -> None:
+    """Start a run that ends with its first block as if it had been killed."""
     offer = Checkpoints.offer
 
     def stop(self, state, at_block_end):
@@ -77,10 +79,14 @@ def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch
         if at_block_end:
             raise Stopped
 
-    monkeypatch.setattr(Checkpoints, "offer", stop)
-    with pytest.raises(Stopped):
-        command("overwrite=true")
-    monkeypatch.setattr(Checkpoints, "offer", offer)
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(Checkpoints, "offer", stop)
+        start(*overrides)
+
+
+def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch):
+    whole = (command() / AGENT).read_bytes()
+    stop_after_a_block(monkeypatch, command, "overwrite=true")
     (stopped,) = Path("runs").glob("*/*")
     assert len(list((stopped / CHECKPOINTS).iterdir())) > 0
 
@@ -171,3 +177,38 @@ def test_a_stored_agent_without_a_setting_that_was_added_is_loaded(tmp_path, mon
     monkeypatch.setattr(settings, "ADDED", {"baselines.a2c.A2C": {"cell": "lstm"}})
 
     assert load(tmp_path).frames == 256
+
+
+EARLIER = ("agent=reinforce", "agent.num_envs=256", "agent.num_steps=8")
+"""REINFORCE with the default that it had before its batches held whole episodes."""
+
+OF_EARLIER = "su_b1_4tasks/reinforce-seed0-582d911d9d30"
+"""What ``agent=reinforce`` without more named such a run then."""
+
+
+SHORT_TASK = ("curriculum=su_b1_4tasks", "curriculum.num_frames=2048", "evaluation.num_episodes=2")
+
+
+def test_a_changed_default_is_another_run_and_earlier_runs_keep_their_names(compose):
+    cells = ((*SHORT_TASK, *EARLIER), (*SHORT_TASK, "agent=reinforce"))
+
+    earlier, now = (run_name(_root_=compose(*cell, return_hydra_config=True)) for cell in cells)
+
+    assert earlier == OF_EARLIER
+    assert now != earlier
+
+
+@pytest.mark.slow
+def test_a_run_of_an_earlier_default_is_found_loaded_and_resumed(tmp_path, monkeypatch):
+    def start(*overrides: str) -> int:
+        return command_line(monkeypatch, *SHORT_TASK, *EARLIER, *overrides)
+
+    monkeypatch.chdir(tmp_path)
+    run_dir = tmp_path / "runs" / OF_EARLIER
+    start()
+    whole = (run_dir / AGENT).read_bytes()
+    stop_after_a_block(monkeypatch, start, "overwrite=true")
+
+    assert load(run_dir).agent.num_envs == 256
+    assert start() == 0
+    assert (run_dir / AGENT).read_bytes() == whole and (run_dir / "restarts.jsonl").exists()
