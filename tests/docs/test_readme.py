@@ -39,7 +39,7 @@ def test_readme_is_short_and_counts_what_there_is():
     cells = len(list((CHECKOUT / "conf" / "cell").glob("*.yaml"))) - 1  # "none" is no memory
     methods = number_of_classes("method", without="finetune")
 
-    assert len(text.splitlines()) <= 120
+    assert len(text.splitlines()) <= 100
     assert f"{len(curricula.names())} named, versioned curricula" in text
     assert f"{agents} agents, {cells} kinds of memory, {methods} lifelong-learning methods" in text
     assert f"{len(metrics.definitions())} metrics, and runs" in text
