@@ -17,7 +17,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import MLP, QValueActor
 from torchrl.objectives import DQNLoss
 
-from baselines.networks import Data, encoder, require_weights
+from baselines.networks import Data, encoder, num_actions_of, require_weights
 from baselines.prioritized import LARGEST_ALPHA
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
@@ -63,11 +63,11 @@ class DQN(QLearner):
             *not_negative(priority_alpha=priority_alpha),
             *at_most(LARGEST_ALPHA, priority_alpha=priority_alpha),
         )
-        require_weights(observation_spec, hidden_size, 2, action_spec.space.n)
+        require_weights(observation_spec, hidden_size, 2, num_actions_of(action_spec))
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
         self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
         super().__init__(gamma=gamma, **settings)
-        head = MLP(hidden_size, action_spec.space.n, num_cells=[hidden_size], activation_class=nn.ReLU)
+        head = MLP(hidden_size, num_actions_of(action_spec), num_cells=[hidden_size], activation_class=nn.ReLU)
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
         features = encoder(observation_spec, hidden_size)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)

@@ -35,7 +35,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
-from baselines.networks import Data, EncoderModule, encoder, guided, require_weights
+from baselines.networks import Data, EncoderModule, encoder, guided, num_actions_of, require_weights
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
@@ -256,7 +256,7 @@ class MOHQA(QLearner):
             *fraction(average_decay=average_decay, noise_share=noise_share),
             *at_most(0.5, hebbian_share=hebbian_share),
         )
-        num_actions = action_spec.space.n
+        num_actions = num_actions_of(action_spec)
         require_weights(observation_spec, hidden_size, 1, num_features)
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"], 2 * num_features)
         super().__init__(gamma=gamma, **settings)

@@ -18,7 +18,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
 from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, reset
 from baselines.distinct import distinct, histories, renumbered
-from ctgraph_rl.checks import require_memory
+from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
 
@@ -30,7 +30,7 @@ GROUP = "group"
 
 
 class Encoder(nn.Module):
-    """uint8 observations to features: scale to [0, 1], flatten, linear layers with ReLU.
+    """Observations to features: scale uint8 to [0, 1], flatten, linear layers with ReLU.
 
     Args:
         shape: shape of one observation.
@@ -206,6 +206,24 @@ def require_weights(
     require_memory(f"weights of hidden_size={hidden_size} in num_layers={num_layers}", 16 * count, "or smaller layers")
 
 
+def num_actions_of(action_spec: TensorSpec) -> int:
+    """Return the number of actions that an agent chooses from.
+
+    Raises:
+        ValueError: for continuous actions.
+    """
+    count = getattr(action_spec, "n", None)
+    shape, dtype = list(action_spec.shape), str(action_spec.dtype).removeprefix("torch.")
+    fix = "take a learner of your own, measured by Recorder, or a task with discrete ones"
+    require((count is not None, f"agents of baselines choose from discrete actions, these are {dtype} {shape}: {fix}"))
+    return count  # type: ignore[return-value]
+
+
+def highest(spec: TensorSpec) -> float:
+    """Return what observations are divided by: their largest value, or 1 for vectors of floats."""
+    return 1.0 if spec.dtype.is_floating_point else spec.space.high.max().item()
+
+
 def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:
     """Build an encoder that reads ``observation`` and, if the environment has it, ``task_id``; it writes ``features``.
 
@@ -218,7 +236,7 @@ def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1,
     spec = observation_spec["observation"]
     if "task_id" in observation_spec.keys():  # noqa: SIM118, a Composite is no dict
         extra = {"task_id": observation_spec["task_id"].shape.numel(), **extra}
-    module = Encoder(spec.shape, spec.space.high.max().item(), num_features, num_layers, sum(extra.values()))
+    module = Encoder(spec.shape, highest(spec), num_features, num_layers, sum(extra.values()))
     return EncoderModule(module, in_keys=["observation", *extra], out_keys=["features"])
 
 
@@ -251,7 +269,7 @@ def make_orthogonal(module: nn.Module, gain: float = 1.0) -> None:
 def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> ProbabilisticActor:
     """Build a categorical policy that reads features and writes ``action`` and ``action_log_prob``."""
     return ProbabilisticActor(
-        linear(in_key, num_features, "logits", action_spec.space.n),
+        linear(in_key, num_features, "logits", num_actions_of(action_spec)),
         spec=action_spec,
         in_keys=["logits"],
         distribution_class=torch.distributions.Categorical,

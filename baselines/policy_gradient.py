@@ -26,6 +26,7 @@ from baselines.networks import (
     entropy,
     log_probabilities,
     make_orthogonal,
+    num_actions_of,
     recurrent,
     require_weights,
     sequences_of,
@@ -114,7 +115,7 @@ class PolicyGradient(Learner):
         require((self.memory or cell is None, no_cell))
         self.cell = LSTM if cell is None else cell
         self.deduplicate = deduplicate
-        require_weights(observation_spec, hidden_size, num_layers, action_spec.space.n + 1, self.memory)
+        require_weights(observation_spec, hidden_size, num_layers, num_actions_of(action_spec) + 1, self.memory)
         self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
         self.features = "memory" if self.memory else "features"
@@ -139,7 +140,7 @@ class PolicyGradient(Learner):
         """Build the layers before the heads, which with memory end in a cell."""
         if not self.memory:
             return encoder(observation_spec, hidden_size, num_layers)
-        return recurrent(observation_spec, hidden_size, num_layers, action_spec.space.n, self.cell)
+        return recurrent(observation_spec, hidden_size, num_layers, num_actions_of(action_spec), self.cell)
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return zeros for the cell's state; an empty state without memory."""

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
+from baselines.networks import highest
 from baselines.ppo import PPO
 from ctgraph_rl.checks import is_int, not_negative, require
 
@@ -70,7 +71,7 @@ class PPOCount(PPO):
         super().__init__(observation_spec, action_spec, **settings)
         spec = observation_spec["observation"]
         self.bonus_coeff = bonus_coeff
-        self.seen = SimHashCounts(spec.shape.numel(), spec.space.high.max().item(), num_hash_bits)
+        self.seen = SimHashCounts(spec.shape.numel(), highest(spec), num_hash_bits)
 
     def start_task(self, task: int | None = None) -> None:
         """Reset all counts."""

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from baselines.learner import reset_layer
-from baselines.networks import Data, critic, encoder
+from baselines.networks import Data, critic, encoder, highest
 from baselines.optimisers import make_optimiser
 from baselines.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
@@ -173,7 +173,7 @@ class PPORND(PPO):
         size = width * (spec.shape.numel() + num_features)
         require_memory(f"weights of num_features={num_features}", 20 * size, "or smaller layers")
         self.bonus_coeff, self.bonus_gamma, self.predictor_share = bonus_coeff, bonus_gamma, predictor_share
-        high = spec.space.high.max().item()
+        high = highest(spec)
         shape = (spec.shape.numel(), width, num_features)
         self.novelty = Novelty(*shape, high=high, num_envs=self.num_envs, gamma=bonus_gamma)
         self.bonus_critic = TensorDictSequential(

@@ -19,7 +19,7 @@ from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
-from baselines.networks import Data, copied_action, recurrent, require_weights
+from baselines.networks import Data, copied_action, num_actions_of, recurrent, require_weights
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
@@ -120,16 +120,16 @@ class RecurrentQ(QLearner):
             *positive(learning_rate=learning_rate),
             (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
         )
-        num_outputs = action_spec.space.n * self.num_quantiles
+        num_outputs = num_actions_of(action_spec) * self.num_quantiles
         require_weights(observation_spec, hidden_size, 1, num_outputs, memory=True)
         pairs = num_steps * self.num_quantiles**2
         require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
-        self.trunk = recurrent(observation_spec, hidden_size, 1, action_spec.space.n, cell)
+        self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions_of(action_spec), cell)
         unstored = [key for key in self.trunk.state_keys if key.startswith(UNSTORED)]
         message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {unstored}"
         require((not unstored, f"{message}: use agent=lstm_ppo"))
-        head = Quantiles(hidden_size, action_spec.space.n, self.num_quantiles)
+        head = Quantiles(hidden_size, num_actions_of(action_spec), self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         self.greedy = QValueActor(
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import GROUP, Data, RecurrentModule, recurrent
+from baselines.networks import GROUP, Data, RecurrentModule, num_actions_of, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 
@@ -89,7 +89,12 @@ class RL2(PPO):
     def __init__(
         self, observation_spec: Composite, action_spec: TensorSpec, trial_episodes: int, **settings: Any
     ) -> None:
-        require(*at_least_one(trial_episodes=trial_episodes))
+        found = "outcome" in observation_spec.keys()  # noqa: SIM118, a Composite is no dict
+        fix = "take agent=lstm_ppo"
+        require(
+            *at_least_one(trial_episodes=trial_episodes),
+            (found, f"RL2 needs CT-graphs, whose episodes say whether they found the goal: {fix}"),
+        )
         self.trial_episodes = trial_episodes
         super().__init__(observation_spec, action_spec, **settings)
 
@@ -97,7 +102,7 @@ class RL2(PPO):
         self, observation_spec: Composite, action_spec: TensorSpec, hidden_size: int, num_layers: int
     ) -> TrialTrunk:
         """Build a recurrent trunk that also reads the last action and reward."""
-        num_actions = action_spec.space.n
+        num_actions = num_actions_of(action_spec)
         trunk = recurrent(observation_spec, hidden_size, num_layers, num_actions, self.cell, previous=num_actions + 1)
         message = "reads_action and reads_reward must be false, as RL2 reads its last action and reward itself"
         require((not trunk.own_keys, message))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ctgraph_rl.checks import positive, require
@@ -14,10 +14,11 @@ from ctgraph_rl.log.sheets import to_latex as to_latex
 from ctgraph_rl.log.sheets import to_markdown as to_markdown
 from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy, states_per_observation
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.task import Task, are_graphs, ct_graphs
 from ctgraph_rl.tasks.values import open_loop_ceiling, random_frames_to_goal
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
@@ -79,12 +80,15 @@ MISPRINTS = (
 
 def memory(curriculum: Curriculum) -> tuple[int, int]:
     """Bytes of the image bank of a curriculum's tasks, and of each row: two observations, as a step holds."""
-    one = max(math.prod(task.images.shape) for task in curriculum.tasks)
-    return bank_bytes(curriculum.tasks), 2 * one
+    tasks = _graphs(curriculum)
+    one = max(math.prod(task.images.shape) for task in tasks)
+    return bank_bytes(tasks), 2 * one
 
 
 def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> list[Sheet]:
     """The curriculum at large, its blocks, and the difficulty, ceilings and observability of its tasks.
+
+    Of tasks that are no CT-graphs, only the first two are known.
 
     Args:
         curriculum: any curriculum.
@@ -94,12 +98,12 @@ def describe(curriculum: Curriculum, frames_per_second: float | None = None) -> 
         ValueError: for a rate that is not above 0.
     """
     require(*(positive(frames_per_second=frames_per_second) if frames_per_second is not None else ()))
-    sheets = (_blocks, _difficulty, _ceilings, _observations)
+    sheets = (_blocks, _difficulty, _ceilings, _observations) if are_graphs(curriculum.tasks) else (_other_blocks,)
     return [_overview(curriculum, frames_per_second), *(sheet(curriculum) for sheet in sheets)]
 
 
 def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
-    bank, per_row = memory(curriculum)
+    graphs = are_graphs(curriculum.tasks)
     rows = {
         "version": str(curriculum.version),
         "fingerprint": curriculum.fingerprint,
@@ -109,10 +113,22 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
         "frames": f"{curriculum.num_frames:,}",
         "protocol": protocol_in_words(curriculum.protocol, len(curriculum.tasks)),
         "evaluation": evaluation_in_words(curriculum.evaluation),
+        **(_of_graphs(curriculum, frames_per_second) if graphs else {}),
+    }
+    return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))
+
+
+def _of_graphs(curriculum: Curriculum, frames_per_second: float | None) -> dict[str, str]:
+    """Return what CT-graphs need of memory and time."""
+    bank, per_row = memory(curriculum)
+    return {
         "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
         "time": f"{_time(curriculum.num_frames, frames_per_second)}, an estimate without evaluations",
     }
-    return Sheet(curriculum.name, {"what": "l", "value": "l"}, tuple(rows.items()))
+
+
+def _graphs(curriculum: Curriculum) -> Sequence[Task]:
+    return ct_graphs(curriculum.tasks, "this sheet")
 
 
 def _time(num_frames: int, frames_per_second: float | None) -> str:
@@ -164,10 +180,21 @@ def _blocks(curriculum: Curriculum) -> Sheet:
     return Sheet("Blocks", columns | ({"switch": "l"} if switches else {}), tuple(shown))
 
 
-def _block_rows(number: int, block: Block, labels: Mapping[Task, str]) -> Iterator[tuple[str, ...]]:
+def _other_blocks(curriculum: Curriculum) -> Sheet:
+    """Return a row for each different task of a block, of tasks that are no CT-graphs."""
+    labels = dict(zip(curriculum.tasks, curriculum.labels, strict=True))
+    rows = []
+    for number, block in enumerate(curriculum.blocks, 1):
+        for task in dict.fromkeys(block.tasks):
+            rows.append((str(number), labels[task], f"{block.num_frames:,}"))
+    note = f"Tasks are of {type(curriculum.tasks[0]).__name__}: difficulty and ceilings are known of CT-graphs alone."
+    return Sheet("Blocks", {"block": "r", "task": "l", "frames": "r"}, tuple(rows), (note,))
+
+
+def _block_rows(number: int, block: Block, labels: Mapping[TaskLike, str]) -> Iterator[tuple[str, ...]]:
     """A row for each different task; what is of the whole block stands in the first."""
     frames, switch = f"{block.num_frames:,}", "" if block.switch is None else repr(block.switch)
-    for i, task in enumerate(dict.fromkeys(block.tasks)):
+    for i, task in enumerate(dict.fromkeys(ct_graphs(block.tasks, "this sheet"))):
         graph, of_block = task.graph, (str(number), frames, switch) if i == 0 else ("", "", "")
         shape = (str(graph.branching_factor), str(graph.depth), f"{graph.wait_prob:g}")
         yield of_block[0], labels[task], *shape, ".".join(map(str, task.goal)), *of_block[1:]
@@ -206,7 +233,7 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
             lost.append(f"{label} {_number(memoryless)} of {_number(optimal)}")
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
     limits = ((CHANGING_GOALS, _changes_goals), (NOISE_AS_DICE, _varies_on_read))
-    limited = [note for note, applies in limits if any(map(applies, curriculum.tasks))]
+    limited = [note for note, applies in limits if any(map(applies, _graphs(curriculum)))]
     easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
     shown = ", ".join(lost[:MOST_LOST]) + f" and {len(lost) - MOST_LOST} more" * (len(lost) > MOST_LOST)
     needed = [f"{NEEDS_MEMORY} {shown}."] if lost else []
@@ -252,7 +279,7 @@ def _up_to(most: int) -> str:
 
 
 def _labelled(curriculum: Curriculum) -> Iterator[tuple[Task, str]]:
-    return zip(curriculum.tasks, curriculum.labels, strict=True)
+    return zip(_graphs(curriculum), curriculum.labels, strict=True)
 
 
 def probabilities() -> Sheet:

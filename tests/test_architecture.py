@@ -74,6 +74,8 @@ DOORS = {
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
     "ctgraph_rl.report.style": "packages of an extra",
     "ctgraph_rl.runs.trackers": "packages of an extra",
+    "ctgraph_rl.tasks.kinds.gym_task": "the environment of its tasks, which stands above them, and wrappers of others",
+    "ctgraph_rl.tasks.task": "the environment of its tasks, which stands above them",
     "curricula": "its names are imported when they are first used",
 }
 """Modules that import by name, and why."""

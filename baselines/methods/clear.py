@@ -93,7 +93,7 @@ class CLEAR(Method):
         message = f"buffer_size must be at least the {steps} steps of a row, got {self.buffer_size}"
         require((self.buffer_size >= steps, message))
         state = sum(each.nbytes for each in agent.initial_state(1).values())
-        size = math.prod(curriculum.tasks[0].images.shape) + state
+        size = math.prod(curriculum.tasks[0].observation_shape) + state
         require_memory(f"replay of buffer_size={self.buffer_size} steps", self.buffer_size * size, "steps")
         self.reservoir = Reservoir(self.buffer_size // steps)
 

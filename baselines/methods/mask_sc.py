@@ -11,9 +11,12 @@ from typing import Any
 
 import torch
 
+from baselines.learner import Learner
 from baselines.methods.selection import SelectedMasks
+from baselines.methods.weights import Weights
 from ctgraph_rl.checks import at_least_one, is_real, one_of, require
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task, ct_graphs
 
 SELECTIONS = ("similarity", "random", "none", "all", "parent", "depth_prefix")
 
@@ -46,6 +49,12 @@ class MaskSC(SelectedMasks):
         self.compares = selection == "similarity"
         self.reads_tasks = "the tasks' goals and images" if selection in ORACLES else ""
 
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().setup(agent, weights, curriculum)
+        if self.selection in ORACLES[1:]:
+            ct_graphs(curriculum.tasks, f"selection={self.selection}")
+
     def start_task(self, task: int | None) -> None:
         """Start with what an oracle selects, or nothing."""
         super().start_task(task)
@@ -61,7 +70,8 @@ class MaskSC(SelectedMasks):
             return torch.randperm(len(earlier), generator=self.generator)[: self.top_k].tolist()
         if self.selection in ("all", "none"):
             return [*earlier] if self.selection == "all" else []
-        family = [slot for slot in earlier if is_prefix(self.task_in(slot), self.task_in(self.slot))]
+        tasks = ct_graphs([*map(self.task_in, range(self.num_combined)), self.task_in(self.slot)], self.selection)
+        family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[-1])]
         return family if self.selection == "depth_prefix" else family[-1:]
 
     def _similar(self) -> list[int]:

@@ -17,6 +17,7 @@ from baselines.methods.masks import Masks, combined
 from baselines.methods.weights import Weights, flat
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import most_actions
 
 
 class MaskShared(Masks):
@@ -47,7 +48,7 @@ class MaskShared(Masks):
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        self.num_actions = max(task.graph.branching_factor for task in curriculum.tasks) + 1
+        self.num_actions = most_actions(curriculum.tasks)
         self.betas = nn.Parameter(torch.zeros(len(weights.parameters), self.max_received + 1))
         self._keep(torch.zeros(0, len(weights)))
         super().setup(agent, weights, curriculum)

@@ -17,7 +17,7 @@ from baselines.methods.masks import combined
 from baselines.methods.weights import Weights
 from ctgraph_rl.checks import at_least_one, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 
 EMBEDDINGS = ("lwe", "swe")
 
@@ -160,11 +160,11 @@ class SelectedMasks(MaskLC):
         super().setup(agent, weights, curriculum)
         self.generator, self.curriculum = own_generator(), curriculum
         self.of_id = {number: task for task, number in curriculum.task_ids.items()}
-        self.num_actions = max(task.graph.branching_factor for task in curriculum.tasks) + 1
+        self.num_actions = most_actions(curriculum.tasks)
         for name in ("community", "places", "offsets"):
             self.register_buffer(name, torch.zeros(0), persistent=False)
 
-    def task_in(self, slot: int) -> Task:
+    def task_in(self, slot: int) -> TaskLike:
         """Return the task of a slot."""
         return self.of_id[self.started[slot]]
 

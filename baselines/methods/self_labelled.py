@@ -20,6 +20,7 @@ from baselines.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import most_actions
 from ctgraph_rl.tasks.protocol import Block, Protocol
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ class SelfLabelled:
             ValueError: if agent, method and detector do not fit together.
         """
         detector, name = self.detector, type(self.detector).__name__
-        shape = curriculum.tasks[0].images.shape
+        shape = curriculum.tasks[0].observation_shape
         missing = "features" in detector.needs and trunk_of(agent.policy) is None
         fix = "its policy has no trunk with `over_time`, as those of baselines have"
         require(
@@ -110,9 +111,8 @@ class SelfLabelled:
         if detector.is_oracle:
             detector.tell(curriculum)
         tasks = curriculum.tasks
-        num_actions = max(task.graph.branching_factor for task in tasks) + 1
-        one_hot = max(task.images.shape[0] for task in tasks) if len(shape) == 1 else None
-        detector.setup(agent.num_envs, agent.num_steps, num_actions, one_hot)
+        one_hot = max(task.observation_shape[0] for task in tasks) if len(shape) == 1 else None
+        detector.setup(agent.num_envs, agent.num_steps, most_actions(tasks), one_hot)
         policy = agent.policy
         learner = self.method.attach(agent, as_labelled(curriculum))
         return SelfLabelledAgent(learner, detector, policy, self.num_labels(curriculum))

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import torch
 
 from ctgraph_rl.describe import describe
-from ctgraph_rl.learn.lifelong import check_rows
+from ctgraph_rl.learn.rules import check_rows
 from ctgraph_rl.log.files import LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog, write_metrics
 from ctgraph_rl.log.scores import scores
@@ -30,6 +30,7 @@ from ctgraph_rl.tasks.configurations import ct_su_b1
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.similarity import shared_decisions
+from ctgraph_rl.tasks.task import ct_graphs
 
 SIZES = (50, 100, 200)
 """Numbers of tasks."""
@@ -105,14 +106,14 @@ def _means(value: float) -> dict[str, float]:
 
 def readers_of_curricula(curriculum: Curriculum) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield everything that reads a curriculum, by name; each works on a new one, which remembers nothing."""
-    content = curriculum.to_json()
+    content, tasks = curriculum.to_json(), ct_graphs(curriculum.tasks, "this benchmark")
     yield "`Curriculum.from_json`", lambda: Curriculum.from_json(content)
     yield "`Curriculum.to_json`", lambda: replace(curriculum).to_json()
     yield "`Curriculum.fingerprint`", lambda: replace(curriculum).fingerprint
     yield "`Curriculum.labels`", lambda: replace(curriculum).labels
     yield "`describe`", lambda: describe(replace(curriculum))
     yield "`check_rows`", lambda: check_rows(replace(curriculum), 8)
-    yield "`shared_decisions`, of every two tasks", lambda: shared_decisions(curriculum.tasks)
+    yield "`shared_decisions`, of every two tasks", lambda: shared_decisions(tasks)
 
 
 def readers_of_logs(curriculum: Curriculum, run: Path) -> Iterator[tuple[str, Callable[[], object]]]:

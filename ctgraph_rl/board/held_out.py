@@ -21,6 +21,7 @@ from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.task import Task
 
 SEEDS = range(10**6, 2**31)
@@ -102,6 +103,8 @@ def drawn(text: str, most: int) -> int:
 def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     """Return a curriculum with other images and goals, and all else alike: what its tasks share, they share still.
 
+    Tasks that are no CT-graphs stay, and the seeds alone are other ones.
+
     Every generated image set gets another seed, equal ones the same. The branches of every decision state are renamed,
     in all tasks alike, so that goals that share their first decisions do so afterwards. Image sets without a seed stay.
 
@@ -109,10 +112,10 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
         curriculum: what was learned.
         key: decides images and goals.
     """
-    others: dict[Task, Task] = {}
+    others: dict[TaskLike, TaskLike] = {}
     held_out = curriculum.evaluation.held_out
     for task in (*curriculum.tasks, *held_out):
-        others[task] = other_task(task, key)
+        others[task] = other_task(task, key) if isinstance(task, Task) else task
     blocks = tuple(replace(block, tasks=tuple(others[task] for task in block.tasks)) for block in curriculum.blocks)
     evaluation = replace(curriculum.evaluation, held_out=tuple(others[task] for task in held_out))
     name, source = f"{curriculum.name} (held out)", f"{curriculum.source}; images and goals drawn by {key}"

@@ -19,13 +19,17 @@ from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
+from ctgraph_rl.tasks.task import are_graphs
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 """Reads a TensorDict of all environments, [num_envs], and writes ``action`` into it."""
 
 InitialState = Callable[[int], TensorDict]
 """Return the initial recurrent state of a number of environments."""
+
+SHOWN = ("observation", "is_init", "step_count", "episode_reward")
+"""What every environment shows."""
 
 TRIAL = "trial"
 """A recurrent state with this key lasts over episodes: the policy resets it itself, where a trial begins."""
@@ -39,37 +43,61 @@ Step = dict[Any, Tensor]
 
 
 def make_env(
-    curriculum: Curriculum, tasks: Sequence[Task], seed: int, device: torch.device | str = "cpu"
-) -> CTGraphEnv:
+    curriculum: Curriculum, tasks: Sequence[TaskLike], seed: int, device: torch.device | str = "cpu"
+) -> EnvBase:
     """Return an environment for a curriculum's tasks, one per row, that shows task ids where the protocol gives them.
 
     Held-out tasks have no id, which shows as zeros.
+
+    Raises:
+        ValueError: for an environment of a user that lacks what `TaskLike.make_env` asks for.
     """
     pool, length = _pool_and_ids(curriculum)
-    place: dict[str, Any] = {"task_pool": pool, "device": device}
-    if length:
-        place |= {"task_ids": curriculum.task_ids, "num_task_ids": length}
-    return CTGraphEnv(tasks, seed, **place)
+    task_ids = curriculum.task_ids if length else None
+    kind = type(pool[0])
+    env = kind.make_env(tasks, seed, task_pool=pool, device=device, task_ids=task_ids, num_task_ids=length or None)
+    if not isinstance(env, CTGraphEnv):
+        require(*_env_rules(env, kind.__name__, len(tasks), length))
+    return env
+
+
+def _env_rules(env: Any, kind: str, num_rows: int, num_task_ids: int) -> Iterator[tuple[bool, str]]:
+    """Yield the rules of what a kind of tasks makes; see `TaskLike.make_env`."""
+    made = f"{kind}.make_env must return a TorchRL EnvBase of batch_size [{num_rows}]"
+    is_env = isinstance(env, EnvBase)
+    yield is_env and tuple(env.batch_size) == (num_rows,), f"{made}, got {env!r:.80}"
+    if is_env:
+        missing = [key for key in SHOWN if key not in env.observation_spec.keys()]  # noqa: SIM118, no dict
+        write = "write them, or add TorchRL's InitTracker, StepCounter and RewardSum"
+        yield not missing, f"the environment of {kind} must show {', '.join(missing)}: {write}"
+        yield hasattr(env, "set_tasks"), f"the environment of {kind} must have set_tasks(tasks, at_episode_end)"
+        ids = not num_task_ids or "task_id" in env.observation_spec.keys()  # noqa: SIM118, no dict
+        yield ids, f"the environment of {kind} must show task_id, as the protocol does: take its make_env's task_ids"
 
 
 def agent_specs(curriculum: Curriculum) -> Specs:
-    """Return the unbatched specs of `make_env`, which agents are built from, without building an environment.
+    """Return the unbatched specs of `make_env`, which agents are built from.
+
+    Those of CT-graphs are made without building an environment.
 
     Raises:
         ValueError: if the tasks cannot be rows of one environment.
     """
     pool, length = _pool_and_ids(curriculum)
-    return specs_of(pool, num_task_ids=length)
+    if are_graphs(pool):
+        return specs_of(pool, num_task_ids=length)
+    env = make_env(curriculum, pool[:1], 0)
+    return Specs(env.observation_spec_unbatched, env.action_spec_unbatched)
 
 
-def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[Task, ...], int]:
+def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:
     """Return all tasks of a curriculum, held-out ones too, and the length of the task ids in observations or 0."""
     how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
     return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
 
 
 def collect(
-    env: CTGraphEnv,
+    env: EnvBase,
     policy: Policy,
     num_frames: int,
     num_steps: int,
@@ -100,7 +128,7 @@ def collect(
 
 @torch.no_grad()
 def batches(
-    env: CTGraphEnv,
+    env: EnvBase,
     policy: Policy,
     num_frames: int,
     num_steps: int,
@@ -129,12 +157,12 @@ def batches(
         yield in_time_order(steps, env), TensorDict(data, env.batch_size, device=env.device)
 
 
-def start_of_episodes(env: CTGraphEnv, initial_state: InitialState | None) -> Step:
+def start_of_episodes(env: EnvBase, initial_state: InitialState | None) -> Step:
     """Return the recurrent state that every episode starts with; empty without memory."""
     return {} if initial_state is None else dict(initial_state(env.numel()).items())
 
 
-def act(env: CTGraphEnv, policy: Policy, data: Step, start: Step) -> tuple[Step, Step]:
+def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, Step]:
     """Take a step in every row; return it, and the data of the next one, reset where an episode ended.
 
     A policy whose class defines ``act_on_tensors`` is asked that way: without the time of a TensorDict and a module,

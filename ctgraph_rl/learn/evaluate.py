@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from inspect import Parameter, signature
@@ -12,10 +13,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require, require_all, takes_numbers
+from ctgraph_rl.checks import require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
@@ -24,15 +26,15 @@ from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, require_tasks
 from ctgraph_rl.tasks.protocol import Evaluation
-from ctgraph_rl.tasks.task import Task
 
 
 @torch.no_grad()
 @takes_numbers
 def evaluate(
     policy: Policy | nn.Module,
-    tasks: Sequence[Task],
+    tasks: Sequence[TaskLike],
     num_episodes: int = Evaluation.num_episodes,
     *,
     seed: int = 0,
@@ -61,7 +63,8 @@ def evaluate(
 
     Returns:
         ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
-        [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other.
+        [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other. CT-graphs
+        alone have ``outcome`` and ``leaf``.
 
     Raises:
         ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy that
@@ -73,15 +76,18 @@ def evaluate(
         >>> evaluate(OptimalPolicy, [ct_su_b1()], num_episodes=10)["episode_reward"].mean().item()
         1.0
     """
-    tasks = require_all(Task, "tasks", tasks)
+    tasks = require_tasks(tasks)
     Evaluation(num_episodes, greedy, episodes_per_row).check(tasks)
     bound = isinstance(policy, RandomPolicy)
     require((callable(policy), f"policy must be a function or a module that writes actions, got {policy!r:.80}"))
     require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
     device = checked_device(device)
     rows = [task for task in tasks for _ in range(num_episodes // episodes_per_row)]
-    env = CTGraphEnv(rows, seed, device=device) if curriculum is None else make_env(curriculum, rows, seed, device)
-    acts = policy(env) if isinstance(policy, type) else as_policy(policy, env.action_spec_unbatched.n)
+    if curriculum is None:
+        env = type(tasks[0]).make_env(rows, seed, device=device)
+    else:
+        env = make_env(curriculum, rows, seed, device)
+    acts = _built_on(env, policy) if isinstance(policy, type) else as_policy(policy, num_actions(env))
     exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
     with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
         torch.manual_seed(seed)
@@ -90,14 +96,24 @@ def evaluate(
     return result.view(len(tasks), num_episodes)
 
 
-def _first_episodes(
-    env: CTGraphEnv, policy: Policy, initial_state: InitialState | None, num_episodes: int
-) -> TensorDict:
+def _built_on(env: EnvBase, policy: type) -> Policy:
+    """Return a policy whose class is built on the environment that it acts in."""
+    known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
+    require((known, f"{policy.__name__} plays CT-graphs alone: it knows their hidden state; give a policy of your own"))
+    return policy(env)
+
+
+def num_actions(env: EnvBase) -> int | None:
+    """Return the number of actions of an environment; None where they are continuous."""
+    return getattr(env.action_spec_unbatched, "n", None)
+
+
+def _first_episodes(env: EnvBase, policy: Policy, initial_state: InitialState | None, num_episodes: int) -> TensorDict:
     """Return the last data of each row's first episodes, [rows, num_episodes]."""
     start = start_of_episodes(env, initial_state)
     first = env.reset().update(start)
     data = dict(first.items(True, True))
-    result = first.select("episode_reward", "step_count", "outcome", "leaf")
+    result = first.select("episode_reward", "step_count", "outcome", "leaf", strict=False)
     result = result.unsqueeze(-1).expand(env.numel(), num_episodes).clone()
     played = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
     while (played < num_episodes).any():
@@ -183,10 +199,13 @@ def _evaluation_mode(module: nn.Module) -> Iterator[None]:
             each.training = True
 
 
-def as_policy(policy: Policy | nn.Module, num_actions: int) -> Policy:
+def as_policy(policy: Policy | nn.Module, num_actions: int | None) -> Policy:
     """Return a plain module as a policy of TensorDicts; what is one already unchanged."""
     plain = isinstance(policy, nn.Module) and not isinstance(policy, TensorDictModuleBase)
-    return LogitsPolicy(policy, num_actions) if plain else policy  # type: ignore[arg-type]
+    if not plain:
+        return policy
+    require((num_actions is not None, "a plain module gives logits, and actions are continuous: give a function"))
+    return LogitsPolicy(policy, num_actions)  # type: ignore[arg-type]
 
 
 EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
@@ -196,16 +215,17 @@ EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
     """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
 
-    Means of no episode are NaN.
+    Means of no episode are NaN, and so are the shares where tasks are no CT-graphs.
 
     Args:
         ends: the data of the last step of each episode.
     """
+    outcome = ends.get("outcome", None)
     return {
         "episodes": ends.batch_size[0],
         "return_mean": ends["episode_reward"].double().mean().item(),
-        "success_rate": (ends["outcome"] == OUTCOME_GOAL).double().mean().item(),
-        "end_rate": (ends["outcome"] != OUTCOME_FAIL).double().mean().item(),
+        "success_rate": math.nan if outcome is None else (outcome == OUTCOME_GOAL).double().mean().item(),
+        "end_rate": math.nan if outcome is None else (outcome != OUTCOME_FAIL).double().mean().item(),
         "length_mean": ends["step_count"].double().mean().item(),
     }
 
@@ -258,7 +278,7 @@ class Evaluator:
             held_out = number > len(curriculum.tasks)
             self.log.append("evaluation", moment=moment, **where, held_out=held_out, **episode_means(episodes))
 
-    def tasks_at(self, frames: int) -> dict[Task, tuple[int, str]]:
+    def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""
         curriculum = self.curriculum
         evaluated = *curriculum.tasks, *curriculum.evaluation.held_out
@@ -268,7 +288,7 @@ class Evaluator:
         seen = {i + 1 for block in curriculum.trained[: curriculum.block_at(frames)] for i in block}
         return {task: name for task, name in named.items() if name[0] in seen or name[0] > len(curriculum.tasks)}
 
-    def _policy(self, agent: Agent, tasks: Iterable[Task], frames: int) -> Policy:
+    def _policy(self, agent: Agent, tasks: Iterable[TaskLike], frames: int) -> Policy:
         """Return the agent's policy; where task ids are given, or the agent has labels, the one for each task."""
         if hasattr(agent, "policy_for_label"):
             return _of_each(agent, policies_by_label(agent, self.curriculum, self.log, tasks, frames))

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics.labels import most_frequent
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 
 
 def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
@@ -55,7 +55,7 @@ def label_spans(log: RunLog) -> tuple[Span, ...]:
 
 
 def policies_by_label(
-    agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[Task], frames: int | None = None
+    agent: Any, curriculum: Curriculum, log: RunLog, tasks: Iterable[TaskLike], frames: int | None = None
 ) -> list[TensorDictModuleBase]:
     """Return an agent's policy for each task by its most frequent label.
 

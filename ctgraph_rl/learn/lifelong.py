@@ -12,14 +12,15 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require, takes_numbers
+from ctgraph_rl.checks import takes_numbers
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import batches, make_env
 from ctgraph_rl.learn.evaluate import EPISODE_KEYS, Evaluator, episode_means
 from ctgraph_rl.learn.guide import Guide, guided_share
+from ctgraph_rl.learn.rules import check_env, check_ids, check_rows, resumes
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block
@@ -65,7 +66,8 @@ def learn_curriculum(
 
     The environment draws from streams of ``seed``, the agent from torch's global generator, which the caller seeds.
     Evaluation disturbs neither. Where boundaries are announced, a batch ends with its block; where they are hidden, a
-    batch may hold frames of two blocks.
+    batch may hold frames of two blocks. Where an environment cannot be saved within an episode, ``checkpoint`` is
+    offered the state at announced boundaries alone.
 
     Args:
         curriculum: what to learn.
@@ -99,7 +101,7 @@ def learn_curriculum(
         block = curriculum.block_at(learned.frames)
         if progress is not None:
             progress.update(block, learned.frames, learned.episode_return)
-        if checkpoint is not None:
+        if checkpoint is not None and learned.can_resume:
             checkpoint(learned.state, curriculum.is_end(learned.frames))
     return log
 
@@ -112,6 +114,8 @@ class Learned(NamedTuple):
     episode_return: float  # mean of the episodes that ended in the batch's last block; NaN without any
     state: Callable[[], dict[str, Any]]
     """Makes all that the rest of the run depends on, as tensors and plain values, until the next batch is collected."""
+
+    can_resume: bool = True  # whether the run can go on from this state as if it had not stopped
 
 
 def learning(
@@ -134,11 +138,12 @@ def learning(
     check_rows(curriculum, agent.num_envs)
     check_ids(curriculum, agent)
     env = make_env(curriculum, curriculum.blocks[0].rows(agent.num_envs), seed, device)
+    check_env(curriculum, env)
     return _learning(curriculum, agent, env, Evaluator(curriculum, seed, log, device), saved)
 
 
 def _learning(
-    curriculum: Curriculum, agent: Agent, env: CTGraphEnv, evaluator: Evaluator, saved: Mapping[str, Any] | None
+    curriculum: Curriculum, agent: Agent, env: EnvBase, evaluator: Evaluator, saved: Mapping[str, Any] | None
 ) -> Iterator[Learned]:
     """Learn block by block; see `learning`."""
     log = evaluator.log
@@ -163,7 +168,8 @@ def _learning(
             measurements = _learn(agent, batch, curriculum.block_at(frames), frames)
             measurements |= _guided(frames - batch.numel() - segment.start, curriculum)
             episode_return = log_training(log, curriculum, batch, frames - batch.numel(), measurements)
-            yield Learned(frames, batch, episode_return, partial(_state, frames, agent, env, carried=carried, log=log))
+            state = partial(_state, frames, agent, env, carried=carried, log=log)
+            yield Learned(frames, batch, episode_return, state, resumes(curriculum) or frames == segment.end)
         agent.end_task()
         evaluator.evaluate_if_due(agent, frames)
 
@@ -174,20 +180,25 @@ class Segment(NamedTuple):
     start: int  # frames of the run before it
     blocks: tuple[Block, ...]
 
+    @property
+    def end(self) -> int:
+        """Frames of the run at its end."""
+        return self.start + sum(block.num_frames for block in self.blocks)
+
 
 def segments(curriculum: Curriculum, frames: int) -> Iterator[Segment]:
     """Yield the segments that end after ``frames`` frames of the run, or right there."""
     start = 0
     for blocks in curriculum.segments:
-        end = start + sum(block.num_frames for block in blocks)
-        if frames <= end:
-            yield Segment(start, blocks)
-        start = end
+        segment = Segment(start, blocks)
+        if frames <= segment.end:
+            yield segment
+        start = segment.end
 
 
 def collect_segment(
     segment: Segment,
-    env: CTGraphEnv,
+    env: EnvBase,
     agent: Actor,
     evaluate: Callable[[int], object],
     *,
@@ -230,7 +241,7 @@ def collect_segment(
     return batches(env, agent.policy if guide is None else guide, length, num_steps, state, **where)
 
 
-def _set_tasks(env: CTGraphEnv, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
+def _set_tasks(env: EnvBase, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
     """Give an environment the tasks of a block, the rows of each seed the same."""
     if block.switch is None:
         env.set_tasks(num_seeds * block.rows(env.numel() // num_seeds), at_episode_end)
@@ -280,7 +291,7 @@ def log_training(
     for part in _of_one_block(batch, start, curriculum.ends):
         frames += part.numel()
         after = part["next"]
-        episodes = episode_means(after.select(*EPISODE_KEYS)[after["done"].squeeze(-1)])
+        episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
         events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
         given = {**episodes, **measurements, **events}
         log.append("training", block=curriculum.block_at(frames), frames=frames, **given)
@@ -295,7 +306,7 @@ def _of_one_block(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Ite
     return (batch[:, first:last] for first, last in pairwise(cuts))
 
 
-def _state(frames: int, agent: Agent, env: CTGraphEnv, carried: TensorDictBase, log: RunLog) -> dict[str, Any]:
+def _state(frames: int, agent: Agent, env: EnvBase, carried: TensorDictBase, log: RunLog) -> dict[str, Any]:
     """Return all that the rest of a run depends on, as tensors and plain values."""
     on_cuda = env.device.type == "cuda"
     return {
@@ -309,7 +320,7 @@ def _state(frames: int, agent: Agent, env: CTGraphEnv, carried: TensorDictBase, 
     }
 
 
-def _restore(saved: Mapping[str, Any], agent: Agent, env: CTGraphEnv) -> TensorDictBase:
+def _restore(saved: Mapping[str, Any], agent: Agent, env: EnvBase) -> TensorDictBase:
     """Restore a saved state; return the data that the next step starts from.
 
     Raises:
@@ -342,29 +353,3 @@ def saved_state_fits() -> Iterator[None]:
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         message = f"the saved state does not fit this agent and curriculum, start again (overwrite=true): {error}"
         raise ValueError(message) from error
-
-
-def check_rows(curriculum: Curriculum, num_envs: int) -> None:
-    """Refuse a curriculum whose blocks cannot be learned in whole steps of ``num_envs`` rows.
-
-    Raises:
-        ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
-    """
-    evaluation = curriculum.evaluation
-    evaluation.check((*curriculum.tasks, *evaluation.held_out))
-    rules: dict[Any, tuple[bool, str]] = {"every": evaluation.every_rule(num_envs)}
-    alike: dict[int, list[str]] = {}
-    for number, block in enumerate(curriculum.blocks, 1):
-        block.rows(num_envs)
-        alike.setdefault(block.num_frames, []).append(str(number))
-    for block in {block.num_frames: block for block in curriculum.blocks}.values():
-        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike[block.num_frames])}")
-    require(*rules.values())
-
-
-def check_ids(curriculum: Curriculum, agent: Agent) -> None:
-    """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
-    reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
-    shows = curriculum.protocol.task_id == "one_hot"
-    message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
-    require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))

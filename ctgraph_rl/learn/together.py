@@ -18,16 +18,16 @@ from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.learn.lifelong import (
     Progress,
     announced_id,
-    check_ids,
-    check_rows,
     collect_segment,
     log_training,
     require_finite,
     saved_state_fits,
     segments,
 )
+from ctgraph_rl.learn.rules import check_ids, check_rows
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import are_graphs
 
 OfferCheckpoints = Callable[[Callable[[], list[dict[str, Any]]], bool], object]
 """Takes a function that makes the state of each seed's run, and whether a block ends here."""
@@ -64,6 +64,9 @@ class Group(Protocol):
 
 def why_not_together(curriculum: Curriculum) -> str | None:
     """Return why seeds cannot learn a curriculum in one environment; None if they can."""
+    kind = type(curriculum.tasks[0]).__name__
+    if not are_graphs(curriculum.tasks):
+        return f"the rows of {kind} cannot draw from the streams of several seeds, as those of CT-graphs can"
     shared = any(block.switch is not None and block.switch.together for block in curriculum.blocks)
     if curriculum.protocol.guide_frames:
         return "a guide draws from the generator of one seed"
@@ -167,7 +170,7 @@ class _Actor:
 
 def _make_env(curriculum: Curriculum, num_envs: int, seeds: Sequence[int], device: torch.device) -> CTGraphEnv:
     """Return an environment with the rows of each seed as it has them alone, one seed after the other."""
-    env = make_env(curriculum, len(seeds) * curriculum.blocks[0].rows(num_envs), seeds[0], device)
+    env: CTGraphEnv = make_env(curriculum, len(seeds) * curriculum.blocks[0].rows(num_envs), seeds[0], device)
     seed = torch.tensor(seeds, device=device).repeat_interleave(num_envs)
     env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(len(seeds)))
     return env

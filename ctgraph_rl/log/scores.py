@@ -16,8 +16,9 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observability import POLICIES, state_entropy
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import (
     memoryless_ceiling,
     open_loop_ceiling,
@@ -34,7 +35,7 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
     """Every metric by name, those of `metrics.summary` first; undefined with the reason where it has no value.
 
     The lifelong metrics are on the scale of l2metrics, 1..101, with each task's known range: 1 is its ``fail_reward``,
-    101 its optimal value.
+    101 its optimal value. Of tasks that are no CT-graphs, 1 is the lowest mean return.
 
     Args:
         log: a whole run.
@@ -61,29 +62,51 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
 
 def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> dict[str, Any]:
     """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give."""
-    count, best = len(curriculum.tasks), optimal_values(curriculum.tasks)
+    tasks = curriculum.tasks
+    count, best = len(tasks), optimal_values(tasks)
     curves = _curves(log, curriculum)
     return {
         "performance": log.performance(count),
         "trained": curriculum.trained,
         "curves": curves,
-        "mastered_returns": mastered_returns(curriculum.tasks),
+        "mastered_returns": mastered_returns(tasks),
         "best": best,
-        "zero": torch.tensor([task.fail_reward for task in curriculum.tasks], dtype=torch.float64),
-        **ceilings(curriculum.tasks),
-        "end_rates": log.last("end_rate", count),
-        "success_rates": log.last("success_rate", count),
+        "zero": lowest_returns(tasks),
         "episodes": log.training("episodes"),
         "returns": log.training("return_mean"),
         "labelling": _labelling(log, curriculum),
         "interval_best": _interval_best(log, curriculum, best),
-        "random_frames": [random_frames_to_goal(task) for task in curriculum.tasks],
-        "search_episodes": [task.graph.expected_search_episodes for task in curriculum.tasks],
         **_first_blocks(log, curriculum),
+        **_of_graphs(log, tasks),
         **_regimes(log, curriculum, best, experts),
         **_areas(curves, best, experts, trapezoids=False),
         **_areas(curves, best, experts, trapezoids=True),
     }
+
+
+OF_GRAPHS = (
+    *("open_loop_ceilings", "memoryless_ceilings", "end_rates", "success_rates", "first_success_rates"),
+    *(f"{policy}_entropies" for policy in POLICIES),
+    *("random_frames", "search_episodes"),
+)
+"""Inputs that CT-graphs alone have."""
+
+
+def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> dict[str, Any]:
+    """Return the inputs that CT-graphs alone have, all but those of first blocks."""
+    if not are_graphs(tasks):
+        return dict.fromkeys(OF_GRAPHS, Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}"))
+    return {
+        **ceilings(tasks),
+        "end_rates": log.last("end_rate", len(tasks)),
+        "success_rates": log.last("success_rate", len(tasks)),
+        "random_frames": [random_frames_to_goal(task) for task in tasks],
+        "search_episodes": [task.graph.expected_search_episodes for task in tasks],
+    }
+
+
+def _kind(tasks: Sequence[TaskLike]) -> str:
+    return type(tasks[0]).__name__
 
 
 def _check_same(log: RunLog, curriculum: Curriculum) -> None:
@@ -100,8 +123,13 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
     require((tasks <= most[0] and blocks <= most[1], f"{more}: give the curriculum that the run learned"))
 
 
-def optimal_values(tasks: Sequence[Task]) -> Tensor:
-    """Each task's best mean return, float64 [tasks]; NaN where a graph is too large to know."""
+def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
+    """Each task's best mean return, float64 [tasks]; NaN where a graph is too large to know.
+
+    Of tasks that are no CT-graphs, the reason where one does not know it.
+    """
+    if not are_graphs(tasks):
+        return _said_by(tasks, "optimal_value", lambda task: task.optimal_value(1.0))
     return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64)
 
 
@@ -118,7 +146,21 @@ def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
     return known
 
 
-def _of_each(value: Callable[[Task], float], tasks: Sequence[Task]) -> Tensor | Undefined:
+def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
+    """Each task's return of a failure, of others than CT-graphs the lowest mean return, float64 [tasks]."""
+    if not are_graphs(tasks):
+        return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
+    return torch.tensor([task.fail_reward for task in tasks], dtype=torch.float64)
+
+
+def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
+    """Return a value that tasks may know themselves by an optional member, or why one does not."""
+    if not hasattr(type(tasks[0]), member):
+        return Undefined(f"{_kind(tasks)} has no {member}, so it is not known")
+    return _of_each(value, tasks)
+
+
+def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
     """Return a value of each task; the reason of the first that has none."""
     try:
         return torch.tensor([value(task) for task in tasks], dtype=torch.float64)
@@ -126,20 +168,24 @@ def _of_each(value: Callable[[Task], float], tasks: Sequence[Task]) -> Tensor | 
         return Undefined(str(error))
 
 
-def mastered_returns(tasks: Sequence[Task]) -> Tensor:
+def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """The mean return from which on each task is mastered, float64 [tasks]; NaN as for `optimal_values`.
 
     It is `metrics.MASTERED` times a positive optimal value, and that share of the way from the worst possible mean
     return to any other, so that the optimal policy masters every task.
     """
-    return torch.tensor([_mastered_return(task) for task in tasks], dtype=torch.float64)
-
-
-def _mastered_return(task: Task) -> float:
-    best, share = _known(optimal_value, task), metrics.MASTERED
-    if best > 0 or math.isnan(best):
+    best = optimal_values(tasks)
+    if isinstance(best, Undefined):
+        return best
+    share, positive = metrics.MASTERED, (best > 0) | best.isnan()
+    if positive.all():
         return share * best
-    return best - (1 - share) * (best - _known(worst_value, task))
+    worst = _of_each(partial(_known, worst_value), tasks) if are_graphs(tasks) else lowest_returns(tasks)
+    return (
+        worst
+        if isinstance(worst, Undefined)
+        else torch.where(positive, share * best, best - (1 - share) * (best - worst))
+    )
 
 
 def _known(value: Callable[[Task, float], float], task: Task) -> float:
@@ -157,8 +203,10 @@ def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
     return Curves(torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64), (0,), (0,), curriculum.trained)
 
 
-def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor) -> Tensor:
+def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
     """Return the optimum of the block that each interval ends in; NaN where tasks of a block differ in it."""
+    if isinstance(best, Undefined):
+        return best
     of_task = best.tolist()
     values = [{of_task[task] for task in block} for block in curriculum.trained]
     alone = torch.tensor([each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64)
@@ -204,15 +252,22 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
     }
 
 
-def _regimes(log: RunLog, curriculum: Curriculum, best: Tensor, experts: Sequence[RunLog] | None) -> dict[str, Any]:
+def _regimes(
+    log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
+) -> dict[str, Any]:
     """Return the run and its experts as the lifelong metrics see them."""
+    lowest = lowest_returns(curriculum.tasks)
+    for each in (best, lowest):
+        if isinstance(each, Undefined):
+            return dict.fromkeys(("regimes", "experts"), each)
+    assert isinstance(best, Tensor)
+    assert isinstance(lowest, Tensor)
     try:
         regimes = log.regime_table(curriculum.trained, curriculum.labels)
         require((not best.isnan().any(), "a task's optimal value is not known: its graph is too large"))
     except ValueError as error:
         return dict.fromkeys(("regimes", "experts"), Undefined(str(error)))
-    lowest = [task.fail_reward for task in curriculum.tasks]
-    ranges = dict(zip(curriculum.labels, zip(lowest, best.tolist(), strict=True), strict=True))
+    ranges = dict(zip(curriculum.labels, zip(lowest.tolist(), best.tolist(), strict=True), strict=True))
     returns = [_returns(expert) for expert in experts or ()]
     curves = {label: [curve] for label, curve in zip(curriculum.labels, returns, strict=False) if len(curve)}
     prepared, of_experts = metrics.prepare(regimes, curves, ranges)
@@ -225,11 +280,15 @@ def _returns(expert: RunLog) -> Tensor:
     return returns[~returns.isnan()]
 
 
-def _areas(curves: Curves, best: Tensor, experts: Sequence[RunLog] | None, trapezoids: bool) -> dict[str, Any]:
+def _areas(
+    curves: Curves, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool
+) -> dict[str, Any]:
     """Return areas under curves for forward transfer; its definitions are of performance whose best is 1."""
     kind = "trapezoid_areas" if trapezoids else "areas"
     try:
         require((experts is not None, NO_EXPERTS))
+        if isinstance(best, Undefined):
+            raise best
         best_is_1 = torch.allclose(best, torch.ones_like(best), rtol=0, atol=1e-9)
         require((best_is_1, "the definition needs tasks whose optimal value is 1"))
         alone = [expert.curves([(0,)]) for expert in experts or ()]

@@ -13,6 +13,7 @@ from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.runs.read import Run, grouped
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import are_graphs
 
 NOTHING_KNOWN = Known(UNBOUNDED.low, UNBOUNDED.high, tasks=1, evaluations=1, failure_is_lowest=False)
 
@@ -82,6 +83,8 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
         curriculum: what they learn.
         evaluations: of each task, after those before training; those of sums over time need it alone.
     """
+    if not are_graphs(curriculum.tasks):
+        return _bounds_of_others(curriculum, evaluations)
     returns = {label: task.return_bounds for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)}
     lows, highs = zip(*returns.values(), strict=True)
     failure = all(task.fail_reward == task.return_bounds[0] for task in curriculum.tasks)
@@ -89,6 +92,20 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
     noisy = any(task.reward_std > 0 for task in curriculum.tasks)
     alike = curriculum.evaluation.greedy and all(task.is_deterministic for task in curriculum.tasks)
     return BoundsOfRuns(returns, known, noisy=noisy, one_episode=alike)
+
+
+def _bounds_of_others(curriculum: Curriculum, evaluations: int) -> BoundsOfRuns:
+    """Return the bounds of tasks that are no CT-graphs; none where a task does not know its own.
+
+    They bound means, so what a few episodes of a task with chance measure may be outside.
+    """
+    try:
+        pairs = [task.return_bounds for task in curriculum.tasks]  # type: ignore[attr-defined]
+    except (AttributeError, ValueError):
+        return NO_BOUNDS
+    lows, highs = zip(*pairs, strict=True)
+    known = Known(min(lows), max(highs), len(pairs), evaluations=evaluations, failure_is_lowest=True)
+    return BoundsOfRuns(dict(zip(curriculum.labels, pairs, strict=True)), known, noisy=True, one_episode=False)
 
 
 def curriculum_of(run: Run) -> Curriculum | None:

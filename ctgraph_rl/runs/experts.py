@@ -22,8 +22,8 @@ from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.protocol import Block, Protocol
-from ctgraph_rl.tasks.task import Task
 
 RunDirs = Mapping[int, Path]
 """The directory of each seed."""
@@ -65,7 +65,7 @@ class Expert(NamedTuple):
         return RunLog.read(self.run_dir / LOG)
 
 
-def expert_curriculum(curriculum: Curriculum, task: Task) -> Curriculum:
+def expert_curriculum(curriculum: Curriculum, task: TaskLike) -> Curriculum:
     """A task of a curriculum alone: the frames of the block that trains it first, the same evaluation and task id.
 
     Raises:

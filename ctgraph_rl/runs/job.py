@@ -18,8 +18,8 @@ from rich.console import Console
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.disk import is_writable
+from ctgraph_rl.learn.rules import notes
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
@@ -36,8 +36,6 @@ from ctgraph_rl.runs.trackers import FOLDER, Tracker
 from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import changed
-
-KERNEL_NAMES = {kind.__name__ for kind in KERNEL_REWARDS}
 
 OF_AN_EXPERT = ("agent", "seed", "device", "num_threads", "portable")
 """Settings that a single-task expert shares with the run that needs it."""
@@ -275,9 +273,8 @@ def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) ->
     job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
     if cfg.experts and not job.curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
-    slow = sorted({type(task.reward_fn).__name__ for task in job.curriculum.tasks} - KERNEL_NAMES)
-    if slow:
-        print(f"note: the C kernel does not know {', '.join(slow)}: steps take the tensor engine, which is slower")
+    for note in notes(job.curriculum):
+        print(f"note: {note}")
     job.learn(run_dir)
 
 

@@ -26,7 +26,7 @@ from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.settings import parameters_of, with_added
 from ctgraph_rl.runs.train import MakeAgent, new_agent, with_method
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 
 OURS = {
     "agent": re.compile(r"(baselines\.\w+)\.(\w+)"),
@@ -52,7 +52,7 @@ class Trained:
     frames: int  # that it has learned from
     log: RunLog
 
-    def policy_for(self, task: Task) -> TensorDictModuleBase:
+    def policy_for(self, task: TaskLike) -> TensorDictModuleBase:
         """Return the policy for a task: the one for its id, where the curriculum has one and shows it.
 
         For an agent that labels tasks itself, it is that of the task's most frequent label.

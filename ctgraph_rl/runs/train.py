@@ -21,8 +21,9 @@ from ctgraph_rl.checks import as_path, is_json_object, require, require_memory, 
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
-from ctgraph_rl.learn.lifelong import check_ids, check_rows, learn_curriculum
+from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.learn.rules import check_ids, check_rows
 from ctgraph_rl.learn.together import Group, learn_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS

@@ -15,9 +15,10 @@ from os import PathLike
 from typing import Any
 
 from ctgraph_rl.checks import LARGEST_INT, as_path, as_tuple, is_int, make_fields_plain, require
-from ctgraph_rl.tasks.curriculum_json import read_curriculum, write_curriculum
+from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.task import Task, are_graphs
 
 FINGERPRINT_SCHEMA = 1
 """Raised when the way a fingerprint is computed changes."""
@@ -72,6 +73,7 @@ class Curriculum:
             (isinstance(self.protocol, Protocol), f"protocol must be a Protocol, got {self.protocol!r}"),
         )
         self.protocol.ids(len(self.tasks))
+        require(*are_tasks("tasks", (*self.tasks, *self.evaluation.held_out)))
         require(*self._task_rules())
 
     def __repr__(self) -> str:
@@ -93,13 +95,16 @@ class Curriculum:
 
     def _task_rules(self) -> list[tuple[bool, str]]:
         everything = (*self.tasks, *self.evaluation.held_out)
-        shapes = list(dict.fromkeys(task.images.shape for task in everything))
-        one_shape = len(shapes) == 1 or all(len(shape) == 1 for shape in shapes)
+        shapes = list(dict.fromkeys(task.observation_shape for task in everything))
+        actions = list(dict.fromkeys(task.num_actions for task in everything))
+        pads = are_graphs(everything)
+        one_shape = len(shapes) == 1 or (pads and all(len(shape) == 1 for shape in shapes))
         trained = set(self.tasks)
         trained_too = [task for task in self.evaluation.held_out if task in trained]
         one_each = self.protocol.task_id != "at_boundaries" or all(len(set(block.tasks)) == 1 for block in self.blocks)
         return [
             (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
+            (pads or len(actions) == 1, f"all tasks of a curriculum must have as many actions, got {actions}"),
             (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
             (self.num_frames <= LARGEST_INT, f"the blocks have {self.num_frames:,} frames together, at most 2**63 - 1"),
             (one_each, "task ids given at_boundaries need blocks of one task each"),
@@ -112,7 +117,7 @@ class Curriculum:
         return how.at_block_ends or at_once or 0 < how.every <= self.num_frames
 
     @cached_property
-    def tasks(self) -> tuple[Task, ...]:
+    def tasks(self) -> tuple[TaskLike, ...]:
         """The different tasks, in the order of first appearance."""
         return tuple(dict.fromkeys(task for block in self.blocks for task in block.tasks))
 
@@ -162,23 +167,24 @@ class Curriculum:
     """The former name of `segments`."""
 
     @property
-    def task_ids(self) -> dict[Task, int]:
+    def task_ids(self) -> dict[TaskLike, int]:
         """The id of each of ``tasks``."""
         return dict(zip(self.tasks, self.protocol.ids(len(self.tasks)), strict=True))
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A different short name for each of ``tasks``: the goal, and what else differs between them."""
+        """A different short name for each of ``tasks``: the goal, or the first of its parts, and what else differs."""
         return self.evaluated_labels[: len(self.tasks)]
 
     @cached_property
     def evaluated_labels(self) -> tuple[str, ...]:
         """`labels`, and in the same manner those of the held-out tasks."""
         parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
-        differing = [name for name in parts[0] if name == "goal" or len({part[name] for part in parts}) > 1]
+        first = next(iter(parts[0]))
+        differing = [name for name in parts[0] if name == first or len({part.get(name) for part in parts}) > 1]
         counts: Counter[str] = Counter()
         labels = []
-        for label in ("-".join(part[name] for name in differing) for part in parts):
+        for label in ("-".join(part.get(name, "") for name in differing) for part in parts):
             counts[label] += 1
             labels.append(f"{label}#{counts[label]}" if counts[label] > 1 else label)
         return tuple(labels)
@@ -221,10 +227,11 @@ class Curriculum:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _block_html(number: int, block: Block, labels: Mapping[Task, str]) -> str:
+def _block_html(number: int, block: Block, labels: Mapping[TaskLike, str]) -> str:
     """Return a row of the table of a notebook."""
     tasks = list(dict.fromkeys(block.tasks))
-    graphs = dict.fromkeys((task.graph.branching_factor, task.graph.depth, task.graph.wait_prob) for task in tasks)
+    of_tasks = [task.graph for task in tasks if isinstance(task, Task)]
+    graphs = dict.fromkeys((graph.branching_factor, graph.depth, graph.wait_prob) for graph in of_tasks)
     shapes = [f"{b}, {d}, {p:g}" for b, d, p in graphs]
     cells = (str(number), _some([labels[task] for task in tasks]), _some(shapes, "; "), f"{block.num_frames:,}")
     return f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
@@ -241,18 +248,13 @@ def _canonical(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         compared = [f for f in fields(value) if f.compare]
         given = {f.name: getattr(value, f.name) for f in compared if getattr(value, f.name) != _default(f)}
-        return {"type": _type_name(type(value)), **{name: _canonical(item) for name, item in given.items()}}
+        return {"type": type_name(type(value)), **{name: _canonical(item) for name, item in given.items()}}
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]
     plain = value is None or isinstance(value, (bool, int, float, str))
     fix = "put @dataclass(frozen=True) above its class, whose fields then are part of the fingerprint"
     require((plain, f"a curriculum's parts must be dataclasses or plain values, got {value!r:.80}: {fix}"))
     return value
-
-
-def _type_name(kind: type) -> str:
-    """Our own types by name alone, so that they may move between modules; a user's with the module."""
-    return kind.__qualname__ if kind.__module__.startswith("ctgraph_rl.") else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _default(field_: Any) -> Any:

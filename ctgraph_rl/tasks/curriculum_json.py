@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -27,6 +28,8 @@ from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import read_regular, write_whole
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.images import IMAGE_SETS
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
 from ctgraph_rl.tasks.memory import bank_bytes
 from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -51,15 +54,20 @@ MAX_BANK_BYTES = 2**36
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
+TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
+"""Kinds of tasks of this package by name, beside `Task`, whose JSON names none."""
+
 
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:
     """Return a curriculum as JSON; see `Curriculum.to_json`."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
-    places = {task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))}
+    places: dict[TaskLike, int] = {
+        task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))
+    }
     content = {
         "schema": SCHEMA,
         **{name: getattr(curriculum, name) for name in ("fingerprint", "name", "version", "source")},
-        "tasks": [_plain(task, {}) for task in places],
+        "tasks": [_plain_task(task) for task in places],
         "blocks": [_plain(block, places) for block in curriculum.blocks],
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
@@ -91,9 +99,9 @@ def read_curriculum(
     return curriculum
 
 
-def _plain(value: Any, places: Mapping[Task, int]) -> Any:
+def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
     """A value of ours as JSON, tasks by their places where these are given."""
-    if isinstance(value, Task) and places:
+    if places and value in places:
         return places[value]
     if isinstance(value, tuple):
         return [_plain(item, places) for item in value]
@@ -106,21 +114,40 @@ def _plain(value: Any, places: Mapping[Task, int]) -> Any:
     return {**kind, **{name: _plain(getattr(value, name), places) for name in _names(type(value))}}
 
 
+def _plain_task(task: TaskLike) -> dict[str, Any]:
+    """Return a task as JSON; a kind beside `Task` is named."""
+    kind = type(task)
+    if kind is Task:
+        return _plain(task, {})
+    return {"type": type_name(kind)} | {name: _plain(getattr(task, name), {}) for name in _names(kind)}
+
+
+def type_name(kind: type) -> str:
+    """Our own types by name alone, so that they may move between modules; a user's with the module."""
+    return kind.__qualname__ if kind.__module__.startswith("ctgraph_rl.") else f"{kind.__module__}.{kind.__qualname__}"
+
+
 def _names(kind: type) -> list[str]:
     """The fields that a class of ours is made of."""
     return [field.name for field in fields(kind) if field.init]
 
 
 def _about(curriculum: Curriculum) -> dict[str, Any]:
-    numbers = ("num_states", "num_end_states", "reward_prob_random", "expected_episode_length")
     return {
         "written_by": f"ctgraph_rl {__version__}",
         "num_frames": curriculum.num_frames,
         "tasks": [
-            {"label": label, "goal_leaf": task.goal_leaf, **{name: getattr(task.graph, name) for name in numbers}}
-            for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
+            {"label": label} | _of_graph(task) for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
         ],
     }
+
+
+def _of_graph(task: TaskLike) -> dict[str, Any]:
+    """Return numbers that follow from a CT-graph."""
+    if not isinstance(task, Task):
+        return {}
+    numbers = ("num_states", "num_end_states", "reward_prob_random", "expected_episode_length")
+    return {"goal_leaf": task.goal_leaf} | {name: getattr(task.graph, name) for name in numbers}
 
 
 def file_text(content: Mapping[str, Any]) -> str:
@@ -215,7 +242,35 @@ def _parts(content: Mapping[str, Any]) -> dict[str, Any]:
     return {**about, "blocks": tuple(blocks), "evaluation": evaluation, "protocol": protocol}
 
 
-def _task(content: Any) -> Task:
+def _task(content: Any) -> TaskLike:
+    if not isinstance(content, Mapping) or "type" not in content:
+        return _graph(content)
+    task = _built(_kind(content["type"]), {key: item for key, item in content.items() if key != "type"}, {})
+    unknown = [name for name in getattr(task, "modules", ()) if not _is_known(name)]
+    fix = "import them first, as nothing of a file is imported"
+    require((not unknown, f"the task needs the modules {', '.join(unknown)}: {fix}"))
+    return task
+
+
+def _kind(name: Any) -> type:
+    """Return the class of tasks that a file names: one of ours, or of a module that is imported already."""
+    require((isinstance(name, str), f"type must be the name of a kind of tasks, got {name!r:.80}"))
+    if name in TASK_KINDS:
+        return TASK_KINDS[name]
+    module, _, own_name = name.rpartition(".")
+    kind = getattr(sys.modules.get(module), own_name, None)
+    fix = f"import {module or 'its module'} first, as nothing of a file is imported, or give the curriculum as Python"
+    known = isinstance(kind, type) and kind.__module__ == module and is_kind(kind)
+    require((known, f"type {name!r:.80} is no kind of tasks that is known here: {fix}"))
+    return kind  # type: ignore[return-value]
+
+
+def _is_known(module: str) -> bool:
+    """Return whether a module may be imported for a file: it is imported, ours or Gymnasium's."""
+    return module in sys.modules or module.partition(".")[0] in ("ctgraph_rl", "curricula", "gymnasium")
+
+
+def _graph(content: Any) -> Task:
     parts = {
         "graph": partial(_built, CTGraph, readers={}),
         "observations": partial(_built, Observations, readers={}),
@@ -261,7 +316,7 @@ def _chosen(kinds: Sequence[type], content: Any, or_none: bool = False) -> Any:
     return _built(names[given], {key: item for key, item in content.items() if key != "type"}, {})
 
 
-def _tasks_at(tasks: Sequence[Task], positions: Any) -> tuple[Task, ...]:
+def _tasks_at(tasks: Sequence[TaskLike], positions: Any) -> tuple[TaskLike, ...]:
     """The tasks at positions in the list of tasks."""
     holds = isinstance(positions, list) and all(is_int(i, 0, len(tasks) - 1) for i in positions)
     require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {positions!r:.80}"))

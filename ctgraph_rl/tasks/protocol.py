@@ -16,8 +16,8 @@ from ctgraph_rl.checks import (
     require,
     true_or_false,
 )
+from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.switch import Switch, switch_rule
-from ctgraph_rl.tasks.task import Task
 
 Part = TypeVar("Part", "Evaluation", "Protocol")
 
@@ -53,25 +53,26 @@ class Block:
         1024
     """
 
-    tasks: tuple[Task, ...]
+    tasks: tuple[TaskLike, ...]
     num_frames: int
     switch: Switch | None = None
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        tasks = (self.tasks,) if isinstance(self.tasks, Task) else as_tuple(self.tasks)
+        tasks = (self.tasks,) if is_dataclass(self.tasks) else as_tuple(self.tasks)
         object.__setattr__(self, "tasks", tasks)
-        only_tasks = isinstance(tasks, tuple) and bool(tasks) and all(isinstance(task, Task) for task in tasks)
+        only_tasks = "a block needs at least one Task and nothing else"
         switches = self.switch is None or (is_dataclass(self.switch) and switch_rule(self.switch)[0])
         require(
-            (only_tasks, f"a block needs at least one Task and nothing else, got {tasks!r}"),
+            (tasks != (), f"{only_tasks}, got ()"),
+            *are_tasks(only_tasks, tasks),
             *at_least_one(num_frames=self.num_frames),
             (switches, f"switch must be a frozen dataclass such as Drift(100), or None, got {self.switch!r}"),
         )
         enough = self.switch is None or len(self.tasks) > 1
         require((enough, "a block with a switch needs at least two tasks, got one; leave the switch out"))
 
-    def rows(self, num_envs: int) -> list[Task]:
+    def rows(self, num_envs: int) -> list[TaskLike]:
         """The task that each of ``num_envs`` rows begins with; several tasks without a switch take turns.
 
         Raises:
@@ -116,20 +117,19 @@ class Evaluation:
     every: int = 0
     at_block_ends: bool = True
     tasks: str = "all"
-    held_out: tuple[Task, ...] = ()
+    held_out: tuple[TaskLike, ...] = ()
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
         n, per_row = self.num_episodes, self.episodes_per_row
-        held_out = (self.held_out,) if isinstance(self.held_out, Task) else as_tuple(self.held_out)
+        held_out = (self.held_out,) if is_dataclass(self.held_out) else as_tuple(self.held_out)
         object.__setattr__(self, "held_out", held_out)
-        only_tasks = isinstance(held_out, tuple) and all(isinstance(task, Task) for task in held_out)
         require(
             *at_least_one(num_episodes=n, episodes_per_row=per_row),
             *true_or_false(greedy=self.greedy, before=self.before, at_block_ends=self.at_block_ends),
             (is_int(self.every, 0), f"every must be an integer >= 0, got {self.every!r}"),
             *one_of(EVALUATED, tasks=self.tasks),
-            (only_tasks, f"held_out must be tasks, got {held_out!r}"),
+            *are_tasks("held_out must be tasks", held_out),
         )
         require(
             (n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"),
@@ -142,14 +142,14 @@ class Evaluation:
         message = f"evaluation.every={self.every} must be a multiple of num_envs={num_envs}, such as {near}"
         return self.every % num_envs == 0, message
 
-    def check(self, tasks: Iterable[Task]) -> None:
+    def check(self, tasks: Iterable[TaskLike]) -> None:
         """Refuse to measure changing goals by first episodes, which all have the first goal.
 
         Raises:
             ValueError: for one episode a row and a task with ``goal_change``.
         """
         tasks = tuple(tasks)
-        changing = self.episodes_per_row == 1 and any(task.goal_change for task in tasks)
+        changing = self.episodes_per_row == 1 and any(getattr(task, "goal_change", None) for task in tasks)
         rows = len(tasks) * self.num_episodes // self.episodes_per_row
         many = f"num_episodes={self.num_episodes} of {len(tasks)} tasks are {rows:,} rows at once, the limit is"
         require(

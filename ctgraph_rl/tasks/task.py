@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from os import PathLike
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeGuard
 
 from torch import Tensor
 
@@ -24,7 +25,11 @@ from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
 from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
+from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observations import Observations
+
+if TYPE_CHECKING:
+    import torch
 
 REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
 NOISES = ("additive", "multiplicative")
@@ -94,6 +99,9 @@ class Task:
     legacy_goal_change: bool = False
     swapped_branches: tuple[tuple[int, ...], tuple[int, int]] | None = field(default=None, metadata={"added": True})
 
+    resumes: ClassVar[bool] = True
+    """See `TaskLike`."""
+
     def __post_init__(self) -> None:
         make_fields_plain(self)
         self._check_parts()
@@ -159,6 +167,21 @@ class Task:
             ValueError: lists everything of the task that the file cannot express.
         """
         return reference.write_task(self, None if path is None else as_path("path", path), general_seed)
+
+    @classmethod
+    def make_env(
+        cls,
+        tasks: Sequence[Task],
+        seed: int = 0,
+        *,
+        task_pool: Sequence[Task] | None = None,
+        device: torch.device | str = "cpu",
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
+    ) -> Any:
+        """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``; see `TaskLike`."""
+        env = import_module("ctgraph_rl.env").CTGraphEnv
+        return env(tasks, seed, task_pool=task_pool, device=device, task_ids=task_ids, num_task_ids=num_task_ids)
 
     def _check_parts(self) -> None:
         images, reward_fn, shown = self.images, self.reward_fn, self.observations
@@ -266,6 +289,16 @@ class Task:
         return self.graph.wait_prob == 0 and not drawn and not noise
 
     @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """The shape of an observation; a batch pads one-hot ones to the longest of its tasks."""
+        return tuple(self.images.shape)
+
+    @property
+    def num_actions(self) -> int:
+        """Waiting, and the b decisions."""
+        return self.graph.branching_factor + 1
+
+    @property
     def image_seed(self) -> int | None:
         """The seed of a generated image set, None for sets without."""
         return getattr(self.images, "seed", None)
@@ -282,6 +315,25 @@ class Task:
             "images": images,
             "swapped_branches": _swap_label(self.swapped_branches),
         }
+
+
+def are_graphs(tasks: Iterable[TaskLike]) -> TypeGuard[Sequence[Task]]:
+    """Return whether all tasks are CT-graphs."""
+    return all(isinstance(task, Task) for task in tasks)
+
+
+def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
+    """Return tasks that are all CT-graphs.
+
+    Args:
+        tasks: of any kind.
+        what: needs CT-graphs, in words.
+
+    Raises:
+        ValueError: for another kind.
+    """
+    require((are_graphs(tasks), f"{what} needs CT-graphs, not {type(tasks[0]).__name__}; take another curriculum"))
+    return tasks  # type: ignore[return-value]
 
 
 def _nested(value: object) -> object:

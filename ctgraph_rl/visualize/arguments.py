@@ -14,7 +14,7 @@ from ctgraph_rl.runs.config import curriculum_names, curriculum_of
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.task import Task, ct_graphs
 from ctgraph_rl.visualize.layout import in_digits
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.visits import Visits, visits
@@ -123,7 +123,7 @@ def _called(name: str, task: Task) -> Selection:
 
 
 def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
-    tasks, labels = curriculum.tasks, curriculum.labels
+    tasks, labels = ct_graphs(curriculum.tasks, "visualize"), curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
     require((is_int(number, 1, len(tasks)), rule))
     return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")

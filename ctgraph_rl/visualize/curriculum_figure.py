@@ -13,6 +13,7 @@ from typing import Any
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import ct_graphs
 from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
 from ctgraph_rl.visualize.style import Point, draw_lines, goal_mark, mark, new_figure, save_figure, shape_of, stub_lines
 
@@ -55,7 +56,7 @@ def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     """For each graph its goals, each with a label of its decisions and the blocks that train it."""
     blocks: dict[CTGraph, dict[Goal, list[int]]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
-        for task in dict.fromkeys(block.tasks):
+        for task in dict.fromkeys(ct_graphs(block.tasks, "a figure of graphs")):
             blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
     return {graph: {goal: _label(goal, of) for goal, of in goals.items()} for graph, goals in blocks.items()}
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.similarity import MEASURES
+from ctgraph_rl.tasks.task import ct_graphs
 from ctgraph_rl.visualize.style import new_figure, save_figure
 
 MOST_NUMBERS, MOST_LABELS = 8, 40
@@ -28,13 +29,14 @@ def draw_similarity(curriculum: Curriculum, path: Path | str) -> None:
 
     Raises:
         ModuleNotFoundError: without matplotlib; names the extra to install.
-        ValueError: for tasks too large for a measure.
+        ValueError: for tasks too large for a measure, and those that are no CT-graphs.
     """
+    tasks = ct_graphs(curriculum.tasks, "a figure of how alike tasks are")
     figure = new_figure(12, 7.6)
-    figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(curriculum.tasks)} tasks")
+    figure.suptitle(f"{figure_text(curriculum.name)}: similarity of {len(tasks)} tasks")
     *panels, last = figure.subplots(2, 3).flat
     for axes, (title, measure) in zip(panels, MEASURES.items(), strict=True):
-        image = _draw_matrix(axes, measure(curriculum.tasks), curriculum.labels, title)
+        image = _draw_matrix(axes, measure(tasks), curriculum.labels, title)
     last.axis("off")
     figure.colorbar(image, ax=last, location="left", shrink=0.8, label="share; hatched: nothing to compare")
     save_figure(figure, path)

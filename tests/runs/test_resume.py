@@ -20,6 +20,7 @@ from ctgraph_rl.learn.lifelong import OfferCheckpoint
 from ctgraph_rl.runs.checkpoints import decoded, encoded
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent
+from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift
 
 AGENTS: dict[str, tuple[str, list[str]]] = {name: (name, less(name)) for name in NAMES} | {
@@ -57,6 +58,14 @@ CURRICULA = {
     "evaluated at the end only": uneven(evaluation=Evaluation(4, before=False)),
     "changing goals": of(
         Block(TWO_GOALS, 160), Block(replace(TWO_GOALS, goal=(2,)), 64), evaluation=replace(MIDDLE, episodes_per_row=4)
+    ),
+}
+
+LAKES = [GymTask("FrozenLake-v1", {"is_slippery": slips}, max_episode_steps=20) for slips in (True, False)]
+CURRICULA |= {
+    "gymnasium": of(Block(LAKES[0], 80), Block(LAKES[1], 56)),
+    "gymnasium, hidden with ids": of(
+        Block((LAKES[0],), 80), Block((LAKES[1], LAKES[0]), 56), task_id="one_hot", boundaries="hidden"
     ),
 }
 
@@ -146,6 +155,7 @@ def test_every_agent_goes_on_as_if_never_stopped(learner, name):
         "drift",
         "evaluated at the end only",
         "changing goals",
+        "gymnasium, hidden with ids",
     ),
 )
 def test_every_kind_of_curriculum_goes_on_as_if_never_stopped(learner, kind):

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from ctgraph_rl.tasks.curriculum import Curriculum
-from ctgraph_rl.tasks.task import Task
+from ctgraph_rl.tasks.protocol import Protocol
+from ctgraph_rl.tasks.task import Task, are_graphs
 from ctgraph_rl.tasks.values import is_needle, memoryless_ceiling, open_loop_ceiling, random_frames_to_goal
 
 
@@ -20,17 +21,19 @@ class Ceilings(NamedTuple):
     memoryless: float | None  # of a policy that remembers nothing within an episode
     open_loop: float | None  # of a sequence of actions that ignores all observations
     random: float | None  # of the uniformly random policy
-    random_frames: float  # frames that it needs for its first reward on the hardest task
+    random_frames: float | None  # frames that it needs for its first reward on the hardest task
 
 
 def ceilings_of(curriculum: Curriculum) -> Ceilings:
     """Return what the tasks of a curriculum allow."""
     tasks = curriculum.tasks
+    if not are_graphs(tasks):
+        return Ceilings(*[None] * len(Ceilings._fields))
     changes = any(task.goal_change is not None for task in tasks)
     return Ceilings(
         optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),
-        one_policy=_one_policy(curriculum),
-        search=_search(curriculum),
+        one_policy=_one_policy(tasks, curriculum.protocol),
+        search=_search(tasks, curriculum.evaluation.episodes_per_row),
         memoryless=None if changes else _mean(tasks, memoryless_ceiling),
         open_loop=None if changes else _mean(tasks, open_loop_ceiling),
         random=_mean(tasks, _random) if all(map(_is_plain, tasks)) else None,
@@ -49,8 +52,10 @@ def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
         "random": "random policy",
     }
     shown = [(name, getattr(ceilings, key)) for key, name in names.items()]
-    frames = f"{ceilings.random_frames:,.0f}" if ceilings.random_frames < 1e7 else f"{ceilings.random_frames:.1e}"
     values = [(name, f"{value:.3g}") for name, value in shown if value is not None]
+    if ceilings.random_frames is None:
+        return values
+    frames = f"{ceilings.random_frames:,.0f}" if ceilings.random_frames < 1e7 else f"{ceilings.random_frames:.1e}"
     return [*values, ("frames to its first reward, on the hardest task", frames)]
 
 
@@ -71,15 +76,14 @@ def _random(task: Task) -> float:
     return task.graph.reward_prob_random * task.goal_reward
 
 
-def _one_policy(curriculum: Curriculum) -> float | None:
+def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:
     """Return the most that one policy without ids gets; None where ids are given or tasks do not pay alike.
 
     Tasks with the same images and the same rules of what is shown are distinguished by nothing. A policy that reaches
     the goal of the deepest one surely reaches those goals that are beginnings of it, and no mixture gets more.
     """
-    tasks = curriculum.tasks
     alike = len({task.goal_reward for task in tasks}) == 1 and all(map(_is_plain, tasks))
-    if len(tasks) < 2 or curriculum.protocol.task_id != "hidden" or not alike or tasks[0].goal_change is not None:
+    if len(tasks) < 2 or protocol.task_id != "hidden" or not alike or tasks[0].goal_change is not None:
         return None
     groups: dict[object, list[tuple[int, ...]]] = {}
     for task in tasks:
@@ -94,9 +98,8 @@ def _most_reached(goals: Iterable[tuple[int, ...]]) -> int:
     return max(sum(n for goal, n in counts.items() if path[: len(goal)] == goal) for path in counts)
 
 
-def _search(curriculum: Curriculum) -> float | None:
+def _search(tasks: Sequence[Task], episodes: int) -> float | None:
     """Return the mean return of a search without repetition, over all episodes of a goal; None where goals stay."""
-    tasks, episodes = curriculum.tasks, curriculum.evaluation.episodes_per_row
     ends = {task.graph.num_end_states for task in tasks}
     whole = all(task.goal_change == (episodes, episodes) for task in tasks) and ends == {episodes}
     return (episodes + 1) / (2 * episodes) if whole and all(map(_is_plain, tasks)) else None

@@ -12,6 +12,7 @@ from ctgraph_rl.report.style import WIDTH, new_figure, short
 from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import are_graphs, ct_graphs
 from ctgraph_rl.visualize.task_figure import draw_task
 from ctgraph_rl.visualize.visits import Visits, visits
 
@@ -48,7 +49,7 @@ def task_trees(section: Section, result: Result, found: Trees) -> CaptionedFigur
 def draw_trees(trees: Trees, seed: int) -> Any:
     """Draw a panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     assert trees.curriculum is not None
-    tasks = list(zip(trees.curriculum.tasks, trees.curriculum.labels, strict=True))[:MOST_TREES]
+    tasks = list(zip(ct_graphs(trees.curriculum.tasks, "a tree"), trees.curriculum.labels, strict=True))[:MOST_TREES]
     columns = min(COLUMNS, len(tasks))
     rows = math.ceil(len(tasks) / columns)
     figure = new_figure(WIDTH, rows * max(_height(task.graph.depth) for task, _ in tasks))
@@ -71,6 +72,10 @@ def find_trees(run: Run) -> Trees:
     """Return the agent and the curriculum of a run as far as its directory has them."""
     reason = f"{run.path} has no {AGENT}, the weights of its agent"
     try:
+        curriculum = Curriculum.from_json(run.path / CURRICULUM)
+        if not are_graphs(curriculum.tasks):
+            kind = type(curriculum.tasks[0]).__name__
+            return Trees(None, None, f"they are of CT-graphs, and its tasks are of {kind}")
         if (run.path / AGENT).exists():
             trained = load(run.path)
             return Trees(trained.curriculum, trained, "")

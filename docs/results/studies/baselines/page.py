@@ -107,6 +107,7 @@ def ceilings(configuration: str, goal: str) -> list[str]:
 def ladder(raw: Raw) -> str:
     """A line for each agent, a column for each depth: seeds that solved it; and how often chance finds the goal."""
     import curricula
+    from ctgraph_rl.tasks.task import ct_graphs
     from ctgraph_rl.tasks.values import random_frames_to_goal
 
     of = groups(raw, "agent", "depth")
@@ -114,7 +115,8 @@ def ladder(raw: Raw) -> str:
     chance = []
     for depth in depths:
         alone = curricula.load("single_task", depth=int(depth))
-        chance.append(f"{alone.num_frames / random_frames_to_goal(alone.tasks[0]):.2g}")
+        [task] = ct_graphs(alone.tasks, "this study")
+        chance.append(f"{alone.num_frames / random_frames_to_goal(task):.2g}")
     rows = [["*goals that random actions find*", *chance]]
     for agent in dict.fromkeys(agent for agent, _ in of):
         each = [of.get((agent, depth), []) for depth in depths]

@@ -58,7 +58,9 @@ def five_seeds(lines: Raw) -> Raw:
 
 def who_learned(run_dir: Path, trained: Trained) -> dict[str, Any]:
     """The part of a line that says what was learned by whom."""
-    (task,) = trained.curriculum.tasks
+    from ctgraph_rl.tasks.task import ct_graphs
+
+    (task,) = ct_graphs(trained.curriculum.tasks, "this study")
     about = trained.log.of_kind("run")[0]
     configured = about["config"]["curriculum"]
     return {
@@ -89,7 +91,9 @@ def measured(run_dir: Path) -> dict[str, Any]:
 
     failed = run_dir / "failed.txt"
     trained = load(run_dir)
-    (task,) = trained.curriculum.tasks
+    from ctgraph_rl.tasks.task import ct_graphs
+
+    (task,) = ct_graphs(trained.curriculum.tasks, "this study")
     line = who_learned(run_dir, trained)
     for way, greedy in (("greedy", True), ("sampled", False)):
         ends = evaluate(

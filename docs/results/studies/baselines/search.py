@@ -40,10 +40,12 @@ def searched(run: Path, trained: Trained) -> list[dict[str, Any]]:
 
     The goals of the trials are uniform: as many trials of each task, and a trial has its task's goal.
     """
+    from ctgraph_rl.tasks.task import ct_graphs
+
     tasks, about = trained.curriculum.tasks, trained.log.of_kind("run")[0]
     found = {way: successes(trained, greedy) for way, greedy in (("greedy", True), ("sampled", False))}
     common = {
-        "depth": tasks[0].graph.depth,
+        "depth": ct_graphs(tasks, "this study")[0].graph.depth,
         "agent": run.name.split("-seed")[0],
         "seed": trained.seed,
         "frames": trained.frames,

@@ -1,0 +1,285 @@
+"""GymEnv: rows of environments of Gymnasium as one TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ctgraph_rl.batch.rows import seed_rule
+from ctgraph_rl.batch.specs import checked_num_ids
+from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.tasks.kinds.gym_task import GymTask, spaces_of
+
+NUM_PROBED = 20
+"""Steps by which it is seen whether an environment repeats."""
+
+
+class GymEnv(EnvBase):
+    """A batch of environments of Gymnasium, ``batch_size=[len(tasks)]``, stepped one after the other.
+
+    ``next`` shows the last observation of an episode. An episode that has ended by itself is ``terminated``, one that
+    the time limit ended ``truncated``. The observation keys are those of `TaskLike.make_env`.
+
+    Args:
+        tasks: one for each row.
+        seed: decides the seed of every episode, in [0, 2**63).
+        task_pool: the tasks that `set_tasks` may be given. Default: ``tasks``.
+        device: where the tensors live.
+        task_ids: the id of each task, see `TaskLike.make_env`.
+        num_task_ids: length of ``task_id``; None: just enough.
+
+    Raises:
+        ValueError: for tasks of different spaces, and an environment that does not repeat with its seed.
+
+    Example:
+        >>> env = GymEnv([GymTask("CartPole-v1")] * 2, seed=0)
+        >>> env.rollout(10, break_when_any_done=False)["observation"].shape
+        torch.Size([2, 10, 4])
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        tasks: Iterable[GymTask],
+        seed: int = 0,
+        *,
+        task_pool: Iterable[GymTask] | None = None,
+        device: torch.device | str = "cpu",
+        task_ids: Mapping[GymTask, int] | None = None,
+        num_task_ids: int | None = None,
+    ) -> None:
+        tasks = require_all(GymTask, "tasks", tasks)
+        pool = tasks if task_pool is None else require_all(GymTask, "task_pool", task_pool)
+        self.pool = tuple(dict.fromkeys((*pool, *tasks)))
+        require(seed_rule(seed), _same_spaces(self.pool), *map(_repeats_rule, self.pool))
+        self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
+        count = len(tasks)
+        super().__init__(device=checked_device(device), batch_size=torch.Size([count]))
+        self.seed = seed
+        self.tasks = tasks
+        self._ids = {} if task_ids is None else dict(task_ids)
+        self._made: list[dict[GymTask, Any]] = [{} for _ in tasks]
+        self._next: tuple[GymTask, ...] | None = None
+        self._episode = np.full(count, -1, dtype=np.int64)
+        self._actions: list[list[Any]] = [[] for _ in tasks]
+        self._rows = SyncVectorEnv(
+            [task.make for task in tasks],
+            autoreset_mode=AutoresetMode.DISABLED,  # so that the last observation shows, and we give each seed
+            observation_mode="different",
+            copy=False,
+        )
+        for made, task, env in zip(self._made, tasks, self._rows.envs, strict=True):
+            made[task] = env
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        n, space = self.batch_size[0], spaces_of(self.pool[0])[0]
+        shape, column = (n, *self.pool[0].observation_shape), (n, 1)
+        if hasattr(space, "n"):
+            shown: Any = Bounded(0, 1, shape=shape, dtype=torch.uint8)
+        elif space.dtype == np.uint8:
+            shown = Bounded(0, 255, shape=shape, dtype=torch.uint8)
+        else:
+            shown = Unbounded(shape=shape, dtype=torch.float32)
+        flag = Binary(1, shape=column, dtype=torch.bool)
+        keys = {
+            "observation": shown,
+            "is_init": flag.clone(),
+            "step_count": Unbounded(shape=column, dtype=torch.int64),
+            "episode_reward": Unbounded(shape=column, dtype=torch.float32),
+        }
+        if self.num_task_ids:
+            keys["task_id"] = Bounded(0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8)
+        self.observation_spec = Composite(keys, shape=(n,)).to(self.device)
+        self.action_spec = _action_spec(spaces_of(self.pool[0])[1], n).to(self.device)
+        self.reward_spec = Unbounded(shape=column, dtype=torch.float32).to(self.device)
+        done = {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
+        self.full_done_spec = Composite(done, shape=(n,)).to(self.device)
+        zeros = self.observation_spec.zero()
+        self._data = {key: zeros[key] for key in keys} | {key: self.full_done_spec.zero()[key] for key in done}
+
+    def set_tasks(self, tasks: Iterable[GymTask], at_episode_end: bool = False) -> None:
+        """Give every row a task of the pool: before the next reset of all rows, or at the end of its episode.
+
+        Raises:
+            ValueError: for another number of tasks than rows, and one that is not of the pool.
+        """
+        tasks = require_all(GymTask, "tasks", tasks)
+        unknown = [task for task in tasks if task not in self.pool]
+        require(
+            (len(tasks) == len(self.tasks), f"tasks must be one for each of {len(self.tasks)} rows, got {len(tasks)}"),
+            (not unknown, f"tasks must be of task_pool, got {unknown[:1]}"),
+        )
+        if at_episode_end:
+            self._next = tasks
+        else:
+            self.tasks = tasks
+            self._next = None
+            self._place(range(len(tasks)))
+
+    def _place(self, rows: Iterable[int]) -> None:
+        """Put the environments of the rows' tasks in their places; each is made once."""
+        for row in rows:
+            made, task = self._made[row], self.tasks[row]
+            if task not in made:
+                made[task] = task.make()
+            self._rows.envs[row] = made[task]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        given = None if tensordict is None else tensordict.get("_reset", None)
+        mask = np.ones(len(self.tasks), dtype=bool)
+        if given is not None and (self._episode >= 0).all():
+            mask = given.view(-1).cpu().numpy()
+        rows = np.flatnonzero(mask).tolist()
+        if self._next is not None:
+            self.tasks = tuple(self._next[row] if mask[row] else task for row, task in enumerate(self.tasks))
+            self._place(rows)
+        self._episode[mask] += 1
+        for row in rows:
+            self._actions[row] = []
+        seeds = [self._episode_seed(row) if mask[row] else None for row in range(len(mask))]
+        observations, _ = self._rows.reset(seed=seeds, options={"reset_mask": mask})
+        begun = torch.from_numpy(mask).to(self.device).unsqueeze(-1)
+        data = self._observed(observations)
+        for key, value in self._data.items():
+            given_up = data[key] if key in data else torch.zeros_like(value)
+            data[key] = torch.where(begun.view(-1, *[1] * (value.ndim - 1)), given_up, value)
+        data["is_init"] = begun
+        return self._shown(data)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = tensordict["action"].cpu().numpy()
+        for played, taken in zip(self._actions, action, strict=True):
+            played.append(taken)
+        observations, reward, terminated, truncated, _ = self._rows.step(self._as_given(action))
+        flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        data = {key: torch.tensor(value, device=self.device).unsqueeze(-1) for key, value in flags.items()}
+        rewards = torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1)
+        data |= self._observed(observations)
+        data["is_init"] = torch.zeros_like(data["done"])
+        data["step_count"] = self._data["step_count"] + 1
+        data["episode_reward"] = self._data["episode_reward"] + rewards
+        return self._shown(data).set("reward", rewards)
+
+    def _shown(self, data: dict[str, Tensor]) -> TensorDict:
+        self._data = data
+        shown = {key: value.clone() for key, value in data.items()}
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+
+    def _observed(self, observations: Any) -> dict[str, Tensor]:
+        """Return what rows show of their observations and tasks."""
+        shape, space = self.pool[0].observation_shape, spaces_of(self.pool[0])[0]
+        seen = torch.as_tensor(np.array(observations), device=self.device)
+        if hasattr(space, "n"):
+            seen = one_hot(seen.long() - int(space.start), shape[0]).to(torch.uint8)
+        elif space.dtype == np.uint8:
+            seen = seen.permute(0, 3, 1, 2) if seen.ndim == 4 else seen.view(-1, *shape)
+        else:
+            seen = seen.float()
+        data = {"observation": seen.contiguous()}
+        if self.num_task_ids:
+            ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device)
+            data["task_id"] = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
+        return data
+
+    def _as_given(self, action: np.ndarray) -> np.ndarray:
+        """Return actions as Gymnasium counts them."""
+        return action + int(getattr(spaces_of(self.pool[0])[1], "start", 0)) if action.ndim == 1 else action
+
+    def _episode_seed(self, row: int) -> int:
+        """Return the seed of a row's present episode, in [0, 2**31)."""
+        return int(np.random.SeedSequence((self.seed, row, int(self._episode[row]))).generate_state(1)[0] >> 1)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Begin the episodes of another seed with the next reset."""
+        require(seed_rule(seed))
+        self.seed = seed  # type: ignore[assignment]
+        self._episode[:] = -1
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """Return what `load_state_dict` needs to go on: each row's task, episode and actions, and the shown data."""
+        following = self.tasks if self._next is None else self._next
+        return {
+            "tasks": [self.pool.index(task) for task in self.tasks],
+            "next_tasks": [self.pool.index(task) for task in following],
+            "episode": torch.from_numpy(self._episode.copy()),
+            "actions": [torch.from_numpy(np.array(played)) for played in self._actions],
+            "data": dict(self._data),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> None:
+        """Go back to a state: each row's episode begins with its seed, and its actions are taken again.
+
+        Raises:
+            ValueError: if a row then does not show what it showed.
+        """
+        self.tasks = tuple(self.pool[number] for number in state_dict["tasks"])
+        self._next = tuple(self.pool[number] for number in state_dict["next_tasks"])
+        self._episode = state_dict["episode"].numpy().copy()
+        kept = all(task.repeats for task in self.tasks)
+        self._actions = [list(played.numpy()) if kept else [] for played in state_dict["actions"]]
+        self._place(range(len(self.tasks)))
+        seeds = [self._episode_seed(row) for row in range(len(self.tasks))]
+        begun, _ = self._rows.reset(seed=seeds, options={"reset_mask": np.ones(len(seeds), dtype=bool)})
+        found = np.array(begun)
+        for row, (env, played) in enumerate(zip(self._rows.envs, self._actions, strict=True)):
+            for action in played:
+                found[row] = env.step(self._as_given(np.asarray([action]))[0])[0]
+        self._data = {key: value.to(self.device) for key, value in state_dict["data"].items()}
+        same = self._observed(found)["observation"].equal(self._data["observation"])
+        require(
+            (same or not kept, f"{self.tasks[0].id} does not show what it showed before the run was stopped: {FIX}")
+        )
+
+
+FIX = "make reset(seed=...) decide all of an episode, or give GymTask(repeats=False)"
+
+
+def _action_spec(space: Any, num_rows: int) -> Any:
+    if hasattr(space, "n"):
+        return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64)
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        return Unbounded(shape=(num_rows, *space.shape), dtype=torch.float32)
+    low, high = (torch.as_tensor(bound).expand(num_rows, *space.shape) for bound in (space.low, space.high))
+    return Bounded(low, high, shape=(num_rows, *space.shape), dtype=torch.float32)
+
+
+def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:
+    """Return the rule that tasks can be rows of one environment."""
+    kinds = {(spaces_of(task)[0].dtype, task.observation_shape, str(spaces_of(task)[1])): task.id for task in pool}
+    shown = ", ".join(f"{dtype} {list(shape)} with actions {actions}" for dtype, shape, actions in kinds)
+    return len(kinds) == 1, f"tasks of one environment must have observations and actions of one form, got {shown}"
+
+
+@cache
+def _repeats_rule(task: GymTask) -> tuple[bool, str]:
+    """Return the rule that an episode repeats with its seed: in one environment, and in another."""
+    if not task.repeats:
+        return True, ""
+    first, other = task.make(), task.make()
+    same = _episode_of(first) == _episode_of(first) == _episode_of(other)
+    return same, f"an episode of {task.id} must repeat with its seed and actions, and it does not: {FIX}"
+
+
+def _episode_of(env: Any) -> list[bytes]:
+    """Return what an episode of random actions shows."""
+    env.action_space.seed(0)
+    shown = [np.asarray(env.reset(seed=0)[0]).tobytes()]
+    for _ in range(NUM_PROBED):
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        shown.append(np.asarray(observation).tobytes() + np.float64(reward).tobytes() + bytes([terminated, truncated]))
+        if terminated or truncated:
+            break
+    return shown

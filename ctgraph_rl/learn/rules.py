@@ -1,0 +1,73 @@
+"""What is refused of a curriculum and an agent before any work, and what one should know before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from torchrl.envs import EnvBase
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
+from ctgraph_rl.core.rewards import KERNEL_REWARDS
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import Task
+
+
+def check_rows(curriculum: Curriculum, num_envs: int) -> None:
+    """Refuse a curriculum whose blocks cannot be learned in whole steps of ``num_envs`` rows.
+
+    Raises:
+        ValueError: names the block and the nearest possible numbers of frames, or the tasks that cannot share the rows.
+    """
+    evaluation = curriculum.evaluation
+    evaluation.check((*curriculum.tasks, *evaluation.held_out))
+    rules: dict[Any, tuple[bool, str]] = {"every": evaluation.every_rule(num_envs)}
+    alike: dict[int, list[str]] = {}
+    for number, block in enumerate(curriculum.blocks, 1):
+        block.rows(num_envs)
+        alike.setdefault(block.num_frames, []).append(str(number))
+    for block in {block.num_frames: block for block in curriculum.blocks}.values():
+        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike[block.num_frames])}")
+    require(*rules.values())
+
+
+def resumes(curriculum: Curriculum) -> bool:
+    """Return whether environments of all tasks can be saved within an episode; see `TaskLike`."""
+    return all(getattr(task, "resumes", False) for task in curriculum.tasks)
+
+
+def check_env(curriculum: Curriculum, env: EnvBase) -> None:
+    """Refuse a curriculum that asks for what an environment cannot do.
+
+    Raises:
+        ValueError: for a switch within a block, or a guide.
+    """
+    kind = type(curriculum.tasks[0]).__name__
+    switches = any(block.switch is not None for block in curriculum.blocks)
+    guide = f"protocol.guide_frames={curriculum.protocol.guide_frames} needs CT-graphs, not {kind}: set it to 0"
+    switch = f"a block with a switch needs an environment with switch_tasks, which {kind} has not: leave it out"
+    require(
+        (isinstance(env, CTGraphEnv) or not curriculum.protocol.guide_frames, guide),
+        (hasattr(env, "switch_tasks") or not switches, switch),
+    )
+
+
+def check_ids(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse an agent that was made for task ids in its observations where the curriculum shows none."""
+    reads = "task_id" in (getattr(agent.policy, "in_keys", None) or ())
+    shows = curriculum.protocol.task_id == "one_hot"
+    message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
+    require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))
+
+
+def notes(curriculum: Curriculum) -> Iterator[str]:
+    """Yield what one should know of a curriculum before it is learned."""
+    rewards = {type(task.reward_fn) for task in curriculum.tasks if isinstance(task, Task)}
+    slow = sorted(kind.__name__ for kind in rewards - {*KERNEL_REWARDS})
+    if slow:
+        yield f"the C kernel does not know {', '.join(slow)}: steps take the tensor engine, which is slower"
+    if not resumes(curriculum):
+        kind = type(curriculum.tasks[0]).__name__
+        yield f"{kind} cannot be saved within an episode: a run that is stopped resumes from its last announced block"

@@ -1,0 +1,139 @@
+"""TaskLike: what a block of a curriculum holds, a CT-graph or anything else that makes its environment."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, Protocol
+
+from ctgraph_rl.checks import as_tuple, require
+
+
+class TaskLike(Hashable, Protocol):
+    """A task of any kind: a frozen dataclass with the four members below, equal and hashable by value.
+
+    Its fields are plain values, tuples of them, or such dataclasses again. So the fingerprint of a curriculum covers
+    them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.tasks.kinds.gym_task.GymTask` the second.
+    All tasks of a curriculum are of one kind, as one environment holds them.
+
+    Further members are optional. ``resumes`` says that the environment can be saved: a new one goes on with the same
+    bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
+    ``optimal_value(gamma)``, the best mean return, and ``return_bounds``,
+    the lowest and the highest one, serve metrics and figures. They raise a ``ValueError`` with the reason where
+    they are not known.
+    """
+
+    @property
+    def label_parts(self) -> Mapping[str, str]:
+        """Parts of the task's short name. A curriculum shows the first one, and those in which its tasks differ."""
+        ...
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """The shape of one row's observation."""
+        ...
+
+    @property
+    def num_actions(self) -> int | None:
+        """The number of actions; None where they are continuous."""
+        ...
+
+    @classmethod
+    def make_env(
+        cls,
+        tasks: Sequence[Any],
+        seed: int = 0,
+        *,
+        task_pool: Sequence[Any] | None = None,
+        device: Any = "cpu",
+        task_ids: Mapping[Any, int] | None = None,
+        num_task_ids: int | None = None,
+    ) -> Any:
+        """Return a TorchRL ``EnvBase`` with one row for each of ``tasks``, ``batch_size=[len(tasks)]``.
+
+        Its data have ``observation``, ``is_init``, ``step_count`` and ``episode_reward``, the last three [N, 1], beside
+        ``reward``, ``done`` and ``terminated``; TorchRL's ``InitTracker``, ``StepCounter`` and ``RewardSum`` write them
+        where an environment does not. Beside those of an ``EnvBase`` it has the member
+        ``set_tasks(tasks, at_episode_end=False)``, which gives each row a task of the pool: before the next reset of
+        all rows, or when the row's episode ends.
+
+        Args:
+            tasks: one for each row.
+            seed: decides all that is random.
+            task_pool: all tasks that ``set_tasks`` may be given; None: ``tasks``.
+            device: where the tensors live.
+            task_ids: the id of each task. Observations then have ``task_id``, the id as one-hot, uint8
+                [N, num_task_ids], zeros for a task without one.
+            num_task_ids: the length of ``task_id``.
+        """
+        ...
+
+
+MEMBERS = ("label_parts", "observation_shape", "num_actions", "make_env")
+"""What a task needs beside being a frozen dataclass."""
+
+
+def are_tasks(name: str, values: object) -> list[tuple[bool, str]]:
+    """Return the rules that values are tasks of one kind, without asking a task for anything.
+
+    Args:
+        name: what needs them, the beginning of the message.
+        values: a tuple, or what is none.
+    """
+    if not isinstance(values, tuple) or not all(map(_is_value, values)):
+        return [(False, f"{name}, got {values!r:.200}")]
+    return [*map(_task_rule, dict.fromkeys(map(type, values))), _kinds_rule(values)]
+
+
+def most_actions(tasks: Iterable[TaskLike]) -> int:
+    """Return the largest number of actions of tasks.
+
+    Raises:
+        ValueError: for continuous ones.
+    """
+    counts = [task.num_actions for task in tasks]
+    known = [count for count in counts if count is not None]
+    require((len(known) == len(counts), "actions must be discrete here, these tasks have continuous ones"))
+    return max(known)
+
+
+def _is_value(value: object) -> bool:
+    return is_dataclass(value) and not isinstance(value, type)
+
+
+def is_kind(kind: type) -> bool:
+    """Return whether a class is a kind of tasks."""
+    return is_dataclass(kind) and _task_rule(kind)[0]
+
+
+def _task_rule(kind: type) -> tuple[bool, str]:
+    """Return the rule that a class has the members of `TaskLike`."""
+    known = {field.name for field in fields(kind)}
+    missing = [name for name in MEMBERS if name not in known and not hasattr(kind, name)]
+    if not missing and kind.__hash__ is None:
+        return False, f"{kind.__name__} is no task, it cannot be hashed: put @dataclass(frozen=True) above its class"
+    fix = "see ctgraph_rl.tasks.kinds.task_like.TaskLike"
+    return not missing, f"{kind.__name__} is no task, it lacks {', '.join(missing)}: {fix}"
+
+
+def _kinds_rule(tasks: Sequence[object]) -> tuple[bool, str]:
+    """Return the rule that tasks are of one kind."""
+    kinds = list(dict.fromkeys(type(task).__name__ for task in tasks))
+    return len(
+        kinds
+    ) < 2, f"tasks of one environment must be of one kind, got {' and '.join(kinds)}; make two curricula"
+
+
+def require_tasks(values: Iterable[TaskLike]) -> tuple[Any, ...]:
+    """Return tasks of one kind, at least one.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    tasks = as_tuple(values)
+    found = [type(each).__name__ for each in tasks] if isinstance(tasks, tuple) else [type(values).__name__]
+    message = f"tasks must be a list with at least one Task, got {', '.join(sorted({*found})) or 'none'}"
+    is_list = isinstance(tasks, tuple) and bool(tasks) and all(map(_is_value, tasks))
+    require((is_list, message))
+    require(*are_tasks("tasks", tasks))
+    return tuple(values)
