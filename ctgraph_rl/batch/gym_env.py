@@ -231,7 +231,7 @@ class GymEnv(EnvBase):
         kept = all(task.repeats for task in self.tasks)
         self._actions = [list(played.numpy()) if kept else [] for played in state_dict["actions"]]
         self._place(range(len(self.tasks)))
-        seeds = [self._episode_seed(row) for row in range(len(self.tasks))]
+        seeds: list[int | None] = [self._episode_seed(row) for row in range(len(self.tasks))]
         begun, _ = self._rows.reset(seed=seeds, options={"reset_mask": np.ones(len(seeds), dtype=bool)})
         found = np.array(begun)
         for row, (env, played) in enumerate(zip(self._rows.envs, self._actions, strict=True)):

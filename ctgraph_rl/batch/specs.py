@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
@@ -55,7 +55,7 @@ def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_id
     )
 
 
-def checked_num_ids(task_ids: Mapping[Task, int] | None, num_task_ids: int | None) -> int:
+def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
     """Return the length of ``task_id``, 0 for none; see `CTGraphEnv` for the arguments and errors."""
     if task_ids is None:
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))

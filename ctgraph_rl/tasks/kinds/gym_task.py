@@ -230,7 +230,7 @@ def _frozen_kwargs(kwargs: Any) -> tuple[tuple[str, Any], ...]:
     Raises:
         ValueError: for values that JSON has no form for, and a way to render, which an agent does not see.
     """
-    pairs = kwargs.items() if isinstance(kwargs, Mapping) else as_tuple(kwargs)
+    pairs: Any = kwargs.items() if isinstance(kwargs, Mapping) else as_tuple(kwargs)
     try:
         given = {name: as_tuple(value) for name, value in pairs}
     except (TypeError, ValueError):
