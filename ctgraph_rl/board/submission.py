@@ -73,7 +73,7 @@ COLUMNS = {
     "fingerprint": "what the curriculum is, in 16 digits",
     "state": "`finished`, or `failed` for a run that failed or was stopped and that `method.yaml` accounts for",
     "reason": "why it failed; empty for a finished run",
-    "group": "seeds that were trained together as one batch, separated by spaces; empty for a run that was alone",
+    "group": "seeds that were trained together as one batch, separated by spaces; empty for a run without others",
     "agent_sha256": "SHA-256 of the agent's state: names, types, shapes and bits; empty where a run left none",
     "agent_bytes": "bytes of all tensors of that state",
     "log_sha256": "SHA-256 of the log without times, versions and machine",

@@ -25,21 +25,13 @@ QUOTED = re.findall(r"^\| `(.+?)` \|", TEXT, re.MULTILINE)
 OF_RUNS = (
     "this configuration was run",
     "... holds a run of other code",
-    "... is in use by",
     "... is nan in",
-    "portable=true needs",
-    "logger=wandb needs",
-    "seeds ... are missing",
     "seeds ... are for tuning",
     "curriculum ... has fingerprint",
-    "runs are of several configurations",
     "... has no results",
     "the code has changed since the runs",
     "no agent can be built",
-    "this runs the code of others",
     "the code of others is not run",
-    "the runs have numbers version",
-    "... had 8 threads",
 )
 """Beginnings of messages that need a run; tests of runs, trackers, faults and submissions hold them."""
 

@@ -9,6 +9,7 @@ import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from helpers.paths import CHECKOUT, sources
 
 INSTEAD = {
@@ -29,11 +30,32 @@ INSTEAD = {
 ALLOWED: dict[str, str] = {}
 """Texts in which a word is right, by the file that has them."""
 
+SENTENCES = {
+    r"so do(?:es)?": "name who does what",
+    r"something else (?:than|in)": "differs from",
+    r"of (?:its|their) own": "separate; another",
+    r"as (?:it is|they are)": "unchanged",
+    r"alone": "only; without others",
+    r"(?-i:(?:^|(?<=^- )|(?<=[.:!] ))(?:What|That (?:the|a|no|each|this|it)) (?:[^?|\]\n]|\n(?!\n))*?\.(?=\s|$))": (
+        "subject, verb, object"
+    ),
+}
+"""Turns of phrase of a text that reads as if translated, and what to write instead."""
+
+TO_COME = (
+    "docs/explanation/memory.md",
+    *(f"docs/how-to/{name}.md" for name in ("sweeps", "verify")),
+    *(f"docs/reference/{name}.md" for name in ("curricula", "published_experiments", "speed_table")),
+)
+"""Pages that still have such turns, or whose text a script makes."""
+
 FOLDERS = ("ctgraph_rl", "baselines", "curricula", "hydra_plugins", "conf", "docs")
 FILES = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
 KINDS = (".py", ".md", ".ipynb", ".yaml", ".j2", ".c")
 
 TOKENS = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+TURNS = re.compile(rf"\b(?:{'|'.join(SENTENCES)})(?!\w)", re.IGNORECASE | re.MULTILINE)
+CODE = re.compile(r"^```.*?^```$|`[^`\n]+`", re.DOTALL | re.MULTILINE)
 WORDS = re.compile(rf"\b(?:{'|'.join(INSTEAD)})\b", re.IGNORECASE)
 
 
@@ -82,3 +104,32 @@ def test_a_word_is_found_in_docstrings_comments_and_messages_and_not_in_names(tm
     hits = [match.group() for text in texts(path) for match in WORDS.finditer(text.replace("{luck}", ""))]
 
     assert hits == ["Told", "anew", "goes on"]
+
+
+def turns(text: str) -> list[str]:
+    """The turns of phrase that prose should not have; code is no prose."""
+    return [match.group() for match in TURNS.finditer(CODE.sub("``", text))]
+
+
+def test_pages_name_who_does_what():
+    pages = [path for path in shown() if path.suffix in (".md", ".ipynb")]
+    named = {path.relative_to(CHECKOUT).as_posix(): path for path in pages}
+    prose = {name: "\n".join(texts(path)) for name, path in named.items() if name not in TO_COME}
+
+    assert len(prose) > 40 and named.keys() >= set(TO_COME)
+    assert {name: turns(text) for name, text in prose.items() if turns(text)} == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("It waits, and so does the other.", ["so does"]),
+        ("A row has a seed of its own.", ["of its own"]),
+        ("It stays as it is. A learner alone.", ["as it is", "alone"]),
+        ("What cannot be composed is refused.", ["What cannot be composed is refused."]),
+        ("Rows differ. That no row ends is rare.", ["That no row ends is rare."]),
+        ("What memory buys\n\n`alone` What is a frame? It says what changed.", []),
+    ],
+)
+def test_a_turn_of_phrase_is_found_in_prose_and_not_in_code_headings_or_questions(text, found):
+    assert turns(text) == found
