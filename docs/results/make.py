@@ -37,6 +37,8 @@ TABLES = {
     "memory_cells": "studies.memory.page",
     "collectives": "studies.collectives.runs",
     "no_labels": "studies.no_labels.runs",
+    "rl2_swap": "studies.baselines.swap",
+    "task_free": "studies.no_labels.task_free",
     "together_fo_b1": "studies.together",
 }
 """Tables of raw results, and the modules that collect them."""

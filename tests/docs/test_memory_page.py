@@ -8,6 +8,7 @@ import re
 import shlex
 from collections import defaultdict
 
+import numpy as np
 import pytest
 from helpers.paths import CHECKOUT
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -22,7 +23,22 @@ from curricula import co_hard
 FOLDER = CHECKOUT / "docs" / "results"
 PAGE = " ".join((FOLDER / "memory.md").read_text(encoding="utf-8").split())
 CONF = CHECKOUT / "conf" / "experiment"
-RIVALS = ("DQN (1 step)", "DQN (6 steps)", "QRDQN+LSTM", "REINFORCE", "A2C", "AMRL-Max", "AMRL-Avg", "Backpropamine")
+RIVALS = (
+    "DQN (1 step)",
+    "DQN (6 steps)",
+    "QRDQN+LSTM",
+    "REINFORCE (8 steps)",
+    "REINFORCE (128 steps)",
+    "A2C (8 steps)",
+    "A2C (32 steps)",
+    "AMRL-Max",
+    "AMRL-Avg",
+    "Backpropamine",
+)
+LONG = ("A2C (32 steps)", "REINFORCE (128 steps)")
+"""Agents that ran on some of the graphs."""
+BY_STEPS = {"a2c": 8, "reinforce": 128}
+"""Agents whose runs differ in the steps of a batch, and what their files in ``conf/agent`` say."""
 GRAPH = ("wait_prob", "unique_decisions", "num_wait_images", "seed")
 SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
 
@@ -148,12 +164,15 @@ def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
     assert f"meets a reward once in {1 / task.graph.reward_prob_random:,.0f} episodes" in PAGE
     assert all(number(unique[name]) >= 4 and number(shared[name]) >= 4 for name in ("AMRL-Max", "AMRL-Avg"))
     assert "AMRL solves both graphs once first rewards are given" in PAGE
-    assert all(number(each[name]) <= 1 for each in (to_find, unique_to_find) for name in (*RIVALS, "MOHQA"))
+    assert all(number(each.get(name, [])) <= 1 for each in (to_find, unique_to_find) for name in (*RIVALS, "MOHQA"))
     assert "agrees with these results where first rewards must be found, but MOHQA does poorly there, too" in PAGE
-    solvers = {name for name in RIVALS if number(shared[name]) > 1}
+    solvers = {name for name in RIVALS if number(shared.get(name, [])) > 1}
     assert solvers == {"AMRL-Max", "AMRL-Avg", "Backpropamine"} < {name for name in RIVALS if number(unique[name]) > 1}
-    assert {name for name in RIVALS if number(unique[name]) > 1} - solvers == {"QRDQN+LSTM", "DQN (6 steps)"}
-    assert "does not hold for AMRL and Backpropamine, and with unique decisions also not for QRDQN+LSTM and DQN" in PAGE
+    assert {name for name in RIVALS if number(unique[name]) > 1} - solvers == {"QRDQN+LSTM", "DQN (6 steps)", *LONG}
+    assert (
+        "does not hold for AMRL and Backpropamine, and with unique decisions also not for QRDQN+LSTM, DQN with targets "
+        "of six steps, REINFORCE with batches of 128 steps and A2C with batches of 32 steps"
+    ) in PAGE
     assert at_any_evaluation(shared["QRDQN+LSTM"]) > 1 < at_any_evaluation(unique["DQN (1 step)"])
     one = [each["DQN (1 step)"] for each in (unique, unique_to_find)]
     once, after = ([f"{count(lines)}" for lines in one] for count in (at_any_evaluation, number))
@@ -164,6 +183,38 @@ def test_what_the_page_says_in_words_of_the_hardest_graphs_holds(names):
     assert f"graph with unique decisions in: {given} (first rewards given), {found} (to be found)" in PAGE
 
 
+def test_the_steps_of_batches_of_reinforce_and_a2c_are_compared_by_counts_of_seeds(names):
+    unique = on_hardest(True, True, names)
+    of_100 = read("memory_cells", "wait_prob", "unique_decisions", "num_wait_images", "guide_frames", "agent")
+    long_100 = of_100["0.9", "True", "100", "204800", "reinforce, 128 steps"]
+    count = {name: f"{number(unique[name])} of {len(unique[name])}" for name in unique}
+
+    short, long = count["REINFORCE (8 steps)"], count["REINFORCE (128 steps)"]
+    assert (short, long) == ("0 of 5", "5 of 5")
+    assert f"it solves the graph in {short} seeds with batches of 8 steps and in {long} with 128, with equal" in PAGE
+    assert f"REINFORCE solves the graph in {short} seeds with batches of 8 steps and in {long} with 128, A2C in" in PAGE
+    assert f"A2C in {count['A2C (8 steps)']} with 8 steps and in {count['A2C (32 steps)']} with 32." in PAGE
+    assert abs(number(unique["A2C (8 steps)"]) - number(unique["A2C (32 steps)"])) <= 1
+    assert f"With 100 wait images REINFORCE with 128 steps solves it in {number(long_100)} of 5." in PAGE
+
+
+@pytest.mark.parametrize("steps", [8, 32, 128])
+def test_the_share_of_frames_whose_episode_a_batch_cuts_off_is_that_of_simulated_episodes(steps):
+    rng = np.random.default_rng(0)
+    shares = []
+    for wait_prob in (0.0, 0.5, 0.9):
+        lengths = rng.geometric(1 - wait_prob, (300_000, 3)).sum(1) + 3
+        ends = np.concatenate([[0], lengths.cumsum()])
+        edges = np.arange(steps, ends[-1], steps)
+        ages = edges - ends[ends.searchsorted(edges, side="right") - 1]
+        shares.append(100 * np.minimum(ages, steps).mean() / steps)
+
+    part = PAGE.split("cuts off is ")[1].split("So REINFORCE")[0]
+    said = re.search(rf"([\d, %and]+) with {steps}\b", part)[1]
+
+    assert [float(each) for each in re.findall(r"\d+(?= %)", said)] == pytest.approx(shares, abs=0.7)
+
+
 def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     table = PAGE.split("## Over all graphs")[1].split("## By graph")[0]
     lines = read("memory_cells", "guide_frames", "read_noise", "agent")
@@ -172,13 +223,14 @@ def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
         name: [float(line["greedy_return"]) for line in sorted(of, key=lambda line: [line[key] for key in GRAPH])]
         for name, of in given.items()
     }
-    others = [name for name in given if name != "LSTM"]
+    others = [name for name in given if name not in ("LSTM", *LONG)]
     found = [statistics.compare(paired[name], paired["LSTM"], bounds=(0, 1)) for name in others]
     p_values = dict(zip(others, statistics.holm([each.p_value for each in found]), strict=True))
 
-    assert set(given) == set(names.values()) and {len(of) for of in given.values()} == {45}
-    for name, of in given.items():
-        assert f"| {name} | {number(of)} | {at_any_evaluation(of)} | " in table
+    assert set(given) == set(names.values())
+    assert {name for name, of in given.items() if len(of) < 45} == {*LONG}
+    for name in (*others, "LSTM"):
+        assert f"| {name} | {number(given[name])} | {at_any_evaluation(given[name])} | " in table
     lower = named(PAGE.split("Returns are lower with")[1].split("([table]")[0])
     alike = named(PAGE.split("is not distinguishable from")[1].split(". Returns")[0])
     assert sorted(lower) == sorted(name for name in others if p_values[name] <= 0.05)
@@ -213,6 +265,8 @@ def line_of(cell: dict[str, str]) -> tuple[str, ...]:
     name = cell["agent"] if cell.get("cell", "lstm") == "lstm" else f"{cell['agent']}-{cell['cell']}"
     if name == "dqn":
         name = {"1": "dqn, 1 step", "6": "dqn, 6 steps"}[cell["agent.n_steps"]]
+    if name in BY_STEPS:
+        name = f"{name}, {cell.get('agent.num_steps', BY_STEPS[name])} steps"
     ladder = ("curriculum.depth", "curriculum.expected_length", *(f"agent.{key}" for key in SETTINGS))
     graph = ("wait_prob", "unique_decisions", "num_wait_images", "guide_frames", "read_noise")
     places = {"guide_frames": "protocol.guide_frames"}
@@ -253,14 +307,17 @@ def test_the_commands_of_the_page_make_its_runs(cells):
 @pytest.mark.slow
 def test_agents_have_the_weights_and_take_the_gradient_steps_that_the_page_says(compose):
     env = CTGraphEnv([co_hard().tasks[0]])
-    words = {"a2c": "A2C", "reinforce": "REINFORCE", "dqn": "DQN, targets of 1 or 6 steps", "mohqa": "MOHQA"}
-    words |= {"qrdqn_lstm": "QRDQN+LSTM, targets of 6 steps", "lstm_ppo": "PPO with each cell"}
+    words = {"dqn": "DQN, targets of 1 or 6 steps", "mohqa": "MOHQA", "lstm_ppo": "PPO with each cell"}
+    words |= {"qrdqn_lstm": "QRDQN+LSTM, targets of 6 steps", "a2c, 8": "A2C (8 steps)", "a2c, 32": "A2C (32 steps)"}
+    words |= {"reinforce, 8": "REINFORCE (8 steps)", "reinforce, 128": "REINFORCE (128 steps)"}
     weights, settings = defaultdict(set), defaultdict(set)
-    for variant in OmegaConf.load(CONF / "memory_cells.yaml").hydra.sweeper.variants:
+    experiments = [OmegaConf.load(CONF / f"{name}.yaml") for name in ("memory_cells", "memory_returns")]
+    for variant in (each for experiment in experiments for each in experiment.hydra.sweeper.variants):
         cfg = compose(*(f"{key}={value}" for key, value in variant.items()))
         agent = config.target(cfg, "agent")(env.observation_spec_unbatched, env.action_spec_unbatched)
         updates = cfg.agent.get("num_updates", cfg.agent.get("num_epochs", 1) * cfg.agent.get("num_minibatches", 1))
-        weights[variant.agent].add(sum(each.numel() for each in agent.weights))
+        name = f"{variant.agent}, {cfg.agent.num_steps}" if variant.agent in BY_STEPS else variant.agent
+        weights[name].add(sum(each.numel() for each in agent.weights))
         size = cfg.agent.num_envs * cfg.agent.num_steps
         batch = f"{cfg.agent.num_envs} x {cfg.agent.num_steps}"
         exploration = "none" if variant.agent == "reinforce" else f"entropy bonus {cfg.agent.get('entropy_coeff')}"
@@ -268,7 +325,7 @@ def test_agents_have_the_weights_and_take_the_gradient_steps_that_the_page_says(
             steps = f"{cfg.agent.annealing_num_steps:,}"
             exploration = f"epsilon from {cfg.agent.eps_init:g} to {cfg.agent.eps_end} over {steps} frames"
         own = f"{cfg.agent.learning_rate}", batch, f"{409_600 // size * updates:,}", f"{cfg.agent.gamma}", exploration
-        settings[variant.agent].add(own)
+        settings[name].add(own)
 
     for name, row in words.items():
         cells = [each.strip() for each in PAGE.split(f"| {row} |")[1].split("|")]

@@ -7,7 +7,7 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
-from studies.baselines import main_job, search
+from studies.baselines import main_job, search, swap
 from studies.baselines.instances import INSTANCES, MEMORY, instances_change
 from studies.baselines.runs import AGENTS, BY_FIVES, EPISODES, REWARDS_MET
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 PAGE = HERE / "baselines.md"
 SMALL = ("fo_b1", "su_b1", "co_b1", "posr_b1")
 """The configurations of which each goal was learned alone."""
+
+OF_GOALS = (search.NAME, swap.NAME)
+"""Tables of goals that change."""
 
 RND = ("rnd_depth", "rnd_co_b1")
 """Tables of PPO with random network distillation, beside those of other agents on the same tasks."""
@@ -192,8 +195,9 @@ def page() -> str:
     return template.substitute(
         tables,
         main_job=performance_table(read("main_job")),
-        machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, search.NAME),
+        machines=machines("main_job", *AGENTS, *RND, *BY_FIVES, *OF_GOALS),
         **learned_and_met(),
+        **swap.texts(),
         **verdicts(),
         **reruns(),
     )

@@ -28,8 +28,10 @@ RIVALS = (
     "dqn, 1 step",
     "dqn, 6 steps",
     "qrdqn_lstm",
-    "reinforce",
-    "a2c",
+    "reinforce, 8 steps",
+    "reinforce, 128 steps",
+    "a2c, 8 steps",
+    "a2c, 32 steps",
     "lstm_ppo-amrl_max",
     "lstm_ppo-amrl_avg",
     "lstm_ppo-backpropamine",
@@ -172,6 +174,30 @@ def lost() -> str:
     parts = [f"{AGENTS[name]} {gone[name]} of {len(once[name])}" for name in worst]
     whole = f"Of {sum(map(len, once.values()))} runs that solved the task at an evaluation, {sum(gone.values())}"
     return f"{whole} did not after training: {', '.join(parts)}"
+
+
+def cut_off(steps: int) -> str:
+    """Return the share of frames whose episode goes on after their batch, for each p of the graphs, as ``25 %``.
+
+    Rows begin together, play the optimal policy, which waits a geometric time before each decision and before the
+    end, and are seen after many batches; at p = 0 all stay in step.
+    """
+    shares = [_share_cut_off(wait_prob, steps) for wait_prob in (0.0, 0.5, 0.9)]
+    return listed([f"{100 * share:.0f} %" for share in shares])
+
+
+def _share_cut_off(wait_prob: float, steps: int, depth: int = 2) -> float:
+    waits = depth + 1
+    if wait_prob == 0:
+        length = 2 * waits
+        return sum(steps * batch % length for batch in range(length)) / length / steps
+    ways = (math.comb(n - 1, depth) * (1 - wait_prob) ** waits * wait_prob ** (n - waits) for n in range(waits, 2000))
+    longer = 1.0
+    shares = [1.0] * (2 * waits - 1)
+    for probability in ways:
+        shares.append(longer)
+        longer -= probability
+    return sum(min(age, steps) * share for age, share in enumerate(shares)) / sum(shares) / steps
 
 
 def claim_table() -> str:

@@ -15,6 +15,14 @@ from studies.memory.conditions import GIVEN, NAME, NOISY, NOISY_AGENTS, SHARED, 
 from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking, solved_once
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
 
+LENGTHS = {
+    ("a2c", "short"): "a2c, 8 steps",
+    ("a2c", "long"): "a2c, 32 steps",
+    ("reinforce", "short"): "reinforce, 8 steps",
+    ("reinforce", "long"): "reinforce, 128 steps",
+}
+"""Agents that differ in the steps of their batches."""
+
 
 def collect(name: str, folders: Sequence[Path], add: bool = False) -> None:
     """Add the finished runs under some folders to tables that grow until they have all runs of the stored ones.
@@ -73,6 +81,9 @@ def texts() -> dict[str, str]:
         one_step = of[condition]["dqn, 1 step"]
         found |= {f"dqn_{place}": count(one_step), f"dqn_{place}_once": str(sum(solved_once(one_step)))}
         found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
+    found |= {f"cut_{steps}": graphs.cut_off(steps) for steps in (8, 32, 128)}
+    found |= {f"{agent}_{length}": count(of[UNIQUE].get(name)) for (agent, length), name in LENGTHS.items()}
+    found["reinforce_long_100"] = count(of[UNIQUE._replace(num_wait_images="100")].get("reinforce, 128 steps"))
     found["lower"], found["alike"] = graphs.distinguishable()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     return found | ladder.texts() | {"intervals": graphs.intervals()}

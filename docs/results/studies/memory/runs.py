@@ -26,8 +26,10 @@ AGENTS = {
     "lstm_ppo-backpropamine": "Backpropamine",
     "lstm_ppo-frames": "frame stacking",
     "lstm_ppo-none": "PPO (no memory)",
-    "a2c": "A2C",
-    "reinforce": "REINFORCE",
+    "a2c, 8 steps": "A2C (8 steps)",
+    "a2c, 32 steps": "A2C (32 steps)",
+    "reinforce, 8 steps": "REINFORCE (8 steps)",
+    "reinforce, 128 steps": "REINFORCE (128 steps)",
     "dqn, 1 step": "DQN (1 step)",
     "dqn, 6 steps": "DQN (6 steps)",
     "qrdqn_lstm": "QRDQN+LSTM",
@@ -36,6 +38,9 @@ AGENTS = {
 """Names of agents with their cells, in the order of the page; PPO where no other algorithm is named."""
 
 CELLS = [name for name in AGENTS if name.startswith("lstm_ppo")]
+
+STEPS = {"dqn": "n_steps", "a2c": "num_steps", "reinforce": "num_steps"}
+"""The setting that tells the runs of an agent apart: the steps of its targets, or of its batches."""
 
 SETTINGS = ("num_envs", "num_steps", "learning_rate", "entropy_coeff")
 """What differs between runs on the ladder: the environments, the steps of a sequence, learning rate, entropy bonus."""
@@ -76,10 +81,10 @@ def _mean_over(lines: list[dict[str, Any]], key: str) -> float:
 def agent_of(run: Path, config: dict[str, Any]) -> str:
     """Return the key of `AGENTS` for a run."""
     name = run.name.split("-seed")[0]
-    steps = config["agent"].get("n_steps")
-    if name != "dqn":
+    if name not in STEPS:
         return name
-    return "dqn, 1 step" if steps == 1 else f"dqn, {steps} steps"
+    steps = config["agent"][STEPS[name]]
+    return f"{name}, 1 step" if steps == 1 else f"{name}, {steps} steps"
 
 
 def condition(config: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from statistics import mean
 from string import Template
 
 from studies.lifelong.pairs import of_pairs, rows
-from studies.no_labels import figures
+from studies.no_labels import figures, task_free
 from studies.no_labels.learners import LEARNERS, finished, values
 from studies.no_labels.runs import FOUND, IMAGES, MASKS, NAME, PAIR, PLANNED, SPANS
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, table
@@ -188,9 +188,10 @@ def page() -> str:
         "images": images(),
         "image_labels": image_labels(),
         "compared": compared(),
+        "task_free": task_free.results(),
         "not_run": not_run(),
     }
-    return template.substitute(tables, machines=machines(NAME), **numbers())
+    return template.substitute(tables, machines=machines(NAME, task_free.NAME), **numbers())
 
 
 def make() -> None:

@@ -1,0 +1,89 @@
+"""RL^2 on a goal that is swapped once, unannounced: `penn_a_swap`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from studies.raw import Raw, groups, machine_of, mean_of, read, table, write
+
+NAME = "rl2_swap"
+
+RETURNS = (-0.4, 1.0)
+"""The lowest and the highest return of an episode."""
+
+LEARNED = 0.9
+"""The least greedy return of a goal that is learned."""
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write a line for each evaluation of the finished runs under some folders."""
+    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
+    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    write(name, sorted(lines, key=lambda line: (line["seed"], line["frames"], line["task"])))
+
+
+def measured(run: Path) -> list[dict[str, Any]]:
+    """Return a line for each evaluation of a run."""
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+
+    log = RunLog.read(run / LOG)
+    about = log.of_kind("run")[0]
+    common = {
+        "agent": run.name.split("-seed")[0],
+        "seed": about["config"]["seed"],
+        "curriculum": about["curriculum"].removesuffix(" (modified)"),
+    }
+    kept = ("block", "frames", "task", "label")
+    return [
+        {
+            **common,
+            **{key: line[key] for key in kept},
+            "greedy_return": round(line["return_mean"], 6),
+            **machine_of(about),
+        }
+        for line in log.of_kind("evaluation")
+    ]
+
+
+def runs() -> dict[tuple[str, ...], Raw]:
+    """Return the lines of each seed."""
+    return groups(read(NAME), "seed")
+
+
+def at_end(lines: Raw, block: str, task: str) -> float:
+    """Return the greedy return on a task after a block."""
+    return [float(line["greedy_return"]) for line in lines if (line["block"], line["task"]) == (block, task)][-1]
+
+
+def frames_to_learn(lines: Raw) -> int | None:
+    """Return the frames from the swap to the first evaluation with the new goal learned; None: there is none."""
+    swap = max(int(line["frames"]) for line in lines if line["block"] == "1")
+    new = [line for line in lines if (line["block"], line["task"]) == ("2", "2")]
+    found = [int(line["frames"]) - swap for line in new if float(line["greedy_return"]) >= LEARNED]
+    return found[0] if found else None
+
+
+def swap_table() -> str:
+    """Return the greedy returns on both goals after each half: means over seeds with their intervals."""
+    of = list(runs().values())
+    rows = [
+        [f"after half {block}", *(mean_of([at_end(lines, block, task) for lines in of], RETURNS) for task in "12")]
+        for block in "12"
+    ]
+    return table(["greedy return", "first goal", "second goal"], rows)
+
+
+def texts() -> dict[str, str]:
+    """Return what the template of the page names."""
+    of = list(runs().values())
+    times = [frames_to_learn(lines) for lines in of]
+    found = [time for time in times if time is not None]
+    return {
+        "swap": swap_table(),
+        "swap_seeds": str(len(of)),
+        "swapped": f"{len(found)} of {len(of)}",
+        "swap_frames": f"{min(found):,} to {max(found):,}",
+    }

@@ -1,0 +1,59 @@
+"""Masks without labels on the three task-free curricula: raw results and the table of no_labels.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean
+
+from studies.no_labels.learners import LEARNERS, learner, values
+from studies.no_labels.runs import measured
+from studies.raw import Raw, groups, mean_of, read, table, write
+
+NAME = "task_free"
+
+CURRICULA = ("task_free_abrupt", "task_free_gradual", "task_free_recurring")
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write a line for each finished run under some folders."""
+    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
+    lines = [measured(path.parent)[0] for path in paths if path.parent.parent.name in CURRICULA]
+    write(name, sorted(lines, key=lambda line: (line["curriculum"], line["detector"], line["seed"])))
+
+
+def cells() -> dict[tuple[str, str], Raw]:
+    """Return the lines of each curriculum and learner."""
+    found: dict[tuple[str, str], Raw] = {}
+    for (curriculum,), lines in groups(read(NAME), "curriculum").items():
+        for name in LEARNERS:
+            own = [line for line in lines if learner(line) == name]
+            if own:
+                found[curriculum, name] = own
+    return found
+
+
+def row(curriculum: str, name: str, lines: Raw) -> list[str]:
+    """Return the cells of a learner on a curriculum."""
+    bounds = (float(lines[0]["lowest_return"]), float(lines[0]["highest_return"]))
+    returns = [mean_of(values(lines, key), bounds) for key in ("average_performance", "online_return")]
+    shown = [f"`{curriculum}`", LEARNERS[name], str(len(lines)), *returns]
+    if not lines[0]["detector"]:
+        return [*shown, "", "", ""]
+    delays = [each for line in lines for each in line["delays"].split()]
+    found = f"{sum(each != '-' for each in delays)} of {len(delays)}" if delays else "no point of change"
+    return [*shown, found, f"{mean(values(lines, 'labels_per_task')):.2f}", not_learned(lines)]
+
+
+def not_learned(lines: Raw) -> str:
+    """Return the shares of frames that were not learned from, and of those whose learning was undone."""
+    frames = sum(values(lines, "frames"))
+    shares = [sum(values(lines, key)) / frames for key in ("frames_not_learned", "frames_rolled_back")]
+    return "; ".join(f"{100 * share:.0f} %" for share in shares)
+
+
+def results() -> str:
+    """Return the table: a line for each curriculum and learner that has run."""
+    head = ["", "", "seeds", "average performance", "online return", "changes found", "labels per task"]
+    rows = [row(curriculum, name, lines) for (curriculum, name), lines in cells().items()]
+    return table([*head, "not learned from; undone"], rows)
