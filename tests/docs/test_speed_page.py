@@ -103,6 +103,28 @@ def test_the_step_that_the_ladder_compiles_is_that_of_a_rollout(name):
     assert all(torch.equal(getattr(found, key), getattr(expected, key)) for key in ("reward", "done", "outcome"))
 
 
+def numbers(text: str, header: str) -> dict[str, list[list[float]]]:
+    """The numbers of a table by the name of the row: of each cell the speed and the share of memcpy."""
+    lines = text.split(header)[1].split("\n\n")[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {row[0]: [[float(x) for x in re.findall(r"[\d.]+", cell)[:2]] for cell in row[1:]] for row in rows}
+
+
+def test_the_speeds_of_the_page_are_those_of_the_table_in_the_reference():
+    page = (CHECKOUT / "docs" / "explanation" / "speed.md").read_text(encoding="utf-8")
+    whole = numbers((CHECKOUT / "docs" / "reference" / "speed_table.md").read_text(encoding="utf-8"), "| million obs")
+    shown = numbers(page, "| 16,384 rows, million")
+
+    del shown['`rollout`, `kernel="off"`']  # the table of the reference is the kernel's
+    names = {"`rollout`": "fast rollout", "`rollout`, noise bank of 4,096": "fast rollout, noise bank"}
+    for way, cells in shown.items():
+        name = names.get(way, way.replace("`", ""))
+        of_tasks = [whole.get(f"{task}: {name}", [[]])[-1] for task in ("SU", "CO", "SU, noise 10", "CO, noise 10")]
+        assert cells == of_tasks, way
+    core, through_torchrl = shown["core"][0][0], shown["TorchRL `rollout`"][0][0]
+    assert f"{core:.0f} million steps a second with 16,384 rows, and {through_torchrl} million through" in page
+
+
 @pytest.fixture
 def gpu():
     from studies import gpu
