@@ -112,7 +112,7 @@ def confined(
         ValueError: for a path that would show all files.
     """
     wrong = [str(path) for path in paths if Path(os.path.realpath(path)) == Path("/")]
-    require((not wrong, "the code of others must be in a folder of its own, got /"))
+    require((not wrong, "the code of others must be in a folder below /, got /"))
     made = [str(shutil.which("bwrap")), *OPTIONS, "--seccomp", str(filtering), "--proc", "/proc", "--dev", "/dev"]
     for path in map(Path, SYSTEM):
         if path.is_symlink():

@@ -1,4 +1,4 @@
-"""The code of others in a process of its own: limits of time, memory and disk, and what the system can close off.
+"""The code of others in a separate process: limits of time, memory and disk, and what the system can close off.
 
 On Linux bubblewrap closes off everything but the process's own folder; see `ctgraph_rl.board.bubblewrap`. Limits hold
 on every POSIX system; `Isolation` says what is open and what is not limited.
@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 from ctgraph_rl.board import bubblewrap
 from ctgraph_rl.checks import LARGEST_INT, positive, require
@@ -136,7 +136,7 @@ def run_isolated(
     variables: Mapping[str, str] | None = None,
     watch: Callable[[], object] = lambda: None,
 ) -> Outcome:
-    """Run a module in a process of its own, within limits, and leave none of its processes behind.
+    """Run a module in a separate process, within limits, and leave none of its processes behind.
 
     Args:
         module: as of ``python -m``.
@@ -153,9 +153,9 @@ def run_isolated(
     """
     require(*positive(seconds=limits.seconds, memory=limits.memory, disk=limits.disk))
     folder = _prepared(folder)
-    spec: dict[str, Any] = {"limits": limits, "module": module, "arguments": list(arguments)}
-    spec |= {"paths": [str(path.resolve()) for path in paths], "is_confined": isolated.bubblewrap is not None}
-    command = [sys.executable, "-P", "-s", "-m", HERE, json.dumps(spec)]
+    found_in = [str(path.resolve()) for path in paths]
+    spec = json.dumps([limits, isolated.bubblewrap is not None, found_in, module, *arguments])
+    command = [sys.executable, "-P", "-s", "-m", HERE, spec]
     start = time.monotonic()
     with ExitStack() as stack:
         opened: tuple[int, ...] = ()
@@ -213,7 +213,7 @@ def _environment(folder: Path) -> dict[str, str]:
 def _process(
     command: Sequence[str], folder: Path, environment: Mapping[str, str], opened: Sequence[int]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a process as the first of a group and session of its own; kill all of them however this ends.
+    """Start a process as the first of a new group and session; kill all of them however this ends.
 
     It gets nothing that is open here but some descriptors, and prints into a pipe.
     """
@@ -366,14 +366,14 @@ def _opened(entry: os.DirEntry[str], folder: int | Path, depth: int, files: int)
 
 
 def main() -> None:
-    """Set the limits, and run the module that the first argument names."""
-    spec = json.loads(sys.argv[1])
-    _limit(Limits(*spec["limits"]), spec["is_confined"])
-    # not before: Python imports a sitecustomize that it finds, and modules of these names in place of its own
-    sys.path += spec["paths"]
-    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *spec["paths"]])
-    sys.argv = [spec["module"], *spec["arguments"]]
-    runpy.run_module(spec["module"], run_name="__main__", alter_sys=True)
+    """Set the limits, and run the module that the first argument names, with its arguments."""
+    limits, is_confined, paths, *called = json.loads(sys.argv[1])
+    _limit(Limits(*limits), is_confined)
+    # not before: Python imports a sitecustomize that it finds, and modules of these names in place of those of Python
+    sys.path += paths
+    os.environ["PYTHONPATH"] = os.pathsep.join([os.environ["PYTHONPATH"], *paths])
+    sys.argv = called
+    runpy.run_module(called[0], run_name="__main__", alter_sys=True)
 
 
 def _limit(limits: Limits, is_confined: bool) -> None:

@@ -1,4 +1,4 @@
-"""What runs in a process of its own: runs are learned again, from a configuration or by the code of others.
+"""What runs in a separate process: runs are learned again, from a configuration or by the code of others.
 
 ``python -m ctgraph_rl.board.relearn JOB.json`` writes a run directory for each seed into the working directory.
 """

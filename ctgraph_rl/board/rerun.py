@@ -1,4 +1,4 @@
-"""Level *rerun* of a verification: drawn runs are trained again, in processes of their own, and compared bit by bit.
+"""Level *rerun* of a verification: drawn runs are trained again, in separate processes, and compared bit by bit.
 
 No one knows which runs are drawn before both the submission and the verifier's number are fixed: they are those with
 the smallest SHA-256 of ``DIGEST NUMBER RUN``. Runs that were trained together are trained again as their group,
@@ -169,7 +169,7 @@ def learn_again(
     paths: Sequence[Path] = (),
     watch: Callable[[], object] = lambda: None,
 ) -> Outcome:
-    """Learn a cell in a process of its own; one that was stopped before is resumed where its learner can be.
+    """Learn a cell in a separate process; one that was stopped before is resumed where its learner can be.
 
     Args:
         cell: what to learn.

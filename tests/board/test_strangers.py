@@ -114,7 +114,14 @@ def test_a_broken_submission_is_refused_in_one_line(tiny_submission, copy, name)
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["alias bomb", "nested folders", "second line", "name that is not UTF-8"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "second line",
+        "nested folders",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("alias bomb", "name that is not UTF-8")),
+    ],
+)
 def test_a_broken_submission_is_no_end_for_others(tiny_submission, tiny_home, copy, name):
     shutil.copytree(tiny_submission.path, copy.parent / "whole")
     BROKEN[name][0](copy)
@@ -132,12 +139,12 @@ def test_a_table_that_unpacks_to_much_is_a_difference(submission):
 
     path = submission.path / "evaluations.parquet"
     rows = parquet.read_table(path)
-    many = pyarrow.table({name: rows.column(name).take([0] * 3_000_000) for name in rows.column_names})
+    many = pyarrow.table({name: rows.column(name).take([0] * 30_000) for name in rows.column_names})
     parquet.write_table(many, path)
 
     (check,) = [each for each in rescore(submission) if each.what == "evaluations.parquet"]
 
-    assert (check.passed, check.note[:11]) == (False, "it has 3,00")
+    assert (check.passed, check.note[:11]) == (False, "it has 30,0")
 
 
 @pytest.mark.parametrize(

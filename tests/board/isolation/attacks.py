@@ -58,7 +58,7 @@ def connect(family: int, address: Any) -> None:
 
 
 def type_a_letter(spec: Any) -> None:
-    """Make a terminal of its own, and put a letter into it."""
+    """Make a terminal, and put a letter into it."""
     with suppress(OSError):
         os.setsid()
     _, terminal = os.openpty()

@@ -132,7 +132,7 @@ def test_no_attack_from_inside_succeeds(attacker):
     assert [name for name in ALL_BUT_THE_TERMINAL if found[name] == "open"] == []
 
 
-@both
+@pytest.mark.parametrize("user", ["root", pytest.param("ordinary user", marks=pytest.mark.slow)], indirect=True)
 def test_the_terminal_of_who_verifies_is_out_of_reach(attacker):
     found = attacker.tries("terminal", how="with_terminal")
     without = attacker.tries("terminal", how="with_terminal", without=[(["--new-session"], [])])
@@ -239,5 +239,5 @@ def test_an_old_or_broken_bubblewrap_is_none(tmp_path, monkeypatch, said, reason
 
 
 def test_code_of_others_is_not_the_whole_file_system(tmp_path):
-    with pytest.raises(ValueError, match="must be in a folder of its own, got /"):
+    with pytest.raises(ValueError, match="must be in a folder below /, got /"):
         bubblewrap.confined(["true"], tmp_path, [Path("/")], filtering=3)

@@ -1,4 +1,4 @@
-"""Hostile code in a process of its own: each limit is kept, and nothing of it is left."""
+"""Hostile code in a separate process: each limit is kept, and nothing of it is left."""
 
 from __future__ import annotations
 
@@ -142,7 +142,11 @@ def test_a_process_that_takes_too_much_is_stopped(place, closed, what, limits, s
     assert outcome.seconds < 15
 
 
-@pytest.mark.parametrize(("what", "limits", "said"), [TOO_MUCH[0], TOO_MUCH[4]], ids=["sleep", "many files"])
+@pytest.mark.parametrize(
+    ("what", "limits", "said"),
+    [pytest.param(*TOO_MUCH[0], marks=pytest.mark.slow), TOO_MUCH[4]],
+    ids=["sleep", "many files"],
+)
 def test_limits_hold_without_bubblewrap_too(place, what, limits, said):
     assert re.search(said, run(place, OPEN, what, limits=limits).failure)
 
@@ -151,7 +155,7 @@ def test_limits_hold_without_bubblewrap_too(place, what, limits, said):
 @pytest.mark.parametrize(
     ("what", "limits", "said"),
     [
-        ("removed", ROOMY._replace(disk=10**7), "stopped: it wrote more than"),
+        pytest.param(*("removed", ROOMY._replace(disk=10**7), "stopped: it wrote more than"), marks=pytest.mark.slow),
         ("closed folder", ROOMY, "stopped: it made a folder that cannot be read"),
         ("threads", ROOMY, "can't start new thread"),
     ],
