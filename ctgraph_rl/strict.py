@@ -17,6 +17,7 @@ import stat
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -169,26 +170,35 @@ def yaml_value(content: bytes) -> Any:
         raise ValueError(f"must be YAML: {' '.join(str(error).split())}") from None
 
 
-def csv_rows(content: bytes, columns: Sequence[str], key: Sequence[str]) -> list[dict[str, str]]:
+def csv_rows(
+    content: bytes, columns: Sequence[str], key: Sequence[str], most: int, read: Callable[[str], str] = str
+) -> list[dict[str, str]]:
     """Return the rows of a CSV text in UTF-8 with exactly these columns.
 
     Args:
         content: the text.
         columns: names, in order.
-        key: columns whose cells together are in one row alone.
+        key: columns whose values together are in one row only.
+        most: rows that it may have.
+        read: gives the value of a cell.
 
     Raises:
-        ValueError: for other columns, a row of another width, and two rows of one key.
+        ValueError: for other columns, a row of another width, more rows, and two rows of one key.
     """
+    text = content.decode("utf-8")
+    require(
+        ("\r" not in text.replace("\r\n", ""), "must end lines with a line feed, got a carriage return without one")
+    )
     try:
-        rows = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
+        rows = list(islice(csv.reader(io.StringIO(text, newline=""), strict=True), most + 2))
     except csv.Error as error:
         raise ValueError(f"must be CSV: {error}") from None
     header = rows[0] if rows else []
     require((header == list(columns), f"must have the columns {', '.join(columns)}, got {', '.join(header):.200}"))
+    require((len(rows) <= most + 1, f"has more than {most:,} rows, the limit"))
     wrong = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
     require((wrong is None, f"must have {len(columns)} cells in every line, line {wrong} has others"))
-    found = [dict(zip(columns, row, strict=True)) for row in rows[1:]]
+    found = [dict(zip(columns, map(read, row), strict=True)) for row in rows[1:]]
     lines: dict[tuple[str, ...], int] = {}
     for number, row in enumerate(found, 2):
         first = lines.setdefault(tuple(row[name] for name in key), number)

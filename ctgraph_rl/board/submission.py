@@ -49,7 +49,8 @@ MOST_BYTES_OF_A_FILE, MOST_BYTES_OF_A_TABLE = 2**28, 2**26
 
 MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**18, 16
 
-MOST_RUNS, MOST_SECONDS = 10_000, 1e9
+MOST_RUNS, MOST_METRICS, MOST_SECONDS = 10_000, 1_000, 1e9
+"""Of a submission, of a run in ``metrics.csv``, and of a run."""
 
 MACHINE = "machine"
 
@@ -178,7 +179,7 @@ class Submission:
     def metrics(self) -> dict[str, dict[str, dict[str, str]]]:
         """Cells of ``metrics.csv`` by run and metric; see `METRIC_COLUMNS`."""
         found: dict[str, dict[str, dict[str, str]]] = {}
-        for row in _rows(self.path / METRICS, METRIC_COLUMNS, ["run", "metric"]):
+        for row in _rows(self.path / METRICS, METRIC_COLUMNS, ["run", "metric"], MOST_METRICS * len(self.runs)):
             found.setdefault(row["run"], {})[row["metric"]] = row
         return found
 
@@ -235,11 +236,11 @@ def read_runs(path: Path) -> tuple[SubmittedRun, ...]:
         ValueError: for other columns, cells out of range, and a run or seed that is there twice.
         OSError: if it cannot be read.
     """
-    rows = _rows(path, COLUMNS, ["run"])
-    require((0 < len(rows) <= MOST_RUNS, f"{path} must have 1..{MOST_RUNS:,} runs, got {len(rows):,}"))
+    rows = _rows(path, COLUMNS, ["run"], MOST_RUNS)
     runs = [_run(row, f"{path}: line {number}") for number, row in enumerate(rows, 2)]
     names, seeds = [run.run.lower() for run in runs], [run.seed for run in runs]
     require(
+        (len(rows) > 0, f"{path} must have 1..{MOST_RUNS:,} runs, got none"),
         (len(set(names)) == len(names), f"{path} names a run twice: {_twice(names)}"),
         (len(set(seeds)) == len(seeds), f"{path} has a seed twice: {_twice(seeds)}"),
     )
@@ -282,11 +283,10 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     return SubmittedRun(**values | {"agent_bytes": int(row["agent_bytes"]) if row["agent_bytes"] else None})
 
 
-def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str]) -> list[dict[str, str]]:
+def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str], most: int) -> list[dict[str, str]]:
     """Return the rows of a CSV file with exactly these columns, of which some are a key."""
     with named(path):
-        rows = csv_rows(read_regular(path, MOST_BYTES_OF_A_TABLE), list(columns), key)
-    return [{name: from_csv(cell) for name, cell in row.items()} for row in rows]
+        return csv_rows(read_regular(path, MOST_BYTES_OF_A_TABLE), list(columns), key, most, from_csv)
 
 
 def _config(path: Path) -> dict[str, Any]:
@@ -301,12 +301,13 @@ def _config(path: Path) -> dict[str, Any]:
 
 def _versions(path: Path) -> dict[str, str]:
     """Return what ``versions.txt`` says, by names."""
-    lines = read_regular(path, MOST_BYTES_OF_A_CONFIGURATION).decode("utf-8", "replace").splitlines()
+    with named(path):
+        text = read_regular(path, MOST_BYTES_OF_A_CONFIGURATION).decode("utf-8")
+    lines = text.replace("\r\n", "\n").removesuffix("\n").split("\n")  # no other letter ends a line, as for pip
     pairs = {name: version for name, _, version in (line.removeprefix("# ").partition("==") for line in lines)}
-    once = len(pairs) == len(lines)
     wrong = [name for name, version in pairs.items() if not version]
     require(
-        (once, f"{path} has a name twice: leave one out"),
+        (len(pairs) == len(lines), f"{path} has a name twice: leave one out"),
         (not wrong, f"{path} must have lines such as torch==2.9.0, got {wrong[:1]!r:.80}"),
         (MACHINE in pairs, f"{path} must have a line # {MACHINE}==KIND, of the machine that computed {METRICS}"),
     )

@@ -163,6 +163,7 @@ def test_each_option_stops_attacks(attacker, attacks, without):
 
 @as_root
 @on_x86_64
+@pytest.mark.slow
 @pytest.mark.parametrize("without", [[USERS], [SECCOMP]], ids=["filter alone", "option alone"])
 def test_a_further_user_name_space_is_refused_twice(attacker, without):
     assert attacker.tries("user name space", without=without)["user name space"] != "open"

@@ -157,7 +157,7 @@ def test_limits_hold_without_bubblewrap_too(place, what, limits, said):
     [
         pytest.param(*("removed", ROOMY._replace(disk=10**7), "stopped: it wrote more than"), marks=pytest.mark.slow),
         ("closed folder", ROOMY, "stopped: it made a folder that cannot be read"),
-        ("threads", ROOMY, "can't start new thread"),
+        pytest.param("threads", ROOMY, "can't start new thread", marks=pytest.mark.slow),
     ],
 )
 def test_an_ordinary_user_is_held_to_limits_too(closed, ordinary, find_python, package, what, limits, said):
