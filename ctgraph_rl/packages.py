@@ -123,7 +123,7 @@ def why_agents_learn_alone(agent: object) -> str | None:
 
 
 def agents_together(agents: Sequence[object], generators: Sequence[object]) -> Any:
-    """Return the `ctgraph_rl.learn.together.Group` of agents, each with what it draws from.
+    """Return the `ctgraph_rl.learn.loop.Group` of agents, each with what it draws from.
 
     Raises:
         ValueError: see `check_packages`.

@@ -92,7 +92,6 @@ LONG_FUNCTIONS = [
     "ctgraph_rl.batch.rows.__init__",
     "ctgraph_rl.benchmark.main",
     "ctgraph_rl.board.rescore._of_the_log",
-    "ctgraph_rl.learn.together.learn_together",
     "ctgraph_rl.report.figures.labels.draw_labels",
     "make._parser",
     "studies.collectives.runs.measured",

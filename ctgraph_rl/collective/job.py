@@ -22,10 +22,11 @@ from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.runs import config, together
 from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.experts import Failures
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished
 from ctgraph_rl.runs.status import marked_if_it_fails
-from ctgraph_rl.runs.train import RunDirectory
+from ctgraph_rl.runs.train import Participant, execute
 
 Runs = Sequence[tuple[Any, Path]]
 """The configuration and the directory of each member."""
@@ -81,10 +82,7 @@ def _is_finished(runs: Runs, run_dir: Path) -> bool:
 def _learn(cfg: Any, runs: Runs, exchange: Exchange, run_dir: Path, *, interrupt: Interrupt) -> None:
     """Build the objects of all members, let them learn, and write the results."""
     checkpoints = Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
-    jobs, random = [], []
-    for number, (each, _) in enumerate(runs):
-        jobs.append(_job(number, each, interrupt))
-        random.append(torch.get_rng_state())
+    jobs, random = _jobs(runs, interrupt)
     exchange.connect([job.agent for job in jobs])
     if _is_replaced(cfg, runs):
         checkpoints.clear()
@@ -95,31 +93,51 @@ def _learn(cfg: Any, runs: Runs, exchange: Exchange, run_dir: Path, *, interrupt
         directories = [stack.enter_context(job.prepared(folder)) for job, (_, folder) in given]
         checkpoints.tidy()
         saved = checkpoints.newest()
-        members = _members(jobs, random, directories, saved)
-        log = _log(cfg, members, run_dir, saved)
-        done, total = 0 if saved is None else saved["frames"], sum(job.curriculum.num_frames for job in jobs)
+        done = 0 if saved is None else saved["frames"]
+        total = sum(job.curriculum.num_frames for job in jobs)
         blocks = max(len(job.curriculum.blocks) for job in jobs)
-        how: dict[str, Any] = {"device": jobs[0].device, "saved": saved, "checkpoint": checkpoints.offer}
-        with ProgressBar(blocks, total, directories[0].console, done) as progress:
-            learn_collective(members, exchange, cfg.seed, log, progress, **how)
-        log.close()
-        for directory, member in zip(directories, members, strict=True):
-            directory.finish(member.curriculum, member.agent, member.log)
+        progress = ProgressBar(blocks, total, directories[0].console, done)
+
+        def learn(logs: Sequence[RunLog]) -> Failures:
+            parts = zip(jobs, logs, random, strict=True)
+            members = [Member(job.curriculum, job.agent, job.cfg.seed, log, state) for job, log, state in parts]
+            log = _log(cfg, members, run_dir, saved)
+            learn_collective(
+                members,
+                exchange,
+                cfg.seed,
+                log,
+                progress,
+                device=jobs[0].device,
+                saved=saved,
+                checkpoint=checkpoints.offer,
+            )
+            log.close()
+            return {}
+
+        pairs = zip(jobs, directories, strict=True)
+        participants = [Participant(job.curriculum, job.agent, directory) for job, directory in pairs]
+        execute(participants, [None] * len(jobs) if saved is None else saved["members"], learn, progress)
         write_summary(run_dir)
         checkpoints.clear()
 
 
-def _job(number: int, cfg: Any, interrupt: Interrupt) -> Job:
-    """Build the objects of a member.
+def _jobs(runs: Runs, interrupt: Interrupt) -> tuple[list[Job], list[torch.Tensor]]:
+    """Build the objects of all members; return them, and the state of torch's generator after each.
 
     Raises:
         ValueError: names the member.
     """
-    try:
-        return Job.of(cfg, interrupt)
-    except ValueError as error:
-        agent = f"curriculum.agent={cfg.curriculum.agent}, " if "agent" in cfg.curriculum else ""
-        raise ValueError(f"member {number} ({agent}seed={cfg.seed}): {error}") from error
+    jobs = []
+    random = []
+    for number, (cfg, _) in enumerate(runs):
+        try:
+            jobs.append(Job.of(cfg, interrupt))
+        except ValueError as error:
+            agent = f"curriculum.agent={cfg.curriculum.agent}, " if "agent" in cfg.curriculum else ""
+            raise ValueError(f"member {number} ({agent}seed={cfg.seed}): {error}") from error
+        random.append(torch.get_rng_state())
+    return jobs, random
 
 
 def _is_replaced(cfg: Any, runs: Runs) -> bool:
@@ -128,20 +146,6 @@ def _is_replaced(cfg: Any, runs: Runs) -> bool:
         return bool(cfg.overwrite)
     begun = [(first_line(folder), code_of(each, {})) for each, folder in runs]
     return any(about is not None and code_changes(about, now) for about, now in begun)
-
-
-def _members(
-    jobs: Sequence[Job],
-    random: Sequence[torch.Tensor],
-    directories: Sequence[RunDirectory],
-    saved: Mapping[str, Any] | None,
-) -> list[Member]:
-    """Return the members, their logs open."""
-    states = [None] * len(jobs) if saved is None else saved["members"]
-    return [
-        Member(job.curriculum, job.agent, job.cfg.seed, directory.begin(job.curriculum, job.agent, state), state_of)
-        for job, directory, state, state_of in zip(jobs, directories, states, random, strict=True)
-    ]
 
 
 def _log(cfg: Any, members: Sequence[Member], run_dir: Path, saved: Mapping[str, Any] | None) -> RunLog:

@@ -1,12 +1,10 @@
-"""The loop of a collective: learners that each learn a curriculum of their own, in lock-step, and exchange messages.
+"""A collective: learners that each learn a curriculum, in lock-step, and exchange messages.
 
-Not to be mistaken for `ctgraph_rl.learn.together`, where seeds of one configuration are trained as one batch and share
-nothing.
+Seeds that are trained as one batch are no collective, as they share nothing; see `ctgraph_rl.learn.stacked`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,7 +17,8 @@ from torch import Tensor
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import at_least_one, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.learn.lifelong import Learned, OfferCheckpoint, Progress, learning, saved_state_fits
+from ctgraph_rl.learn.lifelong import OfferCheckpoint
+from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, State, run_loop, saved_state_fits
 from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT, Fields, Mail, Message
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -58,7 +57,7 @@ class Exchange(Protocol):
         ...
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
-        """Called after a member has learned from a batch; see `ctgraph_rl.learn.lifelong.Learned`."""
+        """Called after a member has learned from a batch; its finished episodes returned ``episode_return``."""
         ...
 
     def send(self, kind: str, member: int, received: Sequence[Message]) -> Sequence[Message]:
@@ -140,14 +139,7 @@ def learn_collective(
     exchange.connect([member.agent for member in members])
     collective = _Collective(members, exchange, Mail(exchange.drop_prob, exchange.delay_prob, seed), log)
     collective.start(checked_device(device), saved)
-    while advanced := collective.advance():
-        if progress is not None:
-            block, returns = collective.block(advanced), [learned.episode_return for learned in advanced.values()]
-            known = [value for value in returns if not math.isnan(value)]
-            progress.update(block, collective.frames, sum(known) / len(known) if known else math.nan)
-        if checkpoint is not None:
-            ends = any(members[number].curriculum.is_end(each.frames) for number, each in advanced.items())
-            checkpoint(collective.state, ends)
+    run_loop(collective, progress, checkpoint)
     return log
 
 
@@ -164,24 +156,30 @@ def _check(members: Sequence[Member], exchange: Exchange) -> None:
 
 
 class _Learner:
-    """A member that learns batch by batch, with a state of torch's global generator of its own."""
+    """A member that learns batch by batch, with a state of torch's global generator that is only its own."""
 
-    def __init__(self, number: int, member: Member, device: torch.device, saved: Mapping[str, Any] | None) -> None:
-        self.number, self.member, self.device, self.saved = number, member, device, saved
-        self.random, self.random_cuda = member.random, _cuda_stream(member.seed, device)
-        self.last: Learned | None = None
-        self.frames = 0 if saved is None else saved["frames"]
+    def __init__(self, number: int, member: Member, device: torch.device, saved: State | None) -> None:
+        self.number = number
+        self.member = member
+        self.device = device
+        self.saved = saved
+        self.random = member.random
+        self.random_cuda = _cuda_stream(member.seed, device)
         self.is_done = saved is not None and saved["done"]
+        self.has_learned = False
+        states = None if saved is None or self.is_done else [saved]
         try:
-            given = None if self.is_done else saved
             with self.drawing():
-                how: dict[str, Any] = {"device": device, "saved": given}
-                self.steps = learning(member.curriculum, member.agent, member.seed, member.log, **how)
+                group = Alone(member.agent)
+                self.steps = Lockstep(
+                    member.curriculum, group, [member.seed], [member.log], device=device, saved=states
+                )
         except ValueError as error:
             raise ValueError(f"member {number}: {error}") from error
         if self.is_done:
             with saved_state_fits():
                 member.agent.load_state_dict(saved["agent"])  # type: ignore[index]
+                self.steps.frames = saved["frames"]  # type: ignore[index]
 
     @contextmanager
     def drawing(self) -> Iterator[None]:
@@ -203,27 +201,24 @@ class _Learner:
         if state is not None:
             torch.cuda.set_rng_state(state, self.device)
 
-    def advance(self) -> Learned | None:
-        """Learn from the next batch; None at the end of the curriculum."""
+    def advance(self) -> bool:
+        """Learn from the next batch; False at the end of the curriculum."""
         if self.is_done:
-            return None
-        try:
-            with self.drawing():
-                learned = next(self.steps, None)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"member {self.number}: {error}") from None
-        self.is_done = learned is None
-        if learned is not None:
-            self.last, self.frames = learned, learned.frames
-        return learned
+            return False
+        with self.drawing():
+            self.is_done = not self.steps.advance()
+        for error in self.steps.failed.values():
+            raise FloatingPointError(f"member {self.number}: {error}")
+        self.has_learned = self.has_learned or not self.is_done
+        return not self.is_done
 
     def state(self) -> dict[str, Any]:
         """Return all that the rest of this member's run depends on; a run alone cannot resume it."""
-        with self.drawing():
-            if self.last is not None:
-                return {**self.last.state(), "done": self.is_done}
-        saved: Mapping[str, Any] = self.saved or {}
-        return {**saved, "agent": self.member.agent.state_dict(), "log": self.member.log.position()}
+        if self.has_learned:
+            with self.drawing():
+                [state] = self.steps.state()
+            return {**state, "done": self.is_done}
+        return {**(self.saved or {}), "agent": self.member.agent.state_dict(), "log": self.member.log.position()}
 
 
 def _cuda_stream(seed: int, device: torch.device) -> Tensor | None:
@@ -238,6 +233,8 @@ class _Collective:
         self.members, self.exchange, self.mail, self.log = members, exchange, mail, log
         self.rounds = 0
         self.learners: list[_Learner] = []
+        self.advanced: list[_Learner] = []
+        """Those that have learned in this round."""
 
     def start(self, device: torch.device, saved: Mapping[str, Any] | None) -> None:
         """Let all members begin, or go back to a saved state."""
@@ -257,22 +254,37 @@ class _Collective:
     @property
     def frames(self) -> int:
         """Frames that all members have learned from."""
-        return sum(learner.frames for learner in self.learners)
+        return sum(learner.steps.frames for learner in self.learners)
 
-    def block(self, advanced: Mapping[int, Learned]) -> int:
-        """Return the highest block that is learned, from 1."""
-        return max(self.members[number].curriculum.block_at(each.frames) for number, each in advanced.items())
+    @property
+    def block(self) -> int:
+        """The highest block that is learned, from 1."""
+        return max(learner.steps.block for learner in self.advanced)
 
-    def advance(self) -> dict[int, Learned]:
-        """Let each member learn from a batch, and all exchange messages if it is time; return who has learned."""
-        found = {learner.number: learner.advance() for learner in self.learners}
-        advanced = {number: learned for number, learned in found.items() if learned is not None}
-        for number, learned in advanced.items():
-            self.exchange.observe(number, learned.batch, learned.episode_return)
-        if advanced and self.rounds % self.exchange.every == 0:
+    @property
+    def returns(self) -> list[float]:
+        """The mean return of the last batch of each member that has learned."""
+        return [learner.steps.returns[0] for learner in self.advanced]
+
+    @property
+    def is_at_block_end(self) -> bool:
+        """Whether a block of a member ends with its last batch."""
+        return any(learner.steps.is_at_block_end for learner in self.advanced)
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether all can go on from this state as if they had not stopped."""
+        return all(learner.steps.can_resume for learner in self.learners)
+
+    def advance(self) -> bool:
+        """Let each member learn from a batch, and all exchange messages if it is time; False if none has learned."""
+        self.advanced = [learner for learner in self.learners if learner.advance()]
+        for learner in self.advanced:
+            self.exchange.observe(learner.number, learner.steps.batch, learner.steps.returns[0])
+        if self.advanced and self.rounds % self.exchange.every == 0:
             self._exchange()
         self.rounds += 1
-        return advanced
+        return bool(self.advanced)
 
     def _exchange(self) -> None:
         """Send messages of one kind after the other, and let members use the last."""
@@ -310,7 +322,7 @@ class _Collective:
 
     def _place(self, number: int) -> dict[str, int]:
         """Return the block of a member, and its frames so far."""
-        frames = self.learners[number].frames
+        frames = self.learners[number].steps.frames
         return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
 
     def state(self) -> dict[str, Any]:

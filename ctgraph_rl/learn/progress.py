@@ -50,7 +50,7 @@ class ProgressBar:
         return f"resumed after {_short(self.done)} frames" if self.done else "evaluating before training"
 
     def update(self, block: int, frames: int, episode_return: float) -> None:
-        """See `ctgraph_rl.learn.lifelong.Progress`."""
+        """See `ctgraph_rl.learn.loop.Progress`."""
         now = time.perf_counter()
         text = self.describe(block, frames, episode_return, now - self._start)
         if self._live:

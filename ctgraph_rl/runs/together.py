@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.learn.together import why_not_together
+from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, locked
 from ctgraph_rl.packages import agents_together, why_agents_learn_alone

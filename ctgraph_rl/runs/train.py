@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -22,9 +22,10 @@ from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import learn_curriculum
+from ctgraph_rl.learn.loop import Group
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.learn.rules import check_ids, check_rows
-from ctgraph_rl.learn.together import Group, learn_together
+from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
@@ -33,7 +34,7 @@ from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import RESULTS, write_sums
 from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import Checkpoints, State, newest_of_all, offer_all
-from ctgraph_rl.runs.experts import Expert
+from ctgraph_rl.runs.experts import Expert, Failures
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 
@@ -176,13 +177,17 @@ def train(
         checkpoints.clear()
         raise FloatingPointError(saved["failed"])
     where = RunDirectory(run_dir, config, checkpoints, experts=experts, listeners=listeners, console=console)
-    log = where.begin(curriculum, agent, saved)
     done = 0 if saved is None else saved["frames"]
-    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
+    progress = ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done)
+
+    def learn(logs: Sequence[RunLog]) -> Failures:
+        [log] = logs
         learn_curriculum(
             curriculum, agent, seed, log, progress, device=device, saved=saved, checkpoint=checkpoints.offer
         )
-    where.finish(curriculum, agent, log)
+        return {}
+
+    execute([Participant(curriculum, agent, where)], [saved], learn, progress)
 
 
 @dataclass(frozen=True)
@@ -234,7 +239,7 @@ def train_together(
     seeds: Sequence[int],
     device: torch.device,
     directories: Sequence[RunDirectory],
-) -> dict[int, FloatingPointError]:
+) -> Failures:
     """Let the agents of several seeds learn a curriculum as one batch; each is a run in a directory of its own.
 
     Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
@@ -256,23 +261,57 @@ def train_together(
     for each in checkpoints:
         each.tidy()
     saved = newest_of_all(checkpoints)
-    members = list(zip(directories, group.agents, strict=True))
-    logs = [
-        directory.begin(curriculum, agent, None if saved is None else saved[number])
-        for number, (directory, agent) in enumerate(members)
-    ]
-    done, console = 0 if saved is None else saved[0]["frames"], directories[0].console
-    with ProgressBar(len(curriculum.blocks), curriculum.num_frames, console, done) as progress:
+    done = 0 if saved is None else saved[0]["frames"]
+    progress = ProgressBar(len(curriculum.blocks), curriculum.num_frames, directories[0].console, done)
+
+    def learn(logs: Sequence[RunLog]) -> Failures:
         offer = partial(offer_all, checkpoints)
-        more: dict[str, Any] = {"device": device, "saved": saved, "checkpoint": offer}
-        failed = learn_together(curriculum, group, seeds, logs, progress, **more)
-    for number, ((directory, agent), log) in enumerate(zip(members, logs, strict=True)):
+        return learn_together(curriculum, group, seeds, logs, progress, device=device, saved=saved, checkpoint=offer)
+
+    pairs = zip(group.agents, directories, strict=True)
+    participants = [Participant(curriculum, agent, directory) for agent, directory in pairs]
+    failed = execute(participants, saved or [None] * len(participants), learn, progress)
+    for number in failed:  # last: the others could not be resumed beside a seed without a checkpoint
+        directories[number].checkpoints.clear()
+    return failed
+
+
+class Participant(NamedTuple):
+    """An agent that learns a curriculum into a directory."""
+
+    curriculum: Curriculum
+    agent: Agent
+    directory: RunDirectory
+
+
+def execute(
+    participants: Sequence[Participant],
+    saved: Sequence[State | None],
+    learn: Callable[[Sequence[RunLog]], Failures],
+    progress: ProgressBar,
+) -> Failures:
+    """Let agents learn, each into its directory: a run alone, seeds as one batch, or members that exchange messages.
+
+    Args:
+        participants: the agents.
+        saved: the state that each is resumed from.
+        learn: lets all learn, given their logs; returns the error of each that failed, which then gets no results.
+        progress: shows while they learn.
+
+    Returns:
+        What ``learn`` returned.
+    """
+    logs = [
+        participant.directory.begin(participant.curriculum, participant.agent, state)
+        for participant, state in zip(participants, saved, strict=True)
+    ]
+    with progress:
+        failed = learn(logs)
+    for number, (participant, log) in enumerate(zip(participants, logs, strict=True)):
         if number in failed:
             log.close()
         else:
-            directory.finish(curriculum, agent, log)
-    for number in failed:  # last: the others could not be resumed beside a seed without a checkpoint
-        directories[number].checkpoints.clear()
+            participant.directory.finish(participant.curriculum, participant.agent, log)
     return failed
 
 

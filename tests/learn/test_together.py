@@ -18,7 +18,7 @@ from baselines.learner import total_loss
 from baselines.stack import Stack, Template
 from baselines.together import Group
 from ctgraph_rl import Block, Curriculum, RunLog, learn_curriculum
-from ctgraph_rl.learn.together import learn_together, why_not_together
+from ctgraph_rl.learn.stacked import learn_together, why_not_together
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent, with_method
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode

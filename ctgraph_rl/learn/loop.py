@@ -1,0 +1,400 @@
+"""The loop over curricula: members learn in lock-step, a batch each, and one object couples them.
+
+A run alone is one member. Seeds that are stacked are several members of one `Lockstep`: they share an environment and
+learn as one. Learners that exchange messages are a `Lockstep` each, and `ctgraph_rl.learn.collective` couples them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.learn.collect import Policy, make_env
+from ctgraph_rl.learn.evaluate import Evaluator
+from ctgraph_rl.learn.rules import check_env, check_ids, check_rows, resumes
+from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+State = Mapping[str, Any]
+"""All that the rest of a member's run depends on, as tensors and plain values."""
+
+
+class Progress(Protocol):
+    """What the loop reports to while it runs."""
+
+    def update(self, block: int, frames: int, episode_return: float) -> None:
+        """Take the present block, from 1, the frames so far and the mean return of a batch's finished episodes."""
+        ...
+
+
+class Coupling(Protocol):
+    """What lets members learn from a batch each: a `Lockstep`, or several that exchange messages."""
+
+    @property
+    def frames(self) -> int:
+        """Frames of the run so far."""
+        ...
+
+    def advance(self) -> bool:
+        """Let each member learn from its next batch; False where none is left."""
+        ...
+
+    @property
+    def block(self) -> int:
+        """The block of the last batch, from 1."""
+        ...
+
+    @property
+    def returns(self) -> Sequence[float]:
+        """The mean return of each member's last batch; NaN where no episode ended."""
+        ...
+
+    @property
+    def is_at_block_end(self) -> bool:
+        """Whether a block of a member ends with the last batch."""
+        ...
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether a run can go on from this state as if it had not stopped."""
+        ...
+
+    def state(self) -> Any:
+        """Return what a resumed run needs, as tensors and plain values, until the next batch is collected."""
+        ...
+
+
+class Group(Protocol):
+    """Learners that act and learn as one, such as `Alone` and `baselines.together.Group`.
+
+    Between two calls each agent is as if it had learned alone.
+    """
+
+    @property
+    def agents(self) -> Sequence[Agent]:
+        """Of one configuration, with different seeds."""
+        ...
+
+    @property
+    def generators(self) -> Sequence[torch.Generator] | None:
+        """What each agent draws from; None for one agent that draws from torch's global generator."""
+        ...
+
+    @property
+    def policy(self) -> Policy:
+        """Writes the actions of all rows, [agents * num_envs], those of an agent one after the other."""
+        ...
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        ...
+
+    def end_task(self) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        ...
+
+    def learn(self, batch: TensorDictBase) -> Sequence[dict[str, float] | FloatingPointError]:
+        """Learn from a batch, [agents * num_envs, num_steps]; return what each agent measured, or raised.
+
+        An agent that raised gets batches as before. Neither then nor later does it change a bit of another's.
+        """
+        ...
+
+
+class Alone:
+    """A group of one learner.
+
+    Args:
+        agent: the learner.
+    """
+
+    generators = None
+
+    def __init__(self, agent: Agent) -> None:
+        self.agents = [agent]
+
+    @property
+    def policy(self) -> Policy:
+        """See `Group`."""
+        return self.agents[0].policy
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `Group`."""
+        self.agents[0].start_task(task)
+
+    def end_task(self) -> None:
+        """See `Group`."""
+        self.agents[0].end_task()
+
+    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+        """See `Group`."""
+        try:
+            return [self.agents[0].learn(batch)]
+        except FloatingPointError as error:
+            return [error]
+
+
+class Lockstep:
+    """Members that learn one curriculum as one, batch by batch.
+
+    A member with a loss or weight that is not finite has failed: it measures nothing from then on.
+
+    Args:
+        curriculum: what is learned.
+        group: the learners.
+        seeds: of each.
+        logs: where the measurements of each are appended.
+        device: where the environment lives.
+        saved: the state of each that `state` returned, to resume from; None: from the beginning.
+
+    Raises:
+        ValueError: for a curriculum that the learners cannot learn.
+    """
+
+    def __init__(
+        self,
+        curriculum: Curriculum,
+        group: Group,
+        seeds: Sequence[int],
+        logs: Sequence[RunLog],
+        *,
+        device: torch.device,
+        saved: Sequence[State] | None = None,
+    ) -> None:
+        check_rows(curriculum, group.agents[0].num_envs)
+        check_ids(curriculum, group.agents[0])
+        self.curriculum = curriculum
+        self.group = group
+        self.seeds = seeds
+        self.logs = logs
+        self.env = self._make_env(device)
+        check_env(curriculum, self.env)
+        self.can_resume = True
+        self.evaluators = [Evaluator(curriculum, seed, log, device) for seed, log in zip(seeds, logs, strict=True)]
+        self.frames: int = 0 if saved is None else saved[0]["frames"]
+        self.failed: dict[int, FloatingPointError] = {}
+        """The error of each member that failed, by its position."""
+
+        for number, state in enumerate(saved or ()):
+            if "failed" in state:
+                self.failed[number] = FloatingPointError(state["failed"])
+        self.batch: TensorDictBase | None = None
+        """The last batch, [members * num_envs, num_steps]."""
+
+        self.returns: list[float] = []
+        self._carried: TensorDictBase | None = None
+        self._batches = self._learn_batches(saved)
+
+    def _make_env(self, device: torch.device) -> EnvBase:
+        """Return an environment with the rows of each seed as it has them alone, one seed after the other."""
+        num_envs = self.group.agents[0].num_envs
+        count = len(self.seeds)
+        tasks = count * self.curriculum.blocks[0].rows(num_envs)
+        env = make_env(self.curriculum, tasks, self.seeds[0], device)
+        if self.group.generators is not None:
+            seed = torch.tensor(self.seeds, device=device).repeat_interleave(num_envs)
+            env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(count))
+        return env
+
+    @property
+    def block(self) -> int:
+        """The block of the last batch, from 1."""
+        return self.curriculum.block_at(self.frames)
+
+    @property
+    def is_at_block_end(self) -> bool:
+        """Whether a block ends with the last batch."""
+        return self.curriculum.is_end(self.frames)
+
+    def advance(self) -> bool:
+        """Let all learn from the next batch; False at the end, and where all have failed."""
+        return next(self._batches, False)
+
+    def _learn_batches(self, saved: Sequence[State] | None) -> Iterator[bool]:
+        """Learn block by block, a batch at each step; evaluate at the moments that the curriculum says."""
+        if len(self.failed) == len(self.logs):
+            return
+        if saved is None:
+            self._evaluate(0)
+        elif self.frames == self.curriculum.num_frames:  # nothing is collected any more
+            self._restore_agents(saved)
+            self.group.end_task()
+            self._evaluate(self.frames)
+            return
+        for segment in segments(self.curriculum, self.frames):
+            if self.frames == segment.start:
+                self.group.start_task(announced_id(self.curriculum, segment.blocks[0]))
+                saved = None
+            restore = None if saved is None else partial(self._restore, saved)
+            for batch, carried in self._collect(segment, restore):
+                self._carried = carried
+                self._learn(batch, segment)
+                self.can_resume = resumes(self.curriculum) or self.frames == segment.end
+                if len(self.failed) == len(self.logs):
+                    return
+                yield True
+            self.group.end_task()
+            self._evaluate(self.frames)
+
+    def _collect(
+        self, segment: Segment, restore: Callable[[], TensorDictBase] | None
+    ) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+        """Yield the batches that are left of a segment."""
+        return collect_segment(
+            segment,
+            self.env,
+            self.group.agents[0],
+            self._evaluate,
+            policy=self.group.policy,
+            done=self.frames - segment.start,
+            restore=restore,
+            num_seeds=len(self.logs),
+            guide_frames=self.curriculum.protocol.guide_frames,
+        )
+
+    def _evaluate(self, frames: int) -> None:
+        """Evaluate those that have not failed, if the curriculum says so after ``frames`` frames."""
+        for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
+            if number not in self.failed:
+                evaluator.evaluate_if_due(agent, frames)
+
+    def _learn(self, batch: TensorDictBase, segment: Segment) -> None:
+        """Let all learn from a batch, and log what they measure."""
+        start = self.frames
+        self.frames += batch.numel() // len(self.logs)
+        self.batch = batch
+        self.returns = []
+        share = guided(start - segment.start, self.curriculum)
+        parts = [batch] if len(self.logs) == 1 else batch.chunk(len(self.logs))
+        for number, measured in enumerate(self.group.learn(batch)):
+            if number in self.failed:
+                continue
+            try:
+                measurements = {**_finite(measured), **share}
+            except FloatingPointError as error:
+                where = f"in block {self.block} after {self.frames} frames; the run stops here"
+                seed = "" if self.group.generators is None else f"seed {self.seeds[number]}: "
+                self.failed[number] = FloatingPointError(f"{seed}{error} {where}")
+                continue
+            self.returns.append(log_training(self.logs[number], self.curriculum, parts[number], start, measurements))
+
+    def state(self) -> list[dict[str, Any]]:
+        """Return all that the rest of each member's run depends on, as tensors and plain values."""
+        assert self._carried is not None, "nothing was learned yet"
+        count = len(self.logs)
+        of_env = _divided(self.env.state_dict(), count)
+        of_data = [self._carried] if count == 1 else [part.clone() for part in self._carried.chunk(count)]
+        states = []
+        for number, (agent, log) in enumerate(zip(self.group.agents, self.logs, strict=True)):
+            state = {
+                "frames": self.frames,
+                "agent": agent.state_dict(),
+                "env": of_env[number],
+                "carried": of_data[number].to_dict(),
+                **self._random_state(number),
+                "log": log.position(),
+            }
+            if number in self.failed:
+                state["failed"] = str(self.failed[number])
+            states.append(state)
+        return states
+
+    def _restore(self, saved: Sequence[State]) -> TensorDictBase:
+        """Restore saved states; return the data that the next step starts from."""
+        self._restore_agents(saved)
+        with saved_state_fits():
+            self.env.load_state_dict(_joined([state["env"] for state in saved]))
+        rows = [self.env.numel() // len(saved)]
+        data = [TensorDict(state["carried"], rows, device=self.env.device) for state in saved]
+        return data[0] if len(data) == 1 else torch.cat(data)
+
+    def _restore_agents(self, saved: Sequence[State]) -> None:
+        """Restore the agents of saved states, and what they draw from."""
+        with saved_state_fits():
+            for agent, state in zip(self.group.agents, saved, strict=True):
+                agent.load_state_dict(state["agent"])
+        for number, state in enumerate(saved):
+            self._set_random_state(number, state)
+
+    def _random_state(self, number: int) -> dict[str, Any]:
+        """Return the state of what an agent draws from."""
+        device = self.env.device
+        if self.group.generators is not None:
+            return {"random": self.group.generators[number].get_state(), "random_cuda": None}
+        of_cuda = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
+        return {"random": torch.get_rng_state(), "random_cuda": of_cuda}
+
+    def _set_random_state(self, number: int, state: State) -> None:
+        """Restore what `_random_state` returned."""
+        if self.group.generators is not None:
+            self.group.generators[number].set_state(state["random"])
+            return
+        torch.set_rng_state(state["random"])
+        if state["random_cuda"] is not None:
+            torch.cuda.set_rng_state(state["random_cuda"], self.env.device)
+
+
+def run_loop(
+    members: Coupling,
+    progress: Progress | None,
+    checkpoint: Callable[[Callable[[], Any], bool], object] | None,
+) -> None:
+    """Let all members learn to the end, report progress and offer the state after every batch."""
+    while members.advance():
+        if progress is not None:
+            known = [value for value in members.returns if not math.isnan(value)]
+            episode_return = sum(known) / len(known) if known else math.nan
+            progress.update(members.block, members.frames, episode_return)
+        if checkpoint is not None and members.can_resume:
+            checkpoint(members.state, members.is_at_block_end)
+
+
+def _finite(measured: dict[str, float] | FloatingPointError) -> dict[str, float]:
+    """Return what was measured.
+
+    Raises:
+        FloatingPointError: what was raised in place of it, or names what is not finite.
+    """
+    if isinstance(measured, FloatingPointError):
+        raise measured
+    for name, value in measured.items():
+        if not math.isfinite(value):
+            raise FloatingPointError(f"{name} is {value}")
+    return measured
+
+
+def _divided(state: dict[str, Any], count: int) -> list[dict[str, Any]]:
+    """Return the state of an environment's rows for each member."""
+    if count == 1:
+        return [state]
+    parts: list[dict[str, Any]] = [{} for _ in range(count)]
+    for key, value in state.items():
+        for part, of_part in zip(parts, value.chunk(count), strict=True):
+            part[key] = of_part.clone()
+    return parts
+
+
+def _joined(states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the state of an environment with the rows of all members."""
+    if len(states) == 1:
+        return states[0]
+    return {key: torch.cat([state[key] for state in states]) for key in states[0]}
+
+
+@contextmanager
+def saved_state_fits() -> Iterator[None]:
+    """Say what to do where a saved state is not one of an agent and curriculum."""
+    try:
+        yield
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        message = f"the saved state does not fit this agent and curriculum, start again (overwrite=true): {error}"
+        raise ValueError(message) from error

@@ -1,0 +1,144 @@
+"""What lies between two announced boundaries of a curriculum: its batches, and the lines that they leave in a log."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate, pairwise
+from typing import NamedTuple
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.learn.collect import Policy, batches
+from ctgraph_rl.learn.evaluate import EPISODE_KEYS, episode_means
+from ctgraph_rl.learn.guide import Guide, guided_share
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block
+
+AT_THE_END = {"alarm", "rolled_back"}
+"""Measurements of the end of a batch, which are 0 in its other parts."""
+
+
+class Segment(NamedTuple):
+    """Blocks with no announced boundary between them."""
+
+    start: int  # frames of the run before it
+    blocks: tuple[Block, ...]
+
+    @property
+    def end(self) -> int:
+        """Frames of the run at its end."""
+        return self.start + sum(block.num_frames for block in self.blocks)
+
+
+def segments(curriculum: Curriculum, frames: int) -> Iterator[Segment]:
+    """Yield the segments that end after ``frames`` frames of the run, or right there."""
+    start = 0
+    for blocks in curriculum.segments:
+        segment = Segment(start, blocks)
+        if frames <= segment.end:
+            yield segment
+        start = segment.end
+
+
+def collect_segment(
+    segment: Segment,
+    env: EnvBase,
+    agent: Agent,
+    evaluate: Callable[[int], object],
+    *,
+    policy: Policy,
+    done: int = 0,
+    restore: Callable[[], TensorDictBase] | None = None,
+    num_seeds: int = 1,
+    guide_frames: int = 0,
+) -> Iterator[tuple[TensorDictBase, TensorDictBase]]:
+    """Yield the batches of a segment, each with the data that the next step starts from.
+
+    Args:
+        segment: what is learned; its frames are those of one seed.
+        env: has the rows of all seeds.
+        agent: says how many steps a batch has, and the recurrent state that rows begin with.
+        evaluate: called between two steps with the frames of the run so far.
+        policy: acts in all rows.
+        done: frames of the segment that were learned before.
+        restore: restores a state between two batches of this segment, and returns the data of the next step.
+        num_seeds: seeds whose rows the environment has, equally many of each.
+        guide_frames: see `ctgraph_rl.tasks.protocol.Protocol`; only with one seed.
+    """
+    ends = list(accumulate(block.num_frames for block in segment.blocks))
+    following = dict(zip(ends, segment.blocks[1:], strict=False))
+    _set_tasks(env, segment.blocks[sum(end <= done for end in ends[:-1])], num_seeds)
+    carried = None if restore is None else restore()
+    num_rows = env.numel() // num_seeds
+    guide = Guide(policy, env, guide_frames) if done < guide_frames else None
+
+    def between_steps(of_all_seeds: int) -> None:
+        frames = of_all_seeds // num_seeds
+        if guide is not None:
+            guide.frames = frames
+        if frames:
+            evaluate(segment.start + frames)
+        next_end = frames + num_rows
+        if next_end in following:  # so that a row whose episode ends with the block does not begin another of its task
+            _set_tasks(env, following[next_end], num_seeds, at_episode_end=True)
+
+    return batches(
+        env,
+        policy if guide is None else guide,
+        num_seeds * ends[-1],
+        agent.num_steps,
+        agent.initial_state,
+        between_steps=between_steps,
+        carried=carried,
+        done=num_seeds * done,
+    )
+
+
+def _set_tasks(env: EnvBase, block: Block, num_seeds: int, at_episode_end: bool = False) -> None:
+    """Give an environment the tasks of a block, the rows of each seed the same."""
+    if block.switch is None:
+        env.set_tasks(num_seeds * block.rows(env.numel() // num_seeds), at_episode_end)
+    else:
+        env.switch_tasks(block.tasks, block.switch, at_episode_end)
+
+
+def announced_id(curriculum: Curriculum, block: Block) -> int | None:
+    """Return the task id that the agent gets at the announced start of a block of one task, unless ids are hidden."""
+    how = curriculum.protocol
+    known = how.task_id != "hidden" and how.boundaries == "announced" and len(set(block.tasks)) == 1
+    return curriculum.task_ids[block.tasks[0]] if known else None
+
+
+def guided(frames: int, curriculum: Curriculum) -> dict[str, float]:
+    """Return the share of new episodes that was guided when a batch began; nothing without a guide."""
+    guide_frames = curriculum.protocol.guide_frames
+    return {"guided_share": guided_share(frames, guide_frames)} if guide_frames else {}
+
+
+def log_training(
+    log: RunLog, curriculum: Curriculum, batch: TensorDictBase, start: int, measurements: Mapping[str, float]
+) -> float:
+    """Append a line for each block that a batch has frames of; return the mean return of the last line."""
+    frames = start
+    end = start + batch.numel()
+    for part in _of_one_block(batch, start, curriculum.ends):
+        frames += part.numel()
+        after = part["next"]
+        episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
+        events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
+        given = {**episodes, **measurements, **events}
+        log.append("training", block=curriculum.block_at(frames), frames=frames, **given)
+    return episodes["return_mean"]
+
+
+def _of_one_block(batch: TensorDictBase, start: int, ends: Sequence[int]) -> Iterator[TensorDictBase]:
+    """Cut a batch that begins after ``start`` frames where blocks end within it."""
+    rows, steps = batch.shape
+    first = bisect_right(ends, start)
+    last = bisect_left(ends, start + batch.numel())
+    cuts = [0, *((end - start) // rows for end in ends[first:last]), steps]
+    return (batch[:, begin:end] for begin, end in pairwise(cuts))

@@ -1,0 +1,70 @@
+"""Several seeds as one batch: one environment, one forward pass, one gradient step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from ctgraph_rl.checks import takes_numbers
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.learn.loop import Group, Lockstep, Progress, State, run_loop
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.task import are_graphs
+
+OfferCheckpoints = Callable[[Callable[[], list[dict[str, Any]]], bool], object]
+"""Takes a function that makes the state of each seed's run, and whether a block ends here."""
+
+
+def why_not_together(curriculum: Curriculum) -> str | None:
+    """Return why seeds cannot learn a curriculum in one environment; None if they can."""
+    kind = type(curriculum.tasks[0]).__name__
+    if not are_graphs(curriculum.tasks):
+        return f"the rows of {kind} cannot draw from the streams of several seeds, as those of CT-graphs can"
+    shared = any(block.switch is not None and block.switch.together for block in curriculum.blocks)
+    if curriculum.protocol.guide_frames:
+        return "a guide draws from the generator of one seed"
+    return "its blocks change the tasks of all rows at once" if shared else None
+
+
+@takes_numbers
+def learn_together(
+    curriculum: Curriculum,
+    group: Group,
+    seeds: Sequence[int],
+    logs: Sequence[RunLog],
+    progress: Progress | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    saved: Sequence[State] | None = None,
+    checkpoint: OfferCheckpoints | None = None,
+) -> dict[int, FloatingPointError]:
+    """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
+
+    Each seed has the rows of the environment, the generator, the evaluations and the log that it has alone; no seed's
+    numbers depend on another's data. Losses and actions differ from those of a run alone by rounding. A seed with a
+    loss or weight that is not finite has failed: it measures nothing from then on, and the others learn on as ever.
+
+    Args:
+        curriculum: what to learn; `why_not_together` has no objection.
+        group: the learners.
+        seeds: of each agent.
+        logs: where the measurements of each are appended.
+        progress: is updated after every batch with the mean return of all seeds.
+        device: where the environment lives.
+        saved: the states of all seeds, as ``checkpoint`` was given them, to resume from with the same bits as if the
+            group had never stopped.
+        checkpoint: is offered the states after every batch.
+
+    Returns:
+        The error of each seed that failed, by its position in ``seeds``; names the seed, the block and the frames.
+
+    Raises:
+        ValueError: before any work, as `learn_curriculum` does.
+    """
+    device = checked_device(device)
+    members = Lockstep(curriculum, group, seeds, logs, device=device, saved=saved)
+    run_loop(members, progress, checkpoint)
+    return members.failed
