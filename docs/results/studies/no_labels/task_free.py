@@ -12,25 +12,42 @@ from studies.raw import Raw, groups, mean_of, read, table, write
 
 NAME = "task_free"
 
-CURRICULA = ("task_free_abrupt", "task_free_gradual", "task_free_recurring")
+PLANNED = {
+    "task_free_abrupt": ("oracle", "adwin", "none"),
+    "task_free_gradual": ("adwin", "none"),
+    "task_free_recurring": ("oracle", "adwin", "none"),
+}
+"""Curricula and learners of the experiment; the oracle refuses gradual changes."""
+
+SEEDS = 3
 
 
 def collect(name: str, folders: Sequence[Path]) -> None:
     """Write a line for each finished run under some folders."""
     paths = [path for folder in folders for path in folder.rglob("metrics.json")]
-    lines = [measured(path.parent)[0] for path in paths if path.parent.parent.name in CURRICULA]
+    lines = [measured(path.parent)[0] for path in paths if path.parent.parent.name in PLANNED]
     write(name, sorted(lines, key=lambda line: (line["curriculum"], line["detector"], line["seed"])))
 
 
 def cells() -> dict[tuple[str, str], Raw]:
-    """Return the lines of each curriculum and learner."""
+    """Return the lines of each curriculum and learner with all seeds."""
+    of = groups(read(NAME), "curriculum")
     found: dict[tuple[str, str], Raw] = {}
-    for (curriculum,), lines in groups(read(NAME), "curriculum").items():
-        for name in LEARNERS:
-            own = [line for line in lines if learner(line) == name]
-            if own:
+    for curriculum, names in PLANNED.items():
+        for name in names:
+            own = [line for line in of.get((curriculum,), []) if learner(line) == name]
+            if len(own) == SEEDS:
                 found[curriculum, name] = own
     return found
+
+
+def not_run() -> list[str]:
+    """Return a line for each curriculum that lacks learners."""
+    missing = {
+        curriculum: [LEARNERS[name] for name in names if (curriculum, name) not in cells()]
+        for curriculum, names in PLANNED.items()
+    }
+    return [f"- `{curriculum}`: {', '.join(names)}." for curriculum, names in missing.items() if names]
 
 
 def row(curriculum: str, name: str, lines: Raw) -> list[str]:
