@@ -184,6 +184,7 @@ def takes_its_kinds(function: Function) -> Function:
         require(*(_kind_rule(name, given[name], checked[name]) for name in given if name in checked))
         return function(*args, **kwargs)
 
+    called.__module__ = getattr(function, "func", function).__module__  # a partial function is not one of functools
     return takes_numbers(called)  # type: ignore[return-value]
 
 

@@ -12,7 +12,8 @@ from ctgraph_rl.log.sheets import LISTED, Sheet
 from ctgraph_rl.log.sheets import print_sheet as print_sheet
 from ctgraph_rl.log.sheets import to_latex as to_latex
 from ctgraph_rl.log.sheets import to_markdown as to_markdown
-from ctgraph_rl.runs.config import curriculum_names, curriculum_of
+from ctgraph_rl.runs.config import curriculum_of
+from ctgraph_rl.runs.settings import curriculum_names
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.memory import bank_bytes

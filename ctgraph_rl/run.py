@@ -24,7 +24,7 @@ from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
-from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep
+from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, of_hydra
 from ctgraph_rl.runs.settings import in_digits
 from ctgraph_rl.runs.sweep import sweepable
 
@@ -83,7 +83,7 @@ class Stop(BaseException):
         self.error, self.message = error, message
 
 
-@hydra.main(version_base="1.3", config_path=conf_dir(), config_name="config")
+@of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")
 def _job(cfg: DictConfig) -> None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().job.chdir:
@@ -117,12 +117,11 @@ def main() -> None:
     environment, arguments = dict(os.environ), sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
-    sys.argv = ["ctgraph-rl", *sweepable(in_digits(arguments))]
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too
     try:
         try:
             with quiet_where_nobody_reads():
-                _check_options(arguments)
+                sys.argv = ["ctgraph-rl", *sweepable(in_digits(options_first(arguments)))]
                 _job()
         except Restart:
             restart(environment, arguments)
@@ -137,15 +136,20 @@ def main() -> None:
         sys.exit(130)
 
 
-def _check_options(arguments: Sequence[str]) -> None:
-    """Refuse an option that Hydra does not know, with exit code 2."""
-    _, unknown = get_args_parser().parse_known_args(arguments)
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """Return a command line with its options first: Hydra 1.3 refuses those that follow settings.
+
+    Raises:
+        SystemExit: with code 2, for an option that Hydra does not know.
+    """
+    known, unknown = get_args_parser().parse_known_intermixed_args(arguments)
     for option in (word for word in unknown if word.startswith("-")):
         setting = option.strip("-").partition("=")[0].replace("-", "_")
         as_setting = f"a setting is written without dashes, {setting}=VALUE; " if option.startswith("--") else ""
         said = f"error: unknown option {option}: {as_setting}ctgraph-rl --help names the options"
         print(terminal_text(said), file=sys.stderr)
         sys.exit(2)
+    return [*(word for word in arguments if word not in known.overrides), *known.overrides]
 
 
 if __name__ == "__main__":  # not this module's own: other processes of a sweep import what is in it

@@ -28,6 +28,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from ctgraph_rl import packages
+from ctgraph_rl.runs.config import of_hydra
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
@@ -99,7 +100,7 @@ def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
 def compose() -> Iterator[Callable[..., DictConfig]]:
     """Composes a configuration from overrides, as the command line does; equal overrides once."""
     GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(packages.conf_dir(), version_base="1.3"):
+    with of_hydra(hydra.initialize_config_dir)(packages.conf_dir()):
         yield lambda *overrides, **how: copy.deepcopy(_composed(overrides, **how))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from helpers.sweeping import command_line, files_in
 
 from ctgraph_rl import Block, Curriculum
 from ctgraph_rl.run import run
+from ctgraph_rl.runs.config import composed, target
 from curricula.paper import ct_su_b1
 
 SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -50,6 +52,12 @@ REFUSED = [
     (["agent.hidden_size=wide"], ["error: agent.hidden_size must be an integer >= 1, got 'wide'\n"]),
     (["curriculum=axes", "curriculum.depth=0"], ["error: curriculum.depth must be an integer"]),
     (["hydra/launcher=joblib"], ["error: hydra/launcher=joblib runs the cells of a sweep: add -m, or leave it out\n"]),
+    (["seed=range(2)"], ["error: seed has several values: add -m to run each\n"]),
+    (["agent=glob(dq*)"], ["error: agent has several values: add -m to run each\n"]),
+    (
+        ["~curriculum.num_frames", "~curriculum.image_seed", "curriculum._target_=os.remove", "+curriculum.path=a"],
+        ["error: Target 'os.remove'"],
+    ),
     (["seed="], ["seed must be an integer in [0, 2**63), got ''"]),
 ]
 
@@ -77,6 +85,16 @@ def test_an_argument_that_is_missing_is_one_message(monkeypatch, capsys, tmp_pat
     error = capsys.readouterr().err
     assert code == 1
     assert "gamma" in error and "Traceback" not in error
+
+
+def test_hydra_warns_of_nothing_where_a_group_is_built(compose):
+    cfg = compose(*SHORT)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        built = [target(composed(SHORT), "agent"), target(cfg, "curriculum")()]
+
+    assert built[1].name == "su_b1_4tasks"
 
 
 def three_tasks_at_once() -> Curriculum:

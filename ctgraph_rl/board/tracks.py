@@ -23,6 +23,7 @@ from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import with_changes
+from ctgraph_rl.runs.settings import names_in
 from ctgraph_rl.runs.sweep import swept
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
@@ -188,8 +189,8 @@ def track(name: str, config_dir: Path | None = None) -> Track:
         ValueError: for an unknown name, with the one that was probably meant, and for a file that lacks a part.
     """
     folders = [Path(folder) for folder in (config_dir, conf_dir()) if folder is not None]
-    home = next((folder for folder in folders if name in config.names_in(folder, GROUP)), None)
-    choices = [each for folder in folders for each in config.names_in(folder, GROUP)]
+    home = next((folder for folder in folders if name in names_in(folder, GROUP)), None)
+    choices = [each for folder in folders for each in names_in(folder, GROUP)]
     require((home is not None, f"unknown track {name!r}: {did_you_mean(str(name), choices)}"))
     assert home is not None
     file = home / GROUP / f"{name}.yaml"
@@ -213,7 +214,7 @@ def track(name: str, config_dir: Path | None = None) -> Track:
 
 def tracks() -> tuple[Track, ...]:
     """Return the tracks of this package; the small one is the first."""
-    names = config.names_in(conf_dir(), GROUP)
+    names = names_in(conf_dir(), GROUP)
     return tuple(track(name) for name in sorted(names, key=lambda name: (name != "small", name)))
 
 

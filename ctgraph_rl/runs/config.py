@@ -9,11 +9,11 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import deepcopy
-from inspect import Parameter
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -31,13 +31,13 @@ from ctgraph_rl.checks import did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
 from ctgraph_rl.portable import check_portable
-from ctgraph_rl.runs.settings import as_typed, digest, flat, parameters_of
+from ctgraph_rl.runs.settings import as_typed, check_arguments, curriculum_names, digest, flat, names_in
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-SPECS = ("observation_spec", "action_spec", "folder")
-"""Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
+IS_NEXT_HYDRA = hasattr(hydra.utils, "execution_whitelist")
+"""Is it Hydra 1.4 or later, which has OmegaConf 2.4 or later?"""
 
 PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 """The groups that change a curriculum, each with an example."""
@@ -52,6 +52,7 @@ SAID = (
         re.compile(r"Ambiguous value for argument '(.*)'"),
         "{0} has several values: add -m to run each; a list is written in brackets, a text in quotes",
     ),
+    (re.compile(r"Sweep parameters '(\S+?)=.*' requires --multirun"), "{0} has several values: add -m to run each"),
     (re.compile(r"Multiple values for (\S+)\. To override .*'override \S+: (.*)'"), "{0} has a value: write {0}={1}"),
 )
 """Beginnings of messages of Hydra, and what is said in their place."""
@@ -62,17 +63,24 @@ MOST_CHOICES = 20
 LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm": "slurm"}
 """Configurations that come with other packages, and the extras that install these."""
 
-HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
-"""What to do about settings that only some targets take."""
-
 RENEWED: tuple[type, ...] = (GlobalHydra, JobRuntime, VersionBase)  # of Hydra's state: what composing changes
 _HYDRA = threading.RLock()  # is held while Hydra's global state is ours
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 SEEDS_APART = 1000
 """Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
 
 NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report", "together", "track")
 """Keys of the configuration that do not change results."""
+
+
+def of_hydra(function: Function) -> Function:
+    """Return a function of Hydra that behaves as in 1.3: later ones do, and want no ``version_base``."""
+    return function if IS_NEXT_HYDRA else partial(function, version_base="1.3")  # type: ignore[return-value]
+
+
+_PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a class that hydra.utils.get_class gets
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -120,7 +128,10 @@ def of_member(cfg: DictConfig, number: int) -> DictConfig:
     return own
 
 
-OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+if IS_NEXT_HYDRA:
+    OmegaConf.register_resolver("run_name", run_name, replace=True)  # type: ignore[call-arg]
+else:
+    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
 def in_sweep() -> bool:
@@ -203,15 +214,22 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
         ValueError: for an argument that the target does not take, with the one that was probably meant or the choices.
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
-    parameters = parameters_of(hydra.utils.get_object(cfg[group]["_target_"]))
-    choices = [name for name in parameters if name not in SPECS]
-    unknown = [name for name in given if name not in choices]
-    missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
-    require(
-        *((False, f"{group} has no {name}: {HINTS.get(name) or did_you_mean(name, choices)}") for name in unknown),
-        (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
-    )
-    return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
+    check_arguments(group, given, hydra.utils.get_object(cfg[group]["_target_"]))
+    with _allowed_targets(OmegaConf.to_yaml(cfg[group])):
+        return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
+
+
+def _allowed_targets(group: str) -> AbstractContextManager[Any]:
+    """Let Hydra 1.4 call what is of any package but Python's standard library, which has functions that do harm.
+
+    Args:
+        group: a group of the configuration as yaml, whose targets may be of modules that are not imported yet.
+    """
+    if not IS_NEXT_HYDRA:
+        return nullcontext()  # it refuses what it knows to do harm
+    packages = {name.partition(".")[0] for name in sys.modules} | set(_PACKAGE.findall(group))
+    allowed: Callable[[list[str]], Any] = vars(hydra.utils)["execution_whitelist"]  # type checkers read Hydra 1.3
+    return allowed([f"{name}.*" for name in packages - sys.stdlib_module_names])
 
 
 def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
@@ -264,7 +282,7 @@ def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictCon
         config_dir: is searched after ``conf``.
     """
     searched = [] if config_dir is None else [f"hydra.searchpath=[{json.dumps(str(config_dir.resolve()))}]"]
-    with _hydra_of_its_own(), hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+    with _hydra_of_its_own(), of_hydra(hydra.initialize_config_dir)(conf_dir()):
         return hydra.compose("config", [*settings, *searched])
 
 
@@ -288,18 +306,6 @@ def _hydra_of_its_own() -> Iterator[None]:
             BaseContainer._resolvers.update(resolvers)
 
 
-def curriculum_names(config_dir: Path | None) -> list[str]:
-    """Return the names of the curricula in a configuration directory.
-
-    Raises:
-        ValueError: if there is no such directory.
-    """
-    if config_dir is None:
-        return []
-    require((config_dir.is_dir(), f"--config-dir must be a directory, got {config_dir}"))
-    return names_in(config_dir, "curriculum")
-
-
 def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) -> DictConfig:
     """Return the configuration with other choices of some groups, such as ``{"agent": "dqn"}``; None: the default.
 
@@ -319,11 +325,6 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
         return composed([f"{group}={name}" for group, name in given.items()], config_dir)
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(explain(error)) from None
-
-
-def names_in(folder: Path | str, group: str) -> list[str]:
-    """Return the names of a group's yaml files in a configuration directory."""
-    return sorted(path.stem for path in Path(folder, group).glob("*.yaml"))
 
 
 def write_configuration(cfg: DictConfig, folder: Path) -> None:

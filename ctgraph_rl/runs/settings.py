@@ -13,8 +13,14 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import LARGEST_INT
+from ctgraph_rl.checks import LARGEST_INT, did_you_mean, require
 from ctgraph_rl.packages import conf_dir
+
+SPECS = ("observation_spec", "action_spec", "folder")
+"""Arguments that a run gives itself: to agents the environment's specs, to trackers where to write."""
+
+HINTS = {"cell": "it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm, or leave the cell out"}
+"""What to do about settings that only some targets take."""
 
 LSTM = {
     "_target_": "baselines.cells.lstm.LSTM",
@@ -94,6 +100,39 @@ def parameters_of(function: Any) -> dict[str, Parameter]:
     named = {name: parameter for name, parameter in own.items() if parameter.kind not in stars}
     hands_on = isinstance(function, type) and stars[1] in {parameter.kind for parameter in own.values()}
     return parameters_of(function.__mro__[1]) | named if hands_on else named
+
+
+def check_arguments(group: str, given: Sequence[str], function: Any) -> None:
+    """Refuse settings of a group that what it builds does not take, and ones that are missing.
+
+    Raises:
+        ValueError: with the one that was probably meant or the choices.
+    """
+    parameters = parameters_of(function)
+    choices = [name for name in parameters if name not in SPECS]
+    unknown = [name for name in given if name not in choices]
+    missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
+    require(
+        *((False, f"{group} has no {name}: {HINTS.get(name) or did_you_mean(name, choices)}") for name in unknown),
+        (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
+    )
+
+
+def names_in(folder: Path | str, group: str) -> list[str]:
+    """Return the names of a group's yaml files in a configuration directory."""
+    return sorted(path.stem for path in Path(folder, group).glob("*.yaml"))
+
+
+def curriculum_names(config_dir: Path | None) -> list[str]:
+    """Return the names of the curricula in a configuration directory.
+
+    Raises:
+        ValueError: if there is no such directory.
+    """
+    if config_dir is None:
+        return []
+    require((config_dir.is_dir(), f"--config-dir must be a directory, got {config_dir}"))
+    return names_in(config_dir, "curriculum")
 
 
 def digest(settings: Mapping[str, Any]) -> str:

@@ -9,16 +9,17 @@ import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
+from copy import deepcopy
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import Override, OverrideType, ValueType
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
@@ -89,10 +90,15 @@ class Sweeper(Base):
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Set up as Hydra does; a launcher for all cores gets as many processes as have ``num_threads`` each."""
+        own = deepcopy(config)
         if config.hydra.launcher.get("n_jobs") == ALL_CORES:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            config.hydra.launcher.n_jobs = max(1, cores // config.num_threads)
-        super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
+            with read_write(own.hydra.launcher):
+                own.hydra.launcher.n_jobs = max(1, cores // config.num_threads)
+        super().setup(hydra_context=hydra_context, task_function=task_function, config=own)
+        assert self.launcher is not None
+        self.config = config  # Hydra 1.4 refuses cells that say another number of processes than this
+        self.launcher.setup(hydra_context=hydra_context, task_function=task_function, config=config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Run the cells that are not done, then report the status of all.
@@ -133,10 +139,29 @@ class Sweeper(Base):
     def _combined(self, variant: Mapping[str, Any], arguments: Sequence[str]) -> list[list[str]]:
         """Return all combinations of a variant with what is swept; the last value of a setting counts."""
         own = [f"{key}={value}" for key, value in variant.items()]
-        overrides = OverridesParser.create().parse_overrides([*self._parse_config(), *own, *arguments])
+        assert self.hydra_context is not None
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        overrides = parser.parse_overrides([*self._parse_config(), *own, *arguments])
+        for each in overrides:
+            if each.value_type == ValueType.GLOB_CHOICE_SWEEP:
+                self._check_glob(each)
         batch: list[list[str]]
         [batch] = self.split_arguments(overrides, None)
         return batch
+
+    def _check_glob(self, parsed: Override) -> None:
+        """Refuse a pattern that chooses no file.
+
+        Raises:
+            ValueError: names the files that there are.
+        """
+        assert self.hydra_context is not None
+        group = parsed.key_or_group
+        names = self.hydra_context.config_loader.get_group_options(group)
+        given = parsed.input_line
+        values = f"{given}: glob chooses files of a group, such as agent or method; {group} has values, such as 1,2"
+        require((bool(names), values))
+        require((any(parsed.sweep_iterator()), f"{given} matches none of {', '.join(names)}"))
 
     def _show(self, cells: Mapping[Path, Overrides], found: Mapping[Path, Status], repeated: int) -> None:
         if self._num_unknown:

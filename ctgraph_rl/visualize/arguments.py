@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
-from ctgraph_rl.runs.config import curriculum_names, curriculum_of
+from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.load import load
+from ctgraph_rl.runs.settings import curriculum_names
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs

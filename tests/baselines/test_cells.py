@@ -19,7 +19,7 @@ from baselines.networks import GROUP, EncoderModule, RecurrentModule
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.packages import conf_dir
-from ctgraph_rl.runs.config import names_in
+from ctgraph_rl.runs.settings import names_in
 from curricula.paper import ct_su_b1
 
 CELLS = names_in(conf_dir(), "cell")

@@ -71,6 +71,40 @@ def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
     assert (code, [config["agent"]["num_envs"] for config in configs(learned)]) == (0, [1, 2])
 
 
+def test_a_pattern_chooses_files_of_a_group(learned, monkeypatch):
+    chosen = ("agent=glob(dq*)", "method=glob([ew*,l*],exclude=*_published)", "curriculum=glob(fo_b1_4t*)")
+
+    code = sweep(monkeypatch, *chosen)
+
+    assert (code, [path.name.split("-seed")[0] for path in learned]) == (0, ["dqn-ewc", "dqn-l2"])
+    assert {path.parent.name for path in learned} == {"fo_b1_4tasks"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["cell=glob(zz*)"], "cell=glob(zz*) matches none of amrl_avg, amrl_max, backpropamine, "),
+        (["seed=glob(1*)"], "seed=glob(1*): glob chooses files of a group, such as agent or method; seed has values"),
+        (["method=glob(l2*)", "method.coef=1"], "with method=l2: unknown setting 'method.coef': did you mean"),
+        (["agent=glob(d*qn)", "seed=0", "agent.burn_in=2"], "with agent=dqn: unknown setting 'agent.burn_in'"),
+    ],
+)
+def test_a_pattern_without_a_good_match_is_refused_first(settings, message, learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, *settings)
+
+    assert (code, learned) == (1, [])
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", ["seed=0,1 -m", "agent=dqn --multirun seed=0,1", "seed=0,1 --config-dir . -m agent=dqn"]
+)
+def test_options_may_follow_settings(words, learned, monkeypatch):
+    code = command_line(monkeypatch, *words.split())
+
+    assert (code, [config["seed"] for config in configs(learned)]) == (0, [0, 1])
+
+
 def test_null_is_a_setting_of_a_swept_group(learned, monkeypatch):
     code = sweep(monkeypatch, "curriculum=ct20,ct28_mosaic_skips_d5", "++curriculum.agent=null", "seed=0")
 
