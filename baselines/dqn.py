@@ -80,16 +80,20 @@ class DQN(QLearner):
         after = [("next", key) for key in (*seen, "reward", "done", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data, others: Data | None = None) -> dict[str, Tensor]:
         """Compute the loss of transitions, as TorchRL's `DQNLoss` does, and their squared errors, ``td_error``.
 
         The prediction is the value of the action taken; the target is the multi-step reward plus the discounted value
         of the best action after it, by the target network.
+
+        Args:
+            batch: transitions.
+            others: the target network's weights, in place of the present ones: see `other_weights`.
         """
         after = {key: batch["next", key] for key in self.greedy.in_keys}
         predicted = self.values(batch).gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            later = self._target_values(after)
+            later = self._target_values(after, self.other_weights() if others is None else others)
             best = (self.values(after) if self.dqn.double_dqn else later).argmax(dim=-1, keepdim=True)
             gamma = later.new_tensor(self.gamma) ** batch["steps_to_next_obs"].view_as(batch["next", "reward"])
             running = (~batch["next", "terminated"]).int()
@@ -104,11 +108,11 @@ class DQN(QLearner):
         trunk, head = self.greedy.module[0].module
         return head.module(trunk.over_time(data))
 
-    def _target_values(self, data: Data) -> Tensor:
+    def _target_values(self, data: Data, weights: Data) -> Tensor:
         """Compute the target network's action values."""
         trunk, head = self.greedy.module[0].module
         parts: list[dict[str, Tensor]] = [{}, {}]
-        for name, value in self.other_weights().items():
+        for name, value in weights.items():
             part, _, name = name.partition(".")
             parts[int(part)][name] = value
         features = functional_call(trunk.module, parts[0], tuple(data[key] for key in trunk.in_keys))

@@ -17,7 +17,7 @@ class Hooks(nn.Module):
     """
 
     stackable: ClassVar[bool] = True
-    """Whether the hooks take tensors with the seeds as a leading dimension, see `baselines.together`."""
+    """Whether the hooks take tensors with the seeds as a leading dimension, see `baselines.update.seeds`."""
 
     def transform_minibatch(self, batch: Data) -> Data:
         """Return the minibatch to learn from in place of the given one."""

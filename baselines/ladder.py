@@ -17,9 +17,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from baselines.networks import draw
-from baselines.optimisers import capturable
 from baselines.policy_gradient import PolicyGradient, generalized_advantages
-from baselines.stack import Stack, Template
+from baselines.update.stack import Stack
+from baselines.update.update import update
 from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.benchmark.ladder import WAYS, Run, Rung
 from ctgraph_rl.core.region import Region, captures
@@ -115,8 +115,8 @@ def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> Run:
 class Seeds:
     """Seeds of one agent on one device, whose networks act and learn as one stack.
 
-    All draw from the device's generator, so their numbers are not those of seeds in `baselines.together.Group`, which
-    have one generator each; the arithmetic is the same.
+    All draw from the device's generator, so their numbers are not those of seeds in `baselines.update.seeds.Group`,
+    which have one generator each; the arithmetic is the same.
 
     Args:
         learners: one for each seed, on the CPU.
@@ -130,7 +130,7 @@ class Seeds:
         self.first, self.count = learners[0], len(learners)
         self.num_envs, self.num_steps = self.first.num_envs, self.first.num_steps
         learners = [learner.to(device) for learner in learners]
-        self.stack = Stack(Template(self.first), learners)
+        self.stack = Stack(learners)
         num_rows = self.count * self.num_envs
         env = CTGraphEnv([task] * num_rows, device=device, check_actions=False, info=False)
         row = torch.arange(num_rows, device=device)
@@ -176,8 +176,7 @@ class Seeds:
 
     def gradient_step(self, minibatch: dict[Any, Tensor]) -> dict[str, Tensor]:
         """Take a gradient step of all seeds on minibatches, [seeds, items, ...]; return losses and norms, [seeds]."""
-        with capturable(self.stack.optimiser.adam):
-            return self.stack.gradient_step(minibatch)
+        return update(self.first, self.stack.state, minibatch)
 
 
 def _taken(value: Tensor, items: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -13,8 +13,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.hooks import Hooks
-from baselines.networks import Data
-from baselines.optimisers import OptimiserParts, capturable, functional_step, parts_of
+from baselines.networks import Data, Place, places
+from baselines.update.compiled import compiled
+from baselines.update.optimiser import parts_of
+from baselines.update.update import State, Update, update
 from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
@@ -40,7 +42,7 @@ class Learner(TakesNumbers, nn.Module):
     """Whether earlier steps of an episode can change the action."""
 
     stackable: ClassVar[bool] = False
-    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.together`; not with ``memory``."""
+    """Whether `loss` and `outputs` can be vectorised over seeds, see `baselines.update.seeds`; not with ``memory``."""
 
     capturable: ClassVar[bool] = False
     """Whether a gradient step has no branch on data and keeps no new tensors, so that a CUDA graph can replay it."""
@@ -65,7 +67,7 @@ class Learner(TakesNumbers, nn.Module):
             *true_or_false(compile=compile),
         )
         require((not (compile and self.memory), "compile must be false for an agent with an LSTM, which gains nothing"))
-        self.compiled_step: Step | None = compiled(functional_gradient_step) if compile else None
+        self.compiled_step: Update | None = compiled(update) if compile else None
         self._region: Region | None = None
         self.method = Hooks()
         self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
@@ -129,10 +131,15 @@ class Learner(TakesNumbers, nn.Module):
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
 
-    @cached_property
+    @property
     def weights(self) -> list[nn.Parameter]:
         """The parameters by which the losses are differentiated."""
-        return list(self.trainable)
+        return [getattr(*place) for place in self._places]
+
+    @cached_property
+    def _places(self) -> list[Place]:
+        """Where the weights are: what the optimiser trains before a method trains others in their place."""
+        return places(self, self.trainable)
 
     @property
     def trainable(self) -> list[nn.Parameter]:
@@ -157,49 +164,46 @@ class Learner(TakesNumbers, nn.Module):
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
 
-    def losses(self, batch: Data) -> dict[str, Tensor]:
-        """Compute the agent's losses and the method's penalties."""
-        return {**self.loss(batch), **self.method.penalties(batch)}
+    def losses(self, batch: Data, others: Data | None = None) -> dict[str, Tensor]:
+        """Compute the agent's losses and the method's penalties.
+
+        Args:
+            batch: a minibatch.
+            others: read in place of `other_weights`, by a ``loss`` that takes them as its second argument.
+        """
+        own = self.loss(batch, others) if others else self.loss(batch)  # type: ignore[call-arg]
+        return {**own, **self.method.penalties(batch)}
+
+    def forward(self, function: Callable[..., Any], *given: Any) -> Any:
+        """Return a function of this learner: with the tensors that `torch.func.functional_call` gives it."""
+        return function(self, *given)
 
     def gradient_step(self, batch: Data) -> dict[str, Tensor]:
         """Minimise the sum of the losses of a batch by one step; return losses and gradient norm."""
         batch = self.method.transform_minibatch(batch)
-        self.weights  # noqa: B018, also for the compiled step: a cached property that is not there yet cannot be traced
-        usual = len(batch["action"]) == self.minibatch_size and self.optimiser.state
-        if usual and self.is_captured:
-            return self._captured_step(batch)
-        if self.compiled_step is not None and usual:
-            return self.compiled_step(self, batch, parts_of(self.optimiser))
-        return self._eager_step(batch)
+        if len(batch["action"]) != self.minibatch_size or not self.optimiser.state:
+            return update(self, self.update_state, batch)
+        if not self.is_captured:
+            return self._usual_update(batch)
+        self._region = self._region or Region(self._usual_update)
+        if not self._region.takes(batch):
+            return update(self, self.update_state, batch)
+        measured = self._region(batch)
+        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
+
+    def _usual_update(self, batch: Data) -> dict[str, Tensor]:
+        """Take the step, compiled where the agent is."""
+        return (self.compiled_step or update)(self, self.update_state, batch)
+
+    @property
+    def update_state(self) -> State:
+        """What an update of this learner changes."""
+        return State(self.weights, parts_of(self.optimiser))
 
     @property
     def is_captured(self) -> bool:
         """Whether gradient steps of the usual size are captured as a CUDA graph: on GPUs, without a method."""
-        return self.capturable and type(self.method) is Hooks and captures(self.weights[0].device)
-
-    def _captured_step(self, batch: Data) -> dict[str, Tensor]:
-        """Take the step as a `Region`."""
-        if self._region is None:
-            self._region = Region(self._step_to_capture)
-        measured = self._region(batch)
-        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
-
-    def _step_to_capture(self, batch: Data) -> dict[str, Tensor]:
-        if self.compiled_step is not None:
-            return self.compiled_step(self, batch, parts_of(self.optimiser))
-        with capturable(self.optimiser):
-            return self._eager_step(batch)
-
-    def _eager_step(self, batch: Data) -> dict[str, Tensor]:
-        """Take the step operation by operation."""
-        losses = self.losses(batch)
-        gradients = torch.autograd.grad(total_loss(losses), self.weights)
-        for parameter, gradient in zip(self.trainable, self.method.transform_gradients(gradients), strict=True):
-            parameter.grad = gradient
-        norm = nn.utils.clip_grad_norm_(self.trainable, self.max_grad_norm)
-        self.optimiser.step()
-        self.method.after_step()
-        return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
+        return self.capturable and type(self.method) is Hooks and captures(next(self.parameters()).device)
 
     def mean_measurements(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
         """Return the mean of each measurement over gradient steps.
@@ -235,47 +239,6 @@ def reset_layer(module: nn.Module) -> None:
     """Draw the weights of a layer, if it has any, as PyTorch does at its construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]
-
-
-Step = Callable[[Learner, Data, OptimiserParts], dict[str, Tensor]]
-
-MOST_COMPILED = 2**14
-"""Gradient steps of different agents, methods and sizes that a process may compile; the compiler's own limit is 8."""
-
-
-@cache
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a learner and tensors, compiled once for all learners of equal structure.
-
-    With small networks and minibatches nearly all time is spent between operations; compiled code has no such gaps.
-    The compiler finds by itself whether a learner needs other code than those before: for another agent or method,
-    other settings or sizes of tensors. A learner of the same structure, or the next task, uses what is there.
-    """
-    torch._dynamo.config.trace_autograd_ops = True  # so that gradients are in the graph; a patch costs 0.07 ms a step
-    torch._dynamo.config.recompile_limit = torch._dynamo.config.accumulated_recompile_limit = MOST_COMPILED
-    return torch.compile(function, fullgraph=True, dynamic=False, options=compiler_options())
-
-
-def compiler_options() -> dict[str, Any]:
-    """Return the compiler's options: between operations there are no checks of sizes and, without a GPU, no Python."""
-    return {"size_asserts": False, "cpp_wrapper": not torch.cuda.is_available()}
-
-
-def functional_gradient_step(learner: Learner, batch: Data, optimiser: OptimiserParts) -> dict[str, Tensor]:
-    """Take `Learner.gradient_step` without a branch on data, given the parts of the learner's optimiser."""
-    losses = learner.losses(batch)
-    gradients = learner.method.transform_gradients(torch.autograd.grad(total_loss(losses), learner.weights))
-    norm = torch.stack([gradient.square().sum() for gradient in gradients]).sum().sqrt()  # fuses; PyTorch's does not
-    scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-    with torch.no_grad():
-        functional_step(optimiser, [gradient * scale for gradient in gradients])
-    learner.method.after_step()
-    return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
-
-
-def total_loss(losses: dict[str, Tensor]) -> Tensor:
-    """Return the sum of the losses named ``loss_*``, which is what is minimised."""
-    return sum((value for key, value in losses.items() if key.startswith("loss_")), start=torch.zeros(()))
 
 
 def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:

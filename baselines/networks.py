@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
@@ -27,6 +27,23 @@ Data = Mapping[Any, Tensor]
 
 GROUP = "group"
 """The key of numbers of frames, int64, the same for frames with the same inputs; see `EncoderModule.groups`."""
+
+
+class Place(NamedTuple):
+    """Where a module has a tensor, whichever it has at the time."""
+
+    module: nn.Module
+    name: str
+
+
+def places(root: nn.Module, tensors: Sequence[Tensor]) -> list[Place]:
+    """Return where the modules of ``root`` have these parameters."""
+    found: dict[int, Place] = {}
+    for module in root.modules():
+        for name, value in module._parameters.items():
+            if not isinstance(module, TensorDictParams):  # has copies of other modules' under names of its own
+                found.setdefault(id(value), Place(module, name))
+    return [found[id(tensor)] for tensor in tensors]
 
 
 class Encoder(nn.Module):

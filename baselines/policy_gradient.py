@@ -31,7 +31,7 @@ from baselines.networks import (
     require_weights,
     sequences_of,
 )
-from baselines.optimisers import OPTIMISERS, make_optimiser
+from baselines.update.optimiser import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
 
 MOST_LAYERS = 1000

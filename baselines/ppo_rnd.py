@@ -31,9 +31,9 @@ from torchrl.data import Composite, TensorSpec
 
 from baselines.learner import reset_layer
 from baselines.networks import Data, critic, encoder, highest
-from baselines.optimisers import make_optimiser
 from baselines.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
+from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0

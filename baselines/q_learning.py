@@ -17,8 +17,8 @@ from torchrl.objectives.common import LossModule
 
 from baselines.learner import MOST_PASSES, Learner
 from baselines.networks import Data, guided
-from baselines.optimisers import make_optimiser
 from baselines.prioritized import PrioritySampler
+from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
 
 LONGEST_TARGET = 10**4

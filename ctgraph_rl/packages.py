@@ -119,7 +119,7 @@ def why_agents_learn_alone(agent: object) -> str | None:
         ValueError: see `check_packages`.
     """
     check_packages()
-    return import_module("baselines.together").why_not_together(agent)
+    return import_module("baselines.update.seeds").why_not_together(agent)
 
 
 def agents_together(agents: Sequence[object], generators: Sequence[object]) -> Any:
@@ -129,7 +129,7 @@ def agents_together(agents: Sequence[object], generators: Sequence[object]) -> A
         ValueError: see `check_packages`.
     """
     check_packages()
-    return import_module("baselines.together").Group(agents, generators)
+    return import_module("baselines.update.seeds").Group(agents, generators)
 
 
 def class_named(module: str, name: str) -> type | None:

@@ -109,7 +109,7 @@ def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None
     """Sets the backend that compiles gradient steps; steps of other tests are compiled again."""
     import torch
 
-    from baselines.learner import compiled
+    from baselines.update.compiled import compiled
 
     def set_backend(backend: Any) -> None:
         monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))

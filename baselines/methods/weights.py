@@ -8,6 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
+from baselines.networks import places
 from ctgraph_rl.checks import require
 
 
@@ -23,16 +24,21 @@ class Weights:
     """
 
     def __init__(self, policy: TensorDictModuleBase, parameters: Sequence[nn.Parameter]) -> None:
-        self.parameters = list(parameters)
-        self.sizes = [parameter.numel() for parameter in self.parameters]
+        self.sizes = [parameter.numel() for parameter in parameters]
         names = {id(parameter): name for name, parameter in policy.named_parameters()}
-        within = all(id(parameter) in names for parameter in self.parameters)
+        within = all(id(parameter) in names for parameter in parameters)
         require((within, "the weights of an agent must all be parameters of its policy"))
-        self.names = [names[id(parameter)] for parameter in self.parameters]
+        self.names = [names[id(parameter)] for parameter in parameters]
+        self._places = places(policy, parameters)
         self.head_names = head_names(policy)
 
     def __len__(self) -> int:
         return sum(self.sizes)
+
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """The present parameters, or what `torch.func.functional_call` has put in their places."""
+        return [getattr(*place) for place in self._places]
 
     @property
     def device(self) -> torch.device:

@@ -59,6 +59,11 @@ class Region:
             self.graph.replay()
         return dict(self._results)
 
+    def takes(self, arguments: Tensors) -> bool:
+        """Return whether arguments have the shapes of the first call's; any, before the first call."""
+        shapes = {key: value.shape for key, value in self._arguments.items()}
+        return not shapes or shapes == {key: value.shape for key, value in arguments.items()}
+
     def _run(self) -> None:
         self._write(self._results, self.function(dict(self._arguments)))
 

@@ -74,7 +74,7 @@ class Coupling(Protocol):
 
 
 class Group(Protocol):
-    """Learners that act and learn as one, such as `Alone` and `baselines.together.Group`.
+    """Learners that act and learn as one, such as `Alone` and `baselines.update.seeds.Group`.
 
     Between two calls each agent is as if it had learned alone.
     """

@@ -18,7 +18,7 @@ from ctgraph_rl.packages import is_published
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-NUMBERS = 1
+NUMBERS = 2
 """The numbers version of this package: raised when equal configurations and seeds give other weights or measurements.
 
 Every run stores it. A log without it is of numbers version 1.

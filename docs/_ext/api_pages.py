@@ -120,7 +120,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.recurrent_q",
             "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.networks",
-            "baselines.optimisers",
+            "baselines.update.optimiser",
             "baselines.embedding",
             "baselines.transport",
             "baselines.methods.method",

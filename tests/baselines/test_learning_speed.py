@@ -14,32 +14,22 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
-from baselines import benchmark, together
+from baselines import benchmark
 from baselines._roofline import Products
 from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
 from baselines.distinct import distinct
-from baselines.learner import compiler_options, functional_gradient_step
 from baselines.networks import GROUP
-from baselines.optimisers import parts_of
-from baselines.together import Group, why_not_together
+from baselines.update import seeds as together
+from baselines.update.compiled import compiler_options
+from baselines.update.seeds import Group, why_not_together
+from baselines.update.update import update
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.benchmark import ladder as ladder_of_envs
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
 
 COMPILED = ("a2c", "dqn", "ppo", "ppo_count", "ppo_published", "reinforce")
-
-
-def whole_step_of(agent, batch) -> dict:
-    """A gradient step as it is compiled, without compiling it, after one that gives the optimiser its state."""
-    agent.gradient_step(batch)
-    return whole_step(agent, batch)
-
-
-def whole_step(agent, batch) -> dict:
-    """A gradient step as it is compiled, of an agent whose optimiser has its state."""
-    return functional_gradient_step(agent, batch, parts_of(agent.optimiser))
 
 
 def test_a_step_in_plain_tensors_equals_torchrls():
@@ -207,12 +197,14 @@ def test_the_loss_of_dqn_in_plain_tensors_equals_torchrls(small_agent, double):
 
 
 @pytest.mark.parametrize("name", others_slow(["a2c", "dqn", "ppo", "ppo_published"], "a2c", "dqn", "ppo"))
-def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent, name):
+def test_the_step_that_is_compiled_is_the_eager_one_but_for_rounding(small_agent, monkeypatch, name):
     agent, other = (small_agent(name, [ct_su_b1()]) for _ in range(2))
     minibatch = learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])[-1]
     other.load_state_dict(saved_and_loaded(agent.state_dict()))
 
-    eager, whole = agent.gradient_step(minibatch), whole_step(other, minibatch)
+    eager = agent.gradient_step(minibatch)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    whole = update(other, other.update_state, minibatch)
 
     assert list(eager) == list(whole)
     torch.testing.assert_close(whole, eager)

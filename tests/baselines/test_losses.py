@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 import torch
-from helpers.small_agents import ONE_HOT_TASK, batches, learnt_from
+from helpers.small_agents import ONE_HOT_TASK, Tiny, batches, learnt_from
 from torch import nn
 
 from baselines.networks import Encoder
-from baselines.optimisers import StackedOptimiser, make_optimiser, stacked
-from baselines.together import sampled
+from baselines.update.optimiser import make_optimiser
+from baselines.update.seeds import sampled
+from baselines.update.stack import Stack
+from baselines.update.update import update
 from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1
 
@@ -39,12 +43,13 @@ def test_entropy_is_rewarded_and_the_critics_error_is_weighed(small_agent, name)
     torch.testing.assert_close(losses["loss_critic"], 2.0 * error)
 
 
-def test_gradients_are_scaled_down_to_the_largest_norm(small_agent):
-    agent = small_agent("lstm_ppo", [ct_su_b1()], "agent.max_grad_norm=0.001")
+def test_gradients_are_scaled_down_to_the_largest_norm(small_agent, monkeypatch):
+    agent, given = small_agent("lstm_ppo", [ct_su_b1()], "agent.max_grad_norm=0.001"), []
+    monkeypatch.setattr("baselines.update.update.step", lambda optimiser, gradients: given.append(gradients))
 
-    learnt_from(agent, batches(agent, ct_su_b1(), 1)[0])
+    agent.learn(batches(agent, ct_su_b1(), 1)[0])
 
-    norm = nn.utils.get_total_norm([p.grad for p in agent.parameters() if p.grad is not None])
+    norm = nn.utils.get_total_norm(given[-1])
     assert 0 < norm <= 0.001 * (1 + 1e-4)
 
 
@@ -77,44 +82,47 @@ def _values(agent, observation):
     return agent.greedy(_observed(observation))["action_value"]
 
 
-@pytest.mark.parametrize("functional", [False, True])
+class Noisy(Tiny):
+    """Has a loss whose gradients are those of its batch, of a matrix and a vector."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.double()
+        self.max_grad_norm = 0.5
+        self.optimiser = make_optimiser(name, self.parameters(), 0.1)
+
+    def loss(self, batch):
+        return {"loss_all": sum((batch[name] * each).sum() for name, each in self.linear.named_parameters())}
+
+
 @pytest.mark.parametrize("name", ["adam", "rmsprop"])
-def test_a_stacked_step_is_that_of_each_optimiser_with_its_own_gradient_norm(name, functional):
+def test_a_stacked_update_is_that_of_each_learner_with_its_own_gradient_norm(name):
     torch.manual_seed(0)
-    own = [[torch.nn.Parameter(torch.randn(*shape).double()) for shape in ((3, 3), (4,))] for _ in SEEDS]
-    optimisers = [make_optimiser(name, parameters, 0.1) for parameters in own]
-    copies = [[torch.nn.Parameter(each.detach().clone()) for each in parameters] for parameters in own]
-    others = [make_optimiser(name, parameters, 0.1) for parameters in copies]
+    learners = [Noisy(name) for _ in SEEDS]
+    others = [deepcopy(learner) for learner in learners]
+    shapes = {name: each.shape for name, each in learners[0].linear.named_parameters()}
 
     for _ in range(2):  # the second time with the state of the first
-        kept = [stacked([each.detach() for each in pair]).requires_grad_() for pair in zip(*own, strict=True)]
-        stack = StackedOptimiser(optimisers, kept)
+        stack = Stack(learners)
         for _ in range(3):
-            gradients = [torch.randn_like(parameter) for parameter in kept]
-            one = stack.functional(kept, stack.tensors) if functional else stack
-            norms = one.step(gradients, 0.5)
-            stack.num_steps += functional
-            for number, parameters in enumerate(copies):
-                parameters[0].grad, parameters[1].grad = (
-                    gradients[0][number].mT.contiguous(),
-                    gradients[1][number].clone(),
-                )
-                norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
-                assert norms[number] == pytest.approx(norm.item(), rel=1e-12)
-                others[number].step()
+            batch = {name: torch.randn(len(SEEDS), *shape).double() for name, shape in shapes.items()}
+            measured = update(learners[0], stack.state, batch)
+            for number, other in enumerate(others):
+                alone = {name: value[number] for name, value in batch.items()}
+                for part, parameter in other.linear.named_parameters():
+                    parameter.grad = alone[part].clone()
+                norm = torch.nn.utils.clip_grad_norm_(other.parameters(), 0.5)
+                assert measured["grad_norm"][number] == pytest.approx(norm.item(), rel=1e-12)
+                other.optimiser.step()
         stack.write()
         stack.write()  # writes no step twice
-        for number, parameters in enumerate(own):
-            parameters[0].data.copy_(kept[0][number].mT.detach())
-            parameters[1].data.copy_(kept[1][number].detach())
 
-    for number in range(len(SEEDS)):
-        for one, other in zip(own[number], copies[number], strict=True):
-            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
-            mine, its = optimisers[number].state[one], others[number].state[other]
-            assert mine.keys() == its.keys()
-            for key in its:
-                torch.testing.assert_close(mine[key], its[key], rtol=1e-12, atol=1e-12)
+    for learner, other in zip(learners, others, strict=True):
+        for one, its in zip(learner.parameters(), other.parameters(), strict=True):
+            torch.testing.assert_close(one, its, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            learner.optimiser.state_dict()["state"], other.optimiser.state_dict()["state"], rtol=1e-12, atol=1e-12
+        )
 
 
 def test_actions_are_drawn_as_multinomial_draws_them_from_the_seeds_own_generator():

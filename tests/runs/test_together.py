@@ -12,7 +12,7 @@ import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
-from baselines.together import Group
+from baselines.update.seeds import Group
 from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.log import run_log, sums, tables

@@ -99,7 +99,8 @@ def test_an_agent_that_is_no_module_is_refused():
 def test_a_weight_that_the_policy_lacks_is_refused(compose):
     def with_another(*specs: Any) -> Any:
         learner = made(compose, "agent", "a2c", *TINY)(*specs)
-        learner.weights = [*learner.weights, nn.Parameter(torch.zeros(2))]
+        learner.another = nn.Parameter(torch.zeros(2))
+        learner.replace_optimiser([*learner.trainable, learner.another])
         return Method().attach(learner, CURRICULUM)
 
     with pytest.raises(ValueError, match="the weights of an agent must all be parameters of its policy"):

@@ -18,11 +18,13 @@ from torch._inductor import compile
 from torch.fx import GraphModule
 
 from baselines.hooks import Hooks
-from baselines.learner import Learner, compiler_options
+from baselines.learner import Learner
 from baselines.methods.method import AgentWithMethod
 from baselines.networks import Data
-from baselines.optimisers import is_stackable
-from baselines.stack import Stack, Template
+from baselines.update.compiled import compiler_options
+from baselines.update.optimiser import has_parts
+from baselines.update.stack import Stack
+from baselines.update.update import update
 from ctgraph_rl.agent import Agent
 
 LARGEST_MINIBATCH = 512
@@ -41,7 +43,7 @@ def why_not_together(agent: Agent) -> str | None:
         return f"{name} learns in a way of its own"
     if not learner.method.stackable:
         return f"{type(learner.method).__name__} cannot be vectorised over seeds"
-    if not is_stackable(learner.optimiser):
+    if not has_parts(learner.optimiser):
         return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
     return None
 
@@ -61,11 +63,14 @@ class Group:
         self.learners = [_learner(agent) for agent in agents]
         self.is_stacked = _gains_from_stacking(self.learners[0])
         self.most_at_once = _most_at_once(self.learners[0]) if self.learners[0].compiled_step else len(self.agents)
-        self._template: Template | None = None
+        self._compiled: dict[str, Outputs] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what depends on the present task: what a method computes can depend on earlier ones."""
+        self._stacks: list[Stack] = []
         self._acting: Stack | None = None
-        self._compiled: dict[str, Graph] = {}
-        self._steps: dict[int, Graph] = {}
-        self._outputs: Graph | None = None
+        self._outputs: Outputs | None = None
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
@@ -79,16 +84,17 @@ class Group:
             torch.set_rng_state(before)
 
     @property
-    def template(self) -> Template:
-        """A copy of a learner as it is in the present task: what a method computes can depend on earlier tasks."""
-        if self._template is None:
-            self._template = Template(self.learners[0])
-        return self._template
+    def stacks(self) -> list[Stack]:
+        """The learners' tensors, as many learners in each as learn at once."""
+        if not self._stacks:
+            count = len(self.learners)
+            bounds = torch.arange(count).tensor_split(math.ceil(count / self.most_at_once))
+            self._stacks = [Stack([self.learners[number] for number in numbers.tolist()]) for numbers in bounds]
+        return self._stacks
 
     def start_task(self, task: int | None = None) -> None:
         """See `ctgraph_rl.agent.Agent`."""
-        self._acting = self._template = self._outputs = None
-        self._steps.clear()
+        self._forget()
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
@@ -103,7 +109,7 @@ class Group:
     def policy(self, data: TensorDictBase) -> TensorDictBase:
         """Write the actions of all agents, [seeds * num_envs], and what they need to learn from them."""
         if self._acting is None:
-            self._acting = Stack(self.template, self.learners)
+            self._acting = Stack(self.learners)
         keys = [key for key in self.learners[0].policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
         outputs = self._act(self._acting, {key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
         written = self._explored(outputs) if "action_value" in outputs else sampled(outputs, self.generators)
@@ -122,7 +128,7 @@ class Group:
             self._outputs = self._compile(graph, inputs) if self.learners[0].compiled_step else graph
         return self._outputs(*inputs)
 
-    def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Graph:
+    def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Outputs:
         """Compile a graph, or return what was compiled of an equal one."""
         if graph.code not in self._compiled:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
@@ -161,18 +167,21 @@ class Group:
         for agent, part in zip(self.agents, parts, strict=True):
             if isinstance(agent, AgentWithMethod):
                 agent.method.on_batch(part)
-        count = len(parts)
-        bounds = torch.arange(count).tensor_split(math.ceil(count / self.most_at_once))
-        return [measured for numbers in bounds for measured in self._learn_at_once(numbers.tolist(), parts)]
+        numbered = iter(range(len(parts)))
+        return [
+            measured
+            for stack in self.stacks
+            for measured in self._learn_at_once(stack, [next(numbered) for _ in stack.learners], parts)
+        ]
 
     def _learn_at_once(
-        self, numbers: Sequence[int], parts: Sequence[TensorDictBase]
+        self, stack: Stack, numbers: Sequence[int], parts: Sequence[TensorDictBase]
     ) -> list[dict[str, float] | FloatingPointError]:
         """Let some of the agents learn as one stack."""
-        learners = [self.learners[number] for number in numbers]
+        stack.read()
         minibatches = {number: self.learners[number].minibatches(parts[number]) for number in numbers}
-        stack, steps = Stack(self.template, learners), []
         errors: dict[Learner, FloatingPointError] = {}
+        steps = []
         while given := self._next(minibatches):
             steps.append(self._update(stack, given, errors))
         stack.write()
@@ -187,7 +196,7 @@ class Group:
                 raise errors[learner]
             return learner.after_batch(learner.means(names, column))
 
-        return [_or_error(measured, *pair) for pair in zip(learners, table, strict=True)]
+        return [_or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
 
     def _next(self, minibatches: Mapping[int, Iterator[dict[Any, Tensor]]]) -> list[Data]:
         """Return the next minibatch of each of these agents; none after the last."""
@@ -221,18 +230,14 @@ class Group:
 
     def _step(self, stack: Stack, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
         """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents say so."""
-        first, count = stack.learners[0], len(stack.learners)
-        if first.compiled_step is None or batch["action"].shape[1] != first.minibatch_size:
-            return stack.gradient_step(batch)
-        if count not in self._steps:
-            self._steps[count] = self._compile(stack.traced(batch), stack.inputs(batch))
-        measured = self._steps[count](*stack.inputs(batch))
-        stack.optimiser.num_steps += 1
-        return measured
+        first = stack.learners[0]
+        usual = batch["action"].shape[1] == first.minibatch_size
+        function = first.compiled_step if usual and first.compiled_step is not None else update
+        return function(first, stack.state, batch)
 
 
-Graph = Callable[..., dict[str, Tensor]]
-"""A graph of operations on the tensors of a `Stack`, compiled or not: of a gradient step, or of acting."""
+Outputs = Callable[..., dict[str, Tensor]]
+"""A graph of operations on the tensors of a `Stack`, compiled or not, that acts."""
 
 CACHED_BYTES = 2**23
 """What a core keeps in its cache, of weights, gradients and moments."""

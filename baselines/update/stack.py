@@ -1,0 +1,143 @@
+"""Tensors of several learners of equal structure, stacked: one forward pass and one update for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from tensordict.nn import TensorDictParams
+from torch import Tensor, nn
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from baselines.learner import Learner
+from baselines.networks import Data
+from baselines.update.optimiser import Parts, parts_of
+from baselines.update.update import State, over_seeds, stacked, unstacked
+
+
+def named_tensors(learner: Learner) -> dict[str, Tensor]:
+    """Return a learner's parameters and buffers by name, in an order that depends on its structure alone."""
+    return {
+        f"{path}.{name}" if path else name: value
+        for path, module in learner.named_modules()
+        for kind in (module._parameters, module._buffers)
+        for name, value in kind.items()
+        if value is not None and not isinstance(module, TensorDictParams)
+    }
+
+
+class Stack:
+    """The tensors of several learners, [seeds, ...] each, which stay where they are in memory.
+
+    Args:
+        learners: whose tensors are read at construction and by `read`, and written by `write`.
+    """
+
+    def __init__(self, learners: Sequence[Learner]) -> None:
+        self.learners, first = learners, learners[0]
+        of_first = named_tensors(first)
+        names = {id(tensor): name for name, tensor in reversed(of_first.items())}
+        self.weights = [names[id(tensor)] for tensor in first.weights]
+        self.trained = [names[id(tensor)] for tensor in first.trainable]
+        self.learned = {*self.weights, *self.trained}
+        self.first_name = {name: names[id(tensor)] for name, tensor in of_first.items()}
+        """For each name the first one of the same tensor."""
+
+        matrices = [name for name, each in of_first.items() if isinstance(each, nn.Parameter) and each.ndim == 2]
+        self.turned = tuple(matrices)
+        self.kept: dict[str, Tensor] = {}
+        self.moments: list[dict[str, Tensor]] = [{} for _ in self.trained]
+        self.others: dict[str, Tensor] = {}
+        self.read()
+        for name in self.learned:
+            self.kept[name].requires_grad_()
+
+    @torch.no_grad()
+    def read(self) -> None:
+        """Read the learners' tensors."""
+        members = [named_tensors(learner) for learner in self.learners]
+        for name in dict.fromkeys(self.first_name.values()):
+            join = stacked if name in self.turned else torch.stack
+            _keep(self.kept, name, join([each[name] for each in members]))
+        for number, states in enumerate(self._states()):
+            for key in states[0]:
+                values = [state[key] for state in states]
+                joined = torch.stack(values).amax(dim=0) if key == "step" else stacked(values)  # 0 of one that failed
+                _keep(self.moments[number], key, joined)
+        self.read_others()
+
+    @torch.no_grad()
+    def read_others(self) -> None:
+        """Read the learners' other weights."""
+        others = [learner.other_weights() for learner in self.learners]
+        for key in others[0]:
+            _keep(self.others, key, torch.stack([each[key] for each in others]))
+
+    @torch.no_grad()
+    def write(self) -> None:
+        """Write the weights and the optimiser's state to the learners."""
+        members = [named_tensors(learner) for learner in self.learners]
+        for name in self.learned:
+            torch._foreach_copy_([each[name] for each in members], list(unstacked(self.kept[name]).unbind()))
+        for moments, states in zip(self.moments, self._states(), strict=True):
+            for key, value in moments.items():
+                values = [value] * len(states) if key == "step" else list(unstacked(value).unbind())
+                torch._foreach_copy_([state[key] for state in states], values)
+
+    def _states(self) -> list[list[dict[str, Tensor]]]:
+        """Return the optimisers' states of each trained parameter, one of each learner."""
+        parts = [cast(Parts, parts_of(learner.optimiser)) for learner in self.learners]
+        return [list(states) for states in zip(*(each.state for each in parts), strict=True)]
+
+    @property
+    def state(self) -> State:
+        """What an update of all learners changes."""
+        weights = [self.kept[name] for name in self.weights]
+        own = cast(Parts, parts_of(self.learners[0].optimiser))
+        optimiser = own._replace(parameters=[self.kept[name] for name in self.trained], state=self.moments)
+        return State(weights, optimiser, self._named(self.kept), self.turned, self.others)
+
+    def _named(self, kept: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: kept[first] for name, first in self.first_name.items()}
+
+    def outputs(self, data: dict[Any, Tensor]) -> dict[str, Tensor]:
+        """Compute the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
+        return over_seeds(self.learners[0], _outputs, self.state, data)
+
+    def one_step(self, data: dict[Any, Tensor]) -> dict[Any, Tensor]:
+        """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
+        return over_seeds(self.learners[0], _one_step, self.state, data)
+
+    def acting_inputs(self, data: dict[Any, Tensor]) -> list[Tensor]:
+        """Return the tensors that `outputs` reads, in one order."""
+        return [*(tensor.detach() for tensor in self.kept.values()), *data.values()]
+
+    def traced_outputs(self, data: dict[Any, Tensor]) -> GraphModule:
+        """Return `outputs` as a graph of operations, a function of `acting_inputs`."""
+        state = self.state
+
+        def outputs(*given: Tensor) -> dict[str, Tensor]:
+            left = iter(given)
+            kept = {name: next(left) for name in self.kept}
+            its = {key: next(left) for key in data}
+            return over_seeds(self.learners[0], _outputs, state._replace(tensors=self._named(kept)), its)
+
+        return make_fx(outputs, tracing_mode="fake")(*self.acting_inputs(data))
+
+
+def _keep(kept: dict[str, Tensor], name: str, value: Tensor) -> None:
+    """Write a value into the tensor of a name, which the first call makes."""
+    if name in kept:
+        kept[name].copy_(value)
+    else:
+        kept[name] = value
+
+
+def _outputs(learner: Learner, data: Data) -> dict[str, Tensor]:
+    return learner.outputs(data)
+
+
+def _one_step(learner: Learner, data: Data) -> dict[Any, Tensor]:
+    return learner.one_step(data)
