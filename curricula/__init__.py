@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from inspect import getdoc, signature, unwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from ctgraph_rl.checks import nearest, takes_its_kinds
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.curriculum import Curriculum
 
-_MODULES = ("adaptation", "masks", "memory", "nested", "paper", "sharing", "task_free")
+_MODULES = ("adaptation", "gym", "masks", "memory", "nested", "paper", "sharing", "task_free")
 """Each has a table ``NAMED`` of its curricula by name."""
 
 _HOMES = {"MISSING": "published", "from_axes": "configured", "from_meta_json": "meta_json", "sequence": "order"}
@@ -28,8 +29,9 @@ __all__ = ["MISSING", "from_axes", "from_meta_json", "load", "names", "sequence"
 
 
 def names() -> list[str]:
-    """Names of all curricula."""
-    return sorted(_named())
+    """Names of all curricula, but for those that need a package which is not installed."""
+    needs = import_module("curricula.gym").NEEDS
+    return sorted(name for name in _named() if name not in needs or find_spec(needs[name]) is not None)
 
 
 def load(name: str, **arguments: Any) -> Curriculum:

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from inspect import Parameter, signature
 from pathlib import Path
 from types import FunctionType, TracebackType
 from typing import Any
 
-import numpy as np
-import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import nn
 from torchrl.record.loggers.common import Logger
 
 from ctgraph_rl.checks import as_path, is_int, is_json_object, plain, require, takes_numbers, true_or_false
 from ctgraph_rl.disk import made_folder, sync_folders
+from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
-from ctgraph_rl.learn.evaluate import Evaluator, as_policy, by_slices
+from ctgraph_rl.learn.evaluate import Evaluator, by_slices
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
 from ctgraph_rl.log.provenance import provenance
 from ctgraph_rl.log.run_log import RunLog
@@ -37,7 +32,8 @@ class Recorder:
 
     A policy is one of
 
-    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions. Where its
+    - a function of a batch of observations, uint8 [n, 1, r, r] or [n, K], that returns n integer actions, or float ones
+      where actions are continuous. Where its
       second argument is named ``task_id``, it gets the one-hot task ids there, uint8 [n, num_task_ids], or None where
       the protocol shows none;
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
@@ -322,7 +318,10 @@ class Recorder:
             self._end()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
-        how = {"greedy": self.curriculum.evaluation.greedy, "num_actions": agent_specs(self.curriculum).action.n}
+        how = {
+            "greedy": self.curriculum.evaluation.greedy,
+            "num_actions": getattr(agent_specs(self.curriculum).action, "n", None),
+        }
         ids, shown = self.curriculum.task_ids, self.curriculum.protocol.task_id
         if policy_for is None:
             return adapt(policy, **how, shows_ids=shown == "one_hot")
@@ -340,55 +339,3 @@ class Recorder:
 def _is_code(code: object) -> bool:
     listed = code is None or isinstance(code, (list, tuple))
     return listed and all(isinstance(each, (type, FunctionType)) for each in code or ())  # type: ignore[attr-defined]
-
-
-def adapt(policy: Any, greedy: bool, num_actions: int, shows_ids: bool = False) -> Policy:
-    """Any policy as a function of TensorDicts; see `Recorder`.
-
-    Raises:
-        ValueError: for what is no policy.
-    """
-    if isinstance(policy, TensorDictModuleBase | type):
-        return policy
-    if hasattr(policy, "predict"):
-        predict, space = policy.predict, getattr(policy, "observation_space", None)
-        blind = shows_ids and space is not None and "task_id" not in getattr(space, "spaces", {})
-        fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
-        require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))
-        return _NumpyPolicy(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))
-    if isinstance(policy, nn.Module):
-        return as_policy(policy, num_actions)
-    require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
-    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    places = [p for p in signature(policy).parameters.values() if p.kind in positional]
-    if [p.name for p in places[1:2]] == ["task_id"]:
-        return _NumpyPolicy(lambda shown, state, start: (policy(*_parts(shown)), None))
-    taken = [p for p in places if p.default is p.empty]
-    fits = len(taken) in (1, 3)
-    require(
-        (fits, f"policy must take (observation) or (observation, state, episode_start), not {len(taken)} arguments")
-    )
-    return _NumpyPolicy(policy if len(taken) == 3 else lambda observation, state, start: (policy(observation), None))
-
-
-def _parts(shown: Any) -> tuple[Any, Any]:
-    """Return observations and one-hot task ids; None where the protocol shows none."""
-    return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
-
-
-class _NumpyPolicy:
-    """A function of NumPy arrays that acts on TensorDicts; it remembers from one step to the next."""
-
-    def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]]) -> None:
-        self.act, self.state = act, None
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        observation: Any = data["observation"].numpy()
-        if "task_id" in data.keys():  # noqa: SIM118, a TensorDict iterates over rows
-            observation = {"observation": observation, "task_id": data["task_id"].numpy()}
-        actions, self.state = self.act(observation, self.state, data["is_init"].squeeze(-1).numpy())
-        actions = np.asarray(actions)
-        whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == data.batch_size
-        got = f"{actions.dtype} {list(actions.shape)}"
-        require((whole, f"a policy must return {data.batch_size[0]} integer actions, one for each row, got {got}"))
-        return data.set("action", torch.from_numpy(actions.astype(np.int64)))

@@ -13,6 +13,7 @@ import curricula
 from baselines.catalogue import catalogue
 from ctgraph_rl import Curriculum, Task
 from ctgraph_rl.describe import Sheet, describe, to_markdown
+from ctgraph_rl.tasks.task import are_graphs
 from ctgraph_rl.tasks.values import random_frames_to_goal
 
 MANY = 16
@@ -28,7 +29,7 @@ def curriculum_cards(figures: dict[str, tuple[str, str]]) -> Iterator[tuple[str,
     all_curricula = {name: curricula.load(name) for name in curricula.names()}
     yield "curricula/index.md", _index(all_curricula)
     for name, curriculum in all_curricula.items():
-        yield f"curricula/{name}.md", card(curriculum, *figures[name])
+        yield f"curricula/{name}.md", card(curriculum, *figures.get(name, ()))
 
 
 def _index(all_curricula: dict[str, Curriculum]) -> str:
@@ -47,7 +48,7 @@ def _purpose(name: str) -> str:
 
 
 def _need_memory(curriculum: Curriculum) -> str:
-    needs = [needs_memory(task) for task in curriculum.tasks]
+    needs = [needs_memory(task) for task in curriculum.tasks] if are_graphs(curriculum.tasks) else [None]
     return "not known" if None in needs else f"{sum(map(bool, needs)):,}"
 
 
@@ -60,8 +61,8 @@ def needs_memory(task: Task) -> bool | None:
         return None
 
 
-def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
-    """Return a card in Markdown; ``graphs`` and ``similarity`` are the files of its figures."""
+def card(curriculum: Curriculum, graphs: str = "", similarity: str = "") -> str:
+    """Return a card in Markdown; ``graphs`` and ``similarity`` are the files of its figures, if its tasks have some."""
     name = curriculum.name
     overview, *sheets = describe(curriculum)
     results = curriculum_results(name)
@@ -70,14 +71,11 @@ def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
         f"# `{name}`",
         "[All curricula](index.md)",
         _purpose(name),
-        f"![The graphs of {name}, and where the goals are](../figures/{graphs})",
+        *([f"![The graphs of {name}, and where the goals are](../figures/{graphs})"] if graphs else []),
         _facts(overview),
         f"```bash\nctgraph-rl curriculum={name}\n```",
         f'```python\nimport curricula\n\ncurriculum = curricula.load("{name}")\n```',
-        "## Who can solve it",
-        "\n".join(f"- {sentence}" for sentence in _who(curriculum)),
-        "## How similar its tasks are",
-        f"![Similarity of the tasks of {name}](../figures/{similarity})",
+        *(_of_graphs(curriculum, similarity) if are_graphs(curriculum.tasks) else []),
         *_folded(sheets, len(curriculum.tasks)),
         *_settings(name),
         *(["## Results", results] if results else []),
@@ -86,6 +84,16 @@ def card(curriculum: Curriculum, graphs: str, similarity: str) -> str:
         *(f"```bibtex\n{entry}\n```" for entry in entries_of(curriculum.source)),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _of_graphs(curriculum: Curriculum, similarity: str) -> list[str]:
+    """Return what is known of CT-graphs alone."""
+    return [
+        "## Who can solve it",
+        "\n".join(f"- {sentence}" for sentence in _who(curriculum)),
+        "## How similar its tasks are",
+        f"![Similarity of the tasks of {curriculum.name}](../figures/{similarity})",
+    ]
 
 
 def _facts(overview: Sheet) -> str:

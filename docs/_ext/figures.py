@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 import curricula
+from ctgraph_rl.tasks.task import are_graphs
 from ctgraph_rl.visualize import curriculum_figure
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs
 from ctgraph_rl.visualize.similarity_figure import draw_similarity
@@ -19,9 +20,10 @@ DRAWINGS = {"graphs": draw_graphs, "similarity": draw_similarity}
 
 
 def draw_all(folder: Path) -> dict[str, tuple[str, str]]:
-    """Draw each curriculum's graphs and similarity; return the names of the two files by curriculum."""
+    """Draw graphs and similarity of curricula of CT-graphs; return the names of the two files by curriculum."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = {name: tuple(_file(name, kind) for kind in DRAWINGS) for name in curricula.names()}
+    names = [name for name in curricula.names() if are_graphs(curricula.load(name).tasks)]
+    files = {name: tuple(_file(name, kind) for kind in DRAWINGS) for name in names}
     missing = [
         (folder / file, name, kind) for name, pair in files.items() for file, kind in zip(pair, DRAWINGS, strict=True)
     ]

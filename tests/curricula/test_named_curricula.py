@@ -21,6 +21,7 @@ from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_pos
 from ctgraph_rl.tasks.images import PaperImages
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from curricula import axes
+from curricula.gym import NEEDS
 from curricula.paper import KINDS, configured
 
 NAMES, FOLDER = curricula.names(), Path(conf_dir(), "curriculum")
@@ -92,7 +93,7 @@ def test_a_curriculum_is_one_yaml_and_one_function_that_build_the_same():
 def test_every_yaml_is_a_named_curriculum_or_the_one_of_free_axes():
     files = {path.stem for path in FOLDER.glob("*.yaml")}
 
-    assert files == {*NAMES, "axes"}
+    assert files == {*NAMES, *NEEDS, "axes"}
 
 
 def test_a_yaml_shows_every_argument_with_a_comment():

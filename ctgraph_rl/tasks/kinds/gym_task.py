@@ -37,8 +37,8 @@ class GymTask:
         wrappers: wrap the environment one after the other: classes, or functions of an environment, by ``module:name``.
         max_episode_steps: the time limit, which truncates an episode; None: that of the id.
         label: short name in tables; None: the id with its arguments.
-        return_range: the lowest and the highest mean return of any policy; None: computed within the time limit for
-            environments of `WITH_TABLE`, and else unknown.
+        return_range: the lowest and the highest mean return of any policy, where you know them; the optimum is the
+            highest. None: computed within the time limit for environments of `WITH_TABLE`, and else unknown.
         repeats: whether an episode repeats with its seed and actions. If not, a stopped run resumes from its last
             announced block.
 

@@ -1,0 +1,80 @@
+"""Policies of any form, of NumPy arrays or with ``predict``, as functions of TensorDicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from inspect import Parameter, signature
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.learn.collect import Policy
+from ctgraph_rl.learn.evaluate import as_policy
+
+
+def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = False) -> Policy:
+    """Any policy as a function of TensorDicts; see `ctgraph_rl.Recorder`.
+
+    Raises:
+        ValueError: for what is no policy.
+    """
+    if isinstance(policy, TensorDictModuleBase | type):
+        return policy
+    act = partial(_NumpyPolicy, discrete=num_actions is not None)
+    if hasattr(policy, "predict"):
+        predict, space = policy.predict, getattr(policy, "observation_space", None)
+        blind = shows_ids and space is not None and "task_id" not in getattr(space, "spaces", {})
+        fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
+        require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))
+        return act(lambda observation, state, start: predict(observation, state, start, deterministic=greedy))
+    if isinstance(policy, nn.Module):
+        return as_policy(policy, num_actions)
+    require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
+    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    places = [p for p in signature(policy).parameters.values() if p.kind in positional]
+    if [p.name for p in places[1:2]] == ["task_id"]:
+        return act(lambda shown, state, start: (policy(*_parts(shown)), None))
+    taken = [p for p in places if p.default is p.empty]
+    fits = len(taken) in (1, 3)
+    require(
+        (fits, f"policy must take (observation) or (observation, state, episode_start), not {len(taken)} arguments")
+    )
+    return act(policy if len(taken) == 3 else lambda observation, state, start: (policy(observation), None))
+
+
+def _parts(shown: Any) -> tuple[Any, Any]:
+    """Return observations and one-hot task ids; None where the protocol shows none."""
+    return (shown["observation"], shown["task_id"]) if isinstance(shown, dict) else (shown, None)
+
+
+class _NumpyPolicy:
+    """A function of NumPy arrays that acts on TensorDicts; it remembers from one step to the next.
+
+    Args:
+        act: the function.
+        discrete: whether actions are integers.
+    """
+
+    def __init__(self, act: Callable[[Any, Any, Any], tuple[Any, Any]], discrete: bool = True) -> None:
+        self.act = act
+        self.discrete = discrete
+        self.state = None
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        observation: Any = data["observation"].numpy()
+        if "task_id" in data.keys():  # noqa: SIM118, a TensorDict iterates over rows
+            observation = {"observation": observation, "task_id": data["task_id"].numpy()}
+        actions, self.state = self.act(observation, self.state, data["is_init"].squeeze(-1).numpy())
+        actions = np.asarray(actions)
+        if not self.discrete:
+            return data.set("action", torch.from_numpy(actions.astype(np.float32)))
+        whole = np.issubdtype(actions.dtype, np.integer) and actions.shape == data.batch_size
+        got = f"{actions.dtype} {list(actions.shape)}"
+        require((whole, f"a policy must return {data.batch_size[0]} integer actions, one for each row, got {got}"))
+        return data.set("action", torch.from_numpy(actions.astype(np.int64)))
