@@ -209,7 +209,7 @@ class GymEnv(EnvBase):
         self._episode[:] = -1
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Return what `load_state_dict` needs to go on: each row's task, episode and actions, and the shown data."""
+        """Return what `load_state_dict` needs to continue: each row's task, episode and actions, and the shown data."""
         following = self.tasks if self._next is None else self._next
         return {
             "tasks": [self.pool.index(task) for task in self.tasks],

@@ -122,6 +122,13 @@ def test_what_only_ct_graphs_can_do_is_refused_with_the_reason(refused, message)
         refused()
 
 
+def test_a_curriculum_of_an_extra_that_is_not_installed_names_the_extra(monkeypatch):
+    monkeypatch.setattr("curricula.gym.find_spec", lambda name: None)
+
+    with pytest.raises(ValueError, match=r"minigrid_3tasks needs MiniGrid: install it by pip install"):
+        curricula.load("minigrid_3tasks")
+
+
 def _learn(**changes: object) -> None:
     curriculum = replace(Curriculum("lake", 1, "-", (Block(LAKE, 64),), Evaluation(num_episodes=2)), **changes)
     learn_curriculum(curriculum, make_agent("a2c", curriculum, num_envs=8, num_steps=8))

@@ -16,7 +16,7 @@ class TaskLike(Hashable, Protocol):
     them and JSON holds them. `ctgraph_rl.Task` is the first kind, `ctgraph_rl.tasks.kinds.gym_task.GymTask` the second.
     All tasks of a curriculum are of one kind, as one environment holds them.
 
-    Further members are optional. ``resumes`` says that the environment can be saved: a new one goes on with the same
+    Further members are optional. ``resumes`` says that the environment can be saved: a new one continues with the same
     bits after ``load_state_dict(state_dict())``. Without it a stopped run resumes from its last announced block.
     ``optimal_value(gamma)``, the best mean return, and ``return_bounds``,
     the lowest and the highest one, serve metrics and figures. They raise a ``ValueError`` with the reason where
