@@ -273,7 +273,7 @@ class _Collective:
 
     @property
     def can_resume(self) -> bool:
-        """Whether all can go on from this state as if they had not stopped."""
+        """Whether all can resume from this state as if they had not stopped."""
         return all(learner.steps.can_resume for learner in self.learners)
 
     def advance(self) -> bool:

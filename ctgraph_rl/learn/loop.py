@@ -65,7 +65,7 @@ class Coupling(Protocol):
 
     @property
     def can_resume(self) -> bool:
-        """Whether a run can go on from this state as if it had not stopped."""
+        """Whether a run can resume from this state as if it had not stopped."""
         ...
 
     def state(self) -> Any:

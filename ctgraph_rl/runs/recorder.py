@@ -318,21 +318,22 @@ class Recorder:
             self._end()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
-        how = {
-            "greedy": self.curriculum.evaluation.greedy,
-            "num_actions": getattr(agent_specs(self.curriculum).action, "n", None),
-        }
         ids, shown = self.curriculum.task_ids, self.curriculum.protocol.task_id
         if policy_for is None:
-            return adapt(policy, **how, shows_ids=shown == "one_hot")
+            return self._adapt(policy)
         require((shown != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))
-        unknown = [task for task in self._evaluator.tasks_at(frames) if task not in ids]
+        tasks = list(self._evaluator.tasks_at(frames))
+        unknown = [task for task in tasks if task not in ids]
         require((not unknown, "policy_for cannot play held-out tasks, which have no task id: give policy"))
-        return by_slices(
-            [
-                adapt(policy_for(ids[task]), **how, shows_ids=shown == "one_hot")
-                for task in self._evaluator.tasks_at(frames)
-            ]
+        return by_slices([self._adapt(policy_for(ids[task])) for task in tasks])
+
+    def _adapt(self, policy: Any) -> Policy:
+        """Return a policy as a function of TensorDicts."""
+        return adapt(
+            policy,
+            greedy=self.curriculum.evaluation.greedy,
+            num_actions=getattr(agent_specs(self.curriculum).action, "n", None),
+            shows_ids=self.curriculum.protocol.task_id == "one_hot",
         )
 
 

@@ -51,8 +51,8 @@ class GymTask:
     """
 
     id: str
-    kwargs: tuple[tuple[str, Any], ...] = ()
-    wrappers: tuple[str, ...] = ()
+    kwargs: Any = ()  # held as pairs in the order of their names
+    wrappers: Any = ()  # held as a tuple of names
     max_episode_steps: int | None = None
     label: str | None = None
     return_range: tuple[float, float] | None = None
