@@ -188,7 +188,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
 
     cells: list[Path] = []
 
-    def learn(cfg, run_dir, interrupt):
+    def learn(cfg, run_dir, interrupt, built=None):
         cells.append(run_dir)
         first = {"kind": "run", "config": config.plain(cfg), **job.code_of(cfg, {})}
         (run_dir / "run.jsonl").write_text(json.dumps(first) + "\n")

@@ -49,7 +49,7 @@ ALLOWED = {
     ("ctgraph_rl.log.run_log", "file.truncate"): "as above",
     ("ctgraph_rl.runs.checkpoints", "each.save"): "a method of Checkpoints, which writes through ctgraph_rl.disk",
     ("ctgraph_rl.runs.sweep", "folder.mkdir"): "named by the user",
-    ("ctgraph_rl.runs.together", "folder.mkdir"): "as above",
+    ("ctgraph_rl.runs.seeds", "folder.mkdir"): "as above",
     ("ctgraph_rl.runs.trackers", "folder.mkdir"): "after a link is refused",
 }
 """Calls outside of `ctgraph_rl.disk`, and why they follow no link of a stranger."""

@@ -19,8 +19,8 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.runs import config
 from ctgraph_rl.runs.job import run_job
+from ctgraph_rl.runs.seeds import learn_experts, run_as_one
 from ctgraph_rl.runs.settings import with_added
-from ctgraph_rl.runs.together import learn_experts, run_as_one
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 

@@ -20,7 +20,7 @@ from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
-from ctgraph_rl.runs import config, together
+from ctgraph_rl.runs import config, seeds
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Failures
 from ctgraph_rl.runs.interrupt import Interrupt
@@ -33,13 +33,13 @@ Runs = Sequence[tuple[Any, Path]]
 
 
 def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration: a collective if it has an ``exchange``, or else as `ctgraph_rl.runs.together.run_cells`.
+    """Run a configuration: a collective if it has an ``exchange``, or else as `ctgraph_rl.runs.seeds.run_cells`.
 
     Returns:
         The directories of single runs; those of a collective's members are within its own.
     """
     if "exchange" not in cfg:
-        return together.run_cells(cfg, run_dir)
+        return seeds.run_cells(cfg, run_dir)
     run_collective(cfg, run_dir)
     if not config.in_sweep():
         print(described(read_collective(run_dir)))

@@ -23,7 +23,7 @@ from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from hydra.version import VersionBase
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
@@ -71,7 +71,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 SEEDS_APART = 1000
 """Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
 
-NOT_HASHED = ("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report", "together", "track")
+NOT_HASHED = (
+    *("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report"),
+    *("together", "seeds", "track"),
+)
 """Keys of the configuration that do not change results."""
 
 
@@ -114,7 +117,9 @@ def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path
     choices = HydraConfig.get().runtime.choices
     folder = run_dir.parents[len(Path(name_of(cfg, choices)).parts) - 1]
     own = deepcopy(cfg)
-    own.seed, own.together = seed, True
+    own.seed = seed
+    with open_dict(own):
+        del own["seeds"]
     return own, folder / name_of(own, choices)
 
 
@@ -333,8 +338,9 @@ def write_configuration(cfg: DictConfig, folder: Path) -> None:
     save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():
         save_yaml(HydraConfig.instance().cfg, folder / "hydra.yaml")
-        own = {"seed": cfg.seed, "together": "true"}  # those of a job for several seeds name the first and all
+        own = {"seed": cfg.seed}  # the settings of a job for several seeds name the first and all
         given = [setting.partition("=") for setting in HydraConfig.get().overrides.task]
+        given = [each for each in given if each[0] != "+seeds"]
         settings = [f"{key}={own.get(key, value)}" if equals else key for key, equals, value in given]
         save_yaml(settings, folder / "overrides.yaml")
 

@@ -245,8 +245,13 @@ def prepare_torch(cfg: DictConfig) -> None:
     torch.set_flush_denormal(True)
 
 
-def run_job(cfg: DictConfig, run_dir: Path) -> None:
+def run_job(cfg: DictConfig, run_dir: Path, job: Job | None = None) -> None:
     """Run a configuration in an existing directory, unless its results are there; a read-only one may hold them.
+
+    Args:
+        cfg: the composed configuration.
+        run_dir: the directory.
+        job: its objects, if they were just built.
 
     Raises:
         ValueError: before any work, for a value out of range.
@@ -264,13 +269,14 @@ def run_job(cfg: DictConfig, run_dir: Path) -> None:
         if finished:
             shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
             return
-        with Interrupt() as interrupt, marked_if_it_fails(run_dir):
-            learn(cfg, run_dir, interrupt)
+        with Interrupt() if job is None else job.interrupt as interrupt, marked_if_it_fails(run_dir):
+            learn(cfg, run_dir, interrupt, job)
 
 
-def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None) -> None:
-    """Build the objects of a configuration and let them learn into a directory."""
-    job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
+def learn(cfg: DictConfig, run_dir: Path, interrupt: Interrupt | None = None, job: Job | None = None) -> None:
+    """Build the objects of a configuration, unless they are given, and let them learn into a directory."""
+    if job is None:
+        job = Job.of(cfg, Interrupt() if interrupt is None else interrupt)
     if cfg.experts and not job.curriculum.evaluation.every:
         print("note: forward transfer against experts needs evaluations within blocks: set evaluation.every")
     for note in notes(job.curriculum):

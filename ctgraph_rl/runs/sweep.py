@@ -116,6 +116,7 @@ class Sweeper(Base):
         require(
             check_overwrite(overwrite),
             (isinstance(together, bool), f"together must be true or false, got {together!r}"),
+            ("seeds" not in self.config, "seeds is a setting of the jobs of a sweep: give seed=0,1 in place of it"),
         )
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables
@@ -296,7 +297,8 @@ def _key(setting: str) -> str:
 def _job(others: Overrides, seeds: Sequence[str]) -> Overrides:
     """Return the settings of a job that runs cells which differ in their seeds alone."""
     own = [f"seed={seed}" for seed in seeds[:1] if seed]
-    return (*others, *own, *([f"together=[{','.join(seeds)}]"] if len(seeds) > 1 else []))
+    group = ["together=true", f"+seeds=[{','.join(seeds)}]"] if len(seeds) > 1 else []
+    return (*others, *own, *group)
 
 
 @contextmanager

@@ -81,7 +81,7 @@ def ran(mine, monkeypatch) -> list[int]:
     """The seeds of the cells that were run, with results that are made up."""
     seeds: list[int] = []
 
-    def learn(cfg, run_dir, interrupt):
+    def learn(cfg, run_dir, interrupt, built=None):
         seeds.append(cfg.seed)
         for path in (run_dir / "run.jsonl", run_dir / "metrics.json"):
             path.unlink(missing_ok=True)

@@ -19,13 +19,13 @@ from ctgraph_rl.log import run_log, sums, tables
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes, group_size
 from ctgraph_rl.runs import checkpoints, config, train
-from ctgraph_rl.runs import together as runs_together
+from ctgraph_rl.runs import seeds as runs_seeds
 from ctgraph_rl.runs.experts import find_or_train
 from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.read import find_runs, read_run
-from ctgraph_rl.runs.together import run_as_one, train_experts
+from ctgraph_rl.runs.seeds import run_as_one, train_experts
 
 TINY = ("curriculum=ct2_interfering", "curriculum.num_frames=128", "evaluation.num_episodes=2", "agent.hidden_size=8")
 PPO = (*TINY, "agent=ppo", "agent.num_envs=8", "agent.num_steps=8", "agent.num_epochs=1")
@@ -192,12 +192,12 @@ def test_a_report_says_which_runs_were_trained_together(monkeypatch, together):
 def test_seeds_that_cannot_be_one_batch_are_run_as_alone_one_after_the_other(monkeypatch, capsys):
     ran = []
 
-    def run_job(cfg, run_dir):
+    def run_job(cfg, run_dir, built=None):
         ran.append((cfg.seed, run_dir.name.split("-")[1]))
         if cfg.seed == 0:
             raise FloatingPointError("the loss is NaN")
 
-    monkeypatch.setattr(runs_together, "run_job", run_job)
+    monkeypatch.setattr(runs_seeds, "run_job", run_job)
     code = sweep(monkeypatch, "seed=0,1", *TINY, "agent=lstm_ppo", "agent.num_envs=8", "together=true")
 
     said = capsys.readouterr()
@@ -274,6 +274,8 @@ def test_a_seed_that_failed_has_failed_also_where_its_group_was_stopped_before_i
             "as one batch: add -m and several seeds, such as seed=range(20), or together=false for one run",
         ),
         (("-m", "seed=0,1", "together=[0,1]"), "together must be true or false, got [0, 1]"),
+        (("-m", "+seeds=[0,1]"), "seeds is a setting of the jobs of a sweep: give seed=0,1"),
+        (("+seeds=[0,1]",), "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1"),
     ],
 )
 def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
@@ -281,6 +283,24 @@ def test_other_uses_are_refused(monkeypatch, capsys, arguments, message):
 
     assert message in capsys.readouterr().err
     assert not runs()
+
+
+@pytest.mark.parametrize("settings", [["together=true"], ["together=true", "agent=lstm_ppo"]], ids=["one", "in turn"])
+def test_as_many_jobs_are_built_as_there_are_seeds(monkeypatch, settings):
+    built = []
+
+    def stop_before_learning(job, *given):
+        built.append(job.cfg.seed)
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr(Job, "prepared", stop_before_learning)
+    of = Job.of
+    monkeypatch.setattr(Job, "of", lambda *given: made.append(given[0].seed) or of(*given))
+    made: list[int] = []
+
+    assert sweep(monkeypatch, SEEDS, *PPO, *settings) == 1
+
+    assert made == [0, 1, 2]
 
 
 def jobs(*seeds: int, folder: str = "experts") -> list[Job]:
@@ -385,8 +405,8 @@ def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch
 
 def test_seeds_that_have_failed_are_an_error_of_the_group(tmp_path, monkeypatch):
     failed = {0: FloatingPointError("the loss is NaN"), 1: OSError("no disk")}
-    monkeypatch.setattr(runs_together, "is_finished", lambda cfg, run_dir: False)
-    monkeypatch.setattr(runs_together, "_marked", lambda left: failed)
+    monkeypatch.setattr(runs_seeds, "is_finished", lambda cfg, run_dir: False)
+    monkeypatch.setattr(runs_seeds, "_marked", lambda left, built: failed)
 
     with pytest.raises(RuntimeError, match=r"^FloatingPointError: the loss is NaN; OSError: no disk$"):
         run_as_one([({}, tmp_path)])

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, locked
@@ -30,7 +31,7 @@ Run = tuple[Any, Path]
 
 
 def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration, or where a sweep lists seeds in ``together`` it with each of them in a directory of its own.
+    """Run a configuration, or where a sweep lists ``seeds`` the configuration with each of them in its directory.
 
     Args:
         cfg: the composed configuration, with the first seed.
@@ -43,49 +44,53 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
         ValueError: before any work, for a value out of range.
         RuntimeError: if seeds have failed.
     """
-    if isinstance(cfg.together, bool) or not config.in_sweep():
+    alone = "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1 in place of it"
+    require((config.in_sweep() or "seeds" not in cfg, alone))
+    if "seeds" not in cfg:
         run_job(cfg, run_dir)
         return [run_dir]
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    runs = [config.of_seed(cfg, seed, run_dir) for seed in cfg.together]
+    runs = [config.of_seed(cfg, seed, run_dir) for seed in cfg.seeds]
     for each, folder in runs:
         config.check_values(each)
         folder.mkdir(parents=True, exist_ok=True)
-    reason = _why_one_after_the_other(runs[0][0])
+    job = Job.of(runs[0][0], Interrupt())
+    generator = _generator()
+    reason = _why_one_after_the_other(job)
     if reason is None:
-        run_as_one(runs)
+        run_as_one(runs, (job, generator))
     else:
         print(f"note: seeds are trained one after the other, as {terminal_text(reason)}", file=sys.stderr)
-        _run_in_turn(runs)
+        torch.set_rng_state(generator.get_state())
+        _run_in_turn(runs, job)
     return [folder for _, folder in runs]
 
 
-def _why_one_after_the_other(cfg: Any) -> str | None:
-    """Return why the seeds of a configuration cannot learn as one batch; None if they can."""
-    with torch.random.fork_rng():
-        job = Job.of(cfg, Interrupt())
+def _why_one_after_the_other(job: Job) -> str | None:
+    """Return why seeds of a job's configuration cannot learn as one batch; None if they can."""
     if job.device.type != "cpu":
         return f"those on {job.device} cannot be one batch"
     return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent)
 
 
-def _run_in_turn(runs: Sequence[Run]) -> None:
-    """Run each; one that fails stops no other."""
+def _run_in_turn(runs: Sequence[Run], first: Job) -> None:
+    """Run each, the first by the job that was built of it; one that fails stops no other."""
     errors = []
-    for cfg, run_dir in runs:
+    for number, (cfg, run_dir) in enumerate(runs):
         try:
-            run_job(cfg, run_dir)
+            run_job(cfg, run_dir, None if number else first)
         except Exception as error:
             errors.append(f"seed {cfg.seed}: {type(error).__name__}: {config.explain(error)}")
     if errors:
         raise RuntimeError("; ".join(errors))
 
 
-def run_as_one(runs: Sequence[Run]) -> None:
+def run_as_one(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None = None) -> None:
     """Run those that are not finished, as one batch; a seed that fails stops no other.
 
     Args:
         runs: the configuration of each seed, and its existing directory.
+        built: the job of one of them, and what its agent draws from, if it was built before.
 
     Raises:
         RuntimeError: if seeds have failed.
@@ -98,18 +103,18 @@ def run_as_one(runs: Sequence[Run]) -> None:
         for (_, run_dir), done in zip(runs, finished, strict=True):
             if done:
                 shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
-        failed = _marked(left) if left else {}
+        failed = _marked(left, built) if left else {}
     if failed:
         raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
 
 
-def _marked(runs: Sequence[Run]) -> Failures:
+def _marked(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None) -> Failures:
     """Run all as one batch; leave in the directory of each that fails, or of all, why."""
     with ExitStack() as stack:
-        interrupt = stack.enter_context(Interrupt())
+        interrupt = stack.enter_context(Interrupt() if built is None else built[0].interrupt)
         for _, run_dir in runs:
             stack.enter_context(marked_if_it_fails(run_dir))
-        failed = _learn(runs, interrupt)
+        failed = _learn(runs, interrupt, built)
     for cfg, run_dir in runs:
         if cfg.seed in failed:
             with suppress(FloatingPointError), marked_if_it_fails(run_dir):
@@ -117,15 +122,19 @@ def _marked(runs: Sequence[Run]) -> Failures:
     return failed
 
 
-def _learn(runs: Sequence[Run], interrupt: Interrupt) -> Failures:
+def _learn(runs: Sequence[Run], interrupt: Interrupt, built: tuple[Job, torch.Generator] | None) -> Failures:
     """Build the objects of all runs, and let them learn; return the error of each seed that failed.
 
     A seed with a single-task expert that failed does not begin.
     """
-    jobs, generators = {}, {}
+    jobs = {}
+    generators = {}
     for cfg, _ in runs:
-        jobs[cfg.seed] = Job.of(cfg, interrupt)
-        generators[cfg.seed] = _generator()
+        if built is not None and built[0].cfg.seed == cfg.seed:
+            jobs[cfg.seed], generators[cfg.seed] = built
+        else:
+            jobs[cfg.seed] = Job.of(cfg, interrupt)
+            generators[cfg.seed] = _generator()
     first = jobs[runs[0][0].seed]
     experts, failed = train_experts([*jobs.values()]) if first.cfg.experts else ({}, {})
     begin = {cfg.seed: run_dir for cfg, run_dir in runs if cfg.seed not in failed}
