@@ -32,7 +32,7 @@ FLOORS = (
     ("visualize", "hydra_plugins"),
     ("report",),
     ("collective", "board"),
-    ("cli", "run", "describe", "compare"),
+    ("cli", "run", "describe", "compare", "testing"),
     ("benchmark",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""

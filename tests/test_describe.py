@@ -25,6 +25,7 @@ from ctgraph_rl.log.sheets import Sheet
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
 from ctgraph_rl.tasks.switch import Drift
+from ctgraph_rl.tasks.task import are_graphs
 from ctgraph_rl.visualize.curriculum_figure import draw_graphs, goals_by_graph
 from curricula.__main__ import main
 
@@ -247,7 +248,8 @@ def test_every_named_curriculum_can_be_described(name):
 
     assert overview.title == name
     assert len(blocks.rows) == sum(map(len, curriculum.trained))
-    assert [len(sheet.rows) for sheet in of_tasks] == [len(curriculum.tasks)] * 3
+    known = 3 if are_graphs(curriculum.tasks) else 0
+    assert [len(sheet.rows) for sheet in of_tasks] == [len(curriculum.tasks)] * known
     assert all(len(row) == len(sheet.columns) for sheet in sheets for row in sheet.rows)
 
 

@@ -1,0 +1,123 @@
+"""What holds for every agent and for every lifelong-learning method; see `ctgraph_rl.agent`."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.learn.collect import agent_specs, make_env
+from ctgraph_rl.learn.lifelong import learn_curriculum
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.runs.train import new_agent, with_method
+from ctgraph_rl.tasks.configurations import ct_su_b1
+from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
+
+
+class AgentContract:
+    """Tests of an agent. Override `make_agent` with small networks and few environments.
+
+    Example:
+        >>> class TestMyAgent(AgentContract):
+        ...     def make_agent(self, observation_spec, action_spec):
+        ...         return MyAgent(observation_spec, action_spec, num_envs=4, num_steps=8)
+    """
+
+    def make_agent(self, observation_spec: Any, action_spec: Any) -> Agent:
+        """Return a new agent for unbatched specs; override it."""
+        raise NotImplementedError
+
+    def protocol(self) -> Protocol:
+        """Return what the agent is given on tasks and boundaries."""
+        return Protocol()
+
+    def curriculum(self) -> Curriculum:
+        """Return two small tasks to learn, three batches each."""
+        tasks = [ct_su_b1(goal=goal) for goal in ((1, 1), (2, 2))]
+        blocks = tuple(Block((task,), num_frames=1) for task in tasks)
+        shortest = Curriculum(
+            "contract", 1, "a test", blocks, evaluation=Evaluation(num_episodes=2), protocol=self.protocol()
+        )
+        agent = self.make_agent(*agent_specs(shortest))
+        frames = 3 * agent.num_envs * agent.num_steps
+        return replace(shortest, blocks=tuple(replace(block, num_frames=frames) for block in blocks))
+
+    def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
+        """Return a new agent for a curriculum."""
+        return new_agent(curriculum, self.make_agent, seed)
+
+    def learnt(self, curriculum: Curriculum, **how: Any) -> tuple[Agent, RunLog]:
+        """Return an agent that learned a curriculum, and its log."""
+        agent = self.build(curriculum)
+        return agent, learn_curriculum(curriculum, agent, **how)
+
+    def test_a_policy_writes_an_action_for_each_row(self) -> None:
+        """Of the type and in the range of the specs."""
+        curriculum = self.curriculum()
+        agent = self.build(curriculum)
+        env = make_env(curriculum, curriculum.tasks[:1] * 3, 0)
+        data = env.reset().update(agent.initial_state(3))
+
+        with torch.no_grad():
+            written = agent.policy(data)
+
+        assert env.action_spec.is_in(written["action"])
+
+    def test_it_learns_two_blocks_and_measures_finite_numbers(self) -> None:
+        """Each batch gives a line of the log."""
+        _, log = self.learnt(self.curriculum())
+        lines = log.of_kind("training")
+
+        assert len(lines) == 6
+        values = [value for line in lines for value in line.values() if isinstance(value, float)]
+        assert all(map(math.isfinite, values))
+
+    def test_equal_seeds_give_equal_runs(self) -> None:
+        """Weights and measurements."""
+        curriculum = self.curriculum()
+        (one, log), (other, again) = self.learnt(curriculum), self.learnt(curriculum)
+
+        assert _without_times(log) == _without_times(again)
+        assert _bytes(one.state_dict()) == _bytes(other.state_dict())
+
+    def test_a_run_resumes_from_a_saved_state_with_the_same_bits(self) -> None:
+        """The state after the second batch, which PyTorch saves and loads without code."""
+        curriculum, states = self.curriculum(), []
+        whole, log = self.learnt(curriculum, checkpoint=lambda state, ends: states.append(_bytes(state())))
+        saved = torch.load(io.BytesIO(states[1]), weights_only=True)
+        resumed, again = self.learnt(curriculum, saved=saved)
+        rest = _without_times(log)[-len(again.measurements) :]
+
+        assert _without_times(again) == rest
+        assert _bytes(whole.state_dict()) == _bytes(resumed.state_dict())
+
+
+class MethodContract(AgentContract):
+    """Tests of a lifelong-learning method on an agent. Override `make_agent` and `make_method`."""
+
+    def make_method(self) -> Method:
+        """Return a new method; override it."""
+        raise NotImplementedError
+
+    def curriculum(self) -> Curriculum:
+        """Return what the method makes of the two small tasks."""
+        return self.make_method().prepare(super().curriculum())
+
+    def build(self, curriculum: Curriculum, seed: int = 0) -> Agent:
+        """Return a new agent with the method."""
+        return new_agent(curriculum, with_method(self.make_agent, self.make_method, curriculum), seed)
+
+
+def _bytes(state: Any) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def _without_times(log: RunLog) -> list[dict[str, Any]]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in log.measurements]
