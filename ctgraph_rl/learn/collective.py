@@ -300,8 +300,14 @@ class _Collective:
                 self._log_help(given)
         for kind in sorted({of for of, _ in self.mail.counts}):
             counts = {what: self.mail.counts[kind, what] for what in (SENT, DELIVERED, DROPPED, DELAYED, REFUSED)}
-            where = {"round": self.rounds, "frames": self.frames, "message": kind}
-            self.log.append("exchange", **where, **counts, bytes=self.mail.bytes[kind])
+            self.log.append(
+                "exchange",
+                round=self.rounds,
+                frames=self.frames,
+                message=kind,
+                **counts,
+                bytes=self.mail.bytes[kind],
+            )
 
     def _post(self, message: Message) -> None:
         others = set(range(len(self.members))) - {message.sender}

@@ -274,9 +274,16 @@ class Evaluator:
             curriculum=curriculum,
         )
         for (number, label), episodes in zip(tasks.values(), result, strict=True):
-            where = {"block": curriculum.block_at(frames), "frames": frames, "task": number, "label": label}
-            held_out = number > len(curriculum.tasks)
-            self.log.append("evaluation", moment=moment, **where, held_out=held_out, **episode_means(episodes))
+            self.log.append(
+                "evaluation",
+                moment=moment,
+                block=curriculum.block_at(frames),
+                frames=frames,
+                task=number,
+                label=label,
+                held_out=number > len(curriculum.tasks),
+                **episode_means(episodes),
+            )
 
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""

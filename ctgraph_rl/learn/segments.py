@@ -130,8 +130,8 @@ def log_training(
         after = part["next"]
         episodes = episode_means(after.select(*EPISODE_KEYS, strict=False)[after["done"].squeeze(-1)])
         events = {} if frames == end else dict.fromkeys(measurements.keys() & AT_THE_END, 0)
-        given = {**episodes, **measurements, **events}
-        log.append("training", block=curriculum.block_at(frames), frames=frames, **given)
+        measured = episodes | dict(measurements) | events
+        log.append("training", block=curriculum.block_at(frames), frames=frames, **measured)
     return episodes["return_mean"]
 
 

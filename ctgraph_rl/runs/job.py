@@ -102,8 +102,15 @@ class Job:
             if cfg.experts and experts is None:
                 with torch.random.fork_rng():
                     experts = self._experts()
-            of_run: dict[str, Any] = {"together": together, "experts": experts, "listeners": listeners}
-            yield RunDirectory(run_dir, config.plain(cfg), saved, **of_run, console=self._console)
+            yield RunDirectory(
+                run_dir,
+                config.plain(cfg),
+                saved,
+                together=together,
+                experts=experts,
+                listeners=listeners,
+                console=self._console,
+            )
 
     @property
     def _console(self) -> Console | None:

@@ -195,9 +195,9 @@ def train_experts(jobs: Sequence[Job], only: int | None = None) -> tuple[dict[in
         ]
         return _as_one(first, alone, members)
 
-    folder, deciding = Path(first.cfg.experts_dir), {seed: job.decides_experts for seed, job in by_seed.items()}
-    how: dict[str, Any] = {"waiting": first.interrupt.check, "only": only}
-    return find_or_train(first.curriculum, learn, folder, deciding, print, **how)
+    folder = Path(first.cfg.experts_dir)
+    deciding = {seed: job.decides_experts for seed, job in by_seed.items()}
+    return find_or_train(first.curriculum, learn, folder, deciding, print, waiting=first.interrupt.check, only=only)
 
 
 def learn_experts(configs: Sequence[Any], task: int) -> None:
