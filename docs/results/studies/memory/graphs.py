@@ -177,7 +177,7 @@ def lost() -> str:
 
 
 def cut_off(steps: int) -> str:
-    """Return the share of frames whose episode goes on after their batch, for each p of the graphs, as ``25 %``.
+    """Return the share of frames whose episode continues after their batch, for each p of the graphs, as ``25 %``.
 
     Rows begin together, play the optimal policy, which waits a geometric time before each decision and before the
     end, and are seen after many batches; at p = 0 all stay in step.
