@@ -42,6 +42,9 @@ LONGEST_CELL = 2**16
 BYTES_PER_CELL, LEAST_TABLE = 64, 2**20
 """Largest Parquet file, for each cell that it should have, and for a file of any size."""
 
+LEAST_UNPACKED, TIMES = 2**24, 50
+"""What a file of gzip of any size may hold, and more for each of its bytes: logs have some ten."""
+
 CODECS = ("SNAPPY", "UNCOMPRESSED")
 """Compressions of Parquet files: none makes more than some twenty times its size."""
 
@@ -211,8 +214,10 @@ def unpacked(content: bytes, most: int) -> bytes:
     """Return what a file of gzip holds.
 
     Raises:
-        ValueError: for what is none, more than ``most`` bytes, a torn file, and what follows its end.
+        ValueError: for what is none, more than ``most`` bytes, more than `TIMES` its size beyond `LEAST_UNPACKED`, a
+            torn file, and what follows its end.
     """
+    most = min(most, LEAST_UNPACKED + TIMES * len(content))
     unpack = zlib.decompressobj(31)  # the format of gzip
     try:
         found = unpack.decompress(content, most + 1)

@@ -16,6 +16,7 @@ from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, one_line
 from ctgraph_rl.board.submission import (
     CONFIG,
     EVALUATIONS,
+    LOGS,
     METHOD,
     METRIC_COLUMNS,
     METRICS,
@@ -37,7 +38,7 @@ from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
 from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences
-from ctgraph_rl.strict import parquet_rows
+from ctgraph_rl.strict import named, parquet_rows
 
 RESCORED = "rescored"
 
@@ -249,8 +250,9 @@ def _number(cell: str) -> object:
 
 def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Check]:
     """Return the checks of ``evaluations.parquet``: one for each row that differs, or one for all."""
-    table = evaluations_parquet(logs)
-    expected = parquet_rows(table, table)
+    with named(submission.path / LOGS):
+        table = evaluations_parquet(logs)
+        expected = parquet_rows(table, table)
     try:
         found = parquet_rows(read_regular(submission.path / EVALUATIONS, MOST_BYTES), table)
     except ValueError as error:

@@ -65,10 +65,10 @@ def odd_name(folder: Path) -> None:
     Path(os.fsdecode(os.fsencode(folder) + b"/\xff")).write_text("")
 
 
-def logged(folder: Path, **fields: object) -> None:
+def logged(folder: Path, kind: str = "experts", **fields: object) -> None:
     """Add a line to a log."""
     path = next((folder / "logs").iterdir())
-    line = json.dumps({"kind": "experts", **fields}).encode() + b"\n"
+    line = json.dumps({"kind": kind, **fields}).encode() + b"\n"
     path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + line))
 
 
@@ -103,6 +103,12 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "experts: 5": (lambda folder: logged(folder, experts=5), "experts must be a list of objects with a task"),
     "together: 5": (lambda folder: logged(folder, together=5), "together must be a list of seeds"),
     "versions: 5": (lambda folder: logged(folder, versions=5), "versions must be an object of texts"),
+    "long label": (
+        lambda folder: logged(
+            folder, "evaluation", block=0, frames=0, task=1, return_mean=0.0, moment="before", label="x" * 2**17
+        ),
+        "logs a text in label has 131,072 bytes, the limit is 65,536",
+    ),
     "versions twice": (
         lambda folder: (folder / "versions.txt").write_text((folder / "versions.txt").read_text() + "torch==1\n"),
         "versions.txt has a name twice",

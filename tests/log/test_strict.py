@@ -111,6 +111,15 @@ def test_what_has_two_meanings_or_takes_too_much_is_refused(name, content, messa
     assert "\n" not in str(refused.value)
 
 
+def test_a_file_of_gzip_holds_no_more_than_its_size_lets_expect(monkeypatch):
+    content = gzip.compress(bytes(10**5), mtime=0)
+    assert strict.unpacked(content, 10**6) == bytes(10**5)
+    monkeypatch.setattr(strict, "LEAST_UNPACKED", 1000)
+
+    with pytest.raises(ValueError, match=f"holds more than {1000 + 50 * len(content):,} bytes, the limit"):
+        strict.unpacked(content, 10**6)
+
+
 def test_a_last_line_without_an_end_is_what_a_killed_run_leaves():
     log = RunLog.of_content(LINE + b'{"kind": "trai', "run.jsonl")
 

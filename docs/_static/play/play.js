@@ -1,0 +1,240 @@
+// The page "Play and explore": form, tree, image, numbers, simulation and logs. graph.js has what it shows.
+"use strict";
+
+const at = (id) => document.getElementById(`ct-${id}`);
+const ROWS = 256, STEPS = 64; // of the simulation, at a time
+const MOST_DRAWN = 64; // nodes side by side in the picture of the tree
+const SVG = "http://www.w3.org/2000/svg";
+
+let task = null; // what is played
+let rows = null; // one row of the kernel
+let run = null; // the simulation: rows of the kernel and what was counted
+
+const percent = (share) => (share >= 1e-4 ? `${(100 * share).toPrecision(4)} %` : share.toExponential(3));
+const grouped = (number) => number.toLocaleString("en");
+
+function placed(kind, node) {
+  return kind === "home" || kind === "fail" ? `the ${kind} state` : `the ${kind} state of node ${node}`;
+}
+
+function element(name, attributes, parent) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  return parent.appendChild(made);
+}
+
+function say(id, text) {
+  at(id).textContent = text;
+}
+
+// The parameters in the form.
+function given() {
+  const number = (id) => (at(id).value.trim() === "" ? NaN : Number(at(id).value));
+  return { b: number("b"), d: number("d"), p: number("p"), shown: at("shown").value, goal: at("goal").value.trim() };
+}
+
+function fill(values) {
+  for (const [name, value] of Object.entries(values)) at(name).value = value;
+}
+
+// Take the parameters of the form, or say why not.
+function choose() {
+  const wanted = given(), why = refusal(wanted);
+  say("refusal", why || "");
+  if (why) return;
+  task = wanted;
+  const same = Object.entries(PRESETS).find(([, each]) => JSON.stringify(each) === JSON.stringify(task));
+  at("preset").value = same ? same[0] : "";
+  history.replaceState(null, "", `#${new URLSearchParams(task)}`);
+  rows = new Rows(task, 1, 1, Math.floor(Math.random() * 2 ** 31));
+  stop();
+  run = null;
+  at("actions").replaceChildren(...Array.from({ length: task.b + 1 }, (_, action) => button(action)));
+  showNumbers();
+  showRun();
+  begin();
+}
+
+function button(action) {
+  const made = document.createElement("button");
+  made.type = "button";
+  made.textContent = action ? `${action}: branch ${action}` : "0: wait";
+  made.addEventListener("click", () => act(action));
+  return made;
+}
+
+function begin() {
+  rows.reset();
+  rows.outcome[0] = 0;
+  say("outcome", "A new episode begins at the home state: any action leaves it.");
+  show();
+}
+
+function act(action) {
+  if (!rows || action > task.b || rows.outcome[0]) return;
+  rows.action[0] = BigInt(action);
+  rows.step();
+  const reward = rows.rewards[0], outcome = OUTCOMES[rows.outcome[0]], steps = rows.steps[0];
+  say("outcome", outcome === "running"
+    ? `Action ${action}, step ${steps}, reward ${reward}.`
+    : `The episode ends after ${steps} steps: ${outcome}, reward ${reward}. Press n for a new one.`);
+  show();
+}
+
+// The image, the buttons, and what is hidden from a policy.
+function show() {
+  const context = at("image").getContext("2d"), image = context.createImageData(12, 12);
+  for (let pixel = 0; pixel < PIXELS; pixel++)
+    image.data.set([...Array(3).fill(rows.observation[pixel]), 255], 4 * pixel);
+  context.putImageData(image, 0, 0);
+  for (const each of at("actions").children) each.disabled = rows.outcome[0] !== 0;
+  const kind = KINDS[rows.kind[0]], node = Number(rows.node[0]);
+  say("hidden", at("reveal").checked ? `You are at ${placed(kind, node)}. The goal is ${task.goal}.` : "");
+  drawTree();
+}
+
+function drawTree() {
+  const { b, d } = task, reveal = at("reveal").checked;
+  let levels = d;
+  while (b ** levels > MOST_DRAWN) levels--;
+  const svg = at("tree"), here = Number(rows.node[0]), kind = KINDS[rows.kind[0]];
+  svg.replaceChildren();
+  svg.setAttribute("viewBox", `0 0 400 ${60 + 50 * levels}`);
+  const place = (level, number) => [400 * (number + 0.5) / b ** level, 40 + 50 * level];
+  const onGoal = (level, number) => number === Math.floor(leafOf(task) / b ** (d - level));
+  for (let level = 0; level <= levels; level++)
+    for (let number = 0; number < b ** level; number++) {
+      const [x, y] = place(level, number), node = firstNode(b, level) + number;
+      if (level) {
+        const [x2, y2] = place(level - 1, Math.floor(number / b));
+        const line = element("line", { x1: x, y1: y, x2, y2 }, svg);
+        if (reveal && onGoal(level, number)) line.classList.add("goal");
+      }
+      const mark = element("circle", { cx: x, cy: y, r: level === d ? 5 : 7 }, svg);
+      if (level === d && run && run.ends) mark.style.fillOpacity = Math.min(1, run.visits[number] * b ** d / run.ends / 2);
+      if (level === d && reveal && onGoal(level, number)) mark.classList.add("goal");
+      if (node === here && kind !== "home" && kind !== "fail") mark.classList.add("here");
+    }
+  for (const [name, x] of [["home", 150], ["fail", 250]]) {
+    const mark = element("text", { x, y: 16, "text-anchor": "middle" }, svg);
+    mark.textContent = name;
+    if (kind === name) mark.classList.add("here");
+  }
+  svg.setAttribute("aria-label", `The tree of ${grouped(b ** d)} end states. You are at ${placed(kind, here)}.`);
+  say("depth", levels < d ? `The picture ends at level ${levels} of ${d}.` : "");
+}
+
+function showNumbers() {
+  const forms = closedForms(task), { drawn, fixed } = ceilings(task);
+  const values = {
+    states: grouped(forms.states), rewardProb: percent(forms.rewardProb), endProb: percent(forms.endProb),
+    navigationProb: percent(forms.navigationProb), length: String(Number(forms.length.toPrecision(6))),
+    search: grouped(forms.search), drawn: percent(drawn), fixed: percent(fixed),
+  };
+  for (const [name, value] of Object.entries(values)) say(name, value);
+}
+
+// Random episodes by the kernel: those of one picture of the screen.
+function simulate() {
+  if (!run || !run.on) return;
+  const { b } = task, actions = new Int32Array(run.rows.action.buffer, run.rows.action.byteOffset, 2 * ROWS * STEPS);
+  for (let place = 0; place < actions.length; place += 2) actions[place] = Math.floor(Math.random() * (b + 1));
+  run.rows.step(STEPS, true);
+  for (let place = 0; place < ROWS * STEPS; place++) {
+    const outcome = run.rows.outcome[place];
+    if (!outcome) continue;
+    run.episodes++;
+    if (outcome === 3) run.goals++;
+    if (outcome > 1) {
+      run.ends++;
+      run.visits[Number(run.rows.leaf[place])]++;
+    }
+  }
+  showRun();
+  drawTree();
+  requestAnimationFrame(simulate);
+}
+
+function showRun() {
+  if (!run || !run.episodes) {
+    say("measured", "");
+    return;
+  }
+  const [low, high] = interval(run.goals, run.episodes), { rewardProb } = closedForms(task);
+  say("measured", `${grouped(run.goals)} of ${grouped(run.episodes)} random episodes reach the goal: `
+    + `${percent(run.goals / run.episodes)}, at 95 % between ${percent(low)} and ${percent(high)}. `
+    + `The closed form is ${percent(rewardProb)}.`);
+}
+
+function stop() {
+  if (run) run.on = false;
+  say("simulate", "Simulate random episodes");
+}
+
+function toggle() {
+  if (run && run.on) return stop();
+  if (!run) {
+    run = { rows: new Rows(task, ROWS, STEPS, Math.floor(Math.random() * 2 ** 31)), episodes: 0, goals: 0, ends: 0 };
+    run.visits = new Float64Array(task.b ** task.d);
+    run.rows.reset();
+  }
+  run.on = true;
+  say("simulate", "Stop the simulation");
+  requestAnimationFrame(simulate);
+}
+
+// The performance matrix of a log: a row for each block, brighter cells for higher returns.
+async function showLog(file) {
+  const table = at("matrix");
+  table.replaceChildren();
+  try {
+    const { name, tasks, labels, rows: blocks } = performance(await file.text());
+    say("log", `${file.name}: ${name}. Mean return on each task after each block; nothing left this browser.`);
+    const line = (cells, kind) => {
+      const row = table.insertRow();
+      cells.forEach((cell) => (row.appendChild(document.createElement(kind)).textContent = cell));
+      return row;
+    };
+    line(["block", "frames", ...labels], "th");
+    for (const { block, frames, returns } of blocks) {
+      const row = line([block, grouped(frames), ...tasks.map((task) => returns[task] ?? "not measured")], "td");
+      tasks.forEach((task, place) => row.cells[2 + place].style.setProperty("--share", Math.max(0, Math.min(1, returns[task] || 0))));
+    }
+  } catch (error) {
+    say("log", `${file.name}: ${error.message}`);
+  }
+}
+
+function start() {
+  for (const name of ["b", "d", "p", "shown", "goal"]) at(name).addEventListener("change", choose);
+  at("preset").addEventListener("change", () => {
+    if (!at("preset").value) return;
+    fill(PRESETS[at("preset").value]);
+    choose();
+  });
+  at("new").addEventListener("click", begin);
+  at("reveal").addEventListener("change", show);
+  at("simulate").addEventListener("click", toggle);
+  at("file").addEventListener("change", () => at("file").files.length && showLog(at("file").files[0]));
+  at("drop").addEventListener("dragover", (event) => event.preventDefault());
+  at("drop").addEventListener("drop", (event) => {
+    event.preventDefault();
+    if (event.dataTransfer.files.length) showLog(event.dataTransfer.files[0]);
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input, select, textarea")) return;
+    if (/^[0-9]$/.test(event.key)) act(Number(event.key));
+    if (event.key === "n") begin();
+  });
+  const linked = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  fill(PRESETS["CT-SU-B1"]);
+  for (const name of ["b", "d", "p", "shown", "goal"]) if (name in linked) at(name).value = linked[name];
+  choose();
+  if (!task) { // the link is refused: its message stays
+    task = PRESETS["CT-SU-B1"];
+    rows = new Rows(task);
+    begin();
+  }
+}
+
+start();
