@@ -16,10 +16,10 @@ from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking, solv
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
 
 LENGTHS = {
-    ("a2c", "short"): "a2c, 8 steps",
-    ("a2c", "long"): "a2c, 32 steps",
-    ("reinforce", "short"): "reinforce, 8 steps",
-    ("reinforce", "long"): "reinforce, 128 steps",
+    "a2c_short": "a2c, 8 steps",
+    "a2c_long": "a2c, 32 steps",
+    "reinforce_short": "reinforce, 8 steps",
+    "reinforce_long": "reinforce, 128 steps",
 }
 """Agents that differ in the steps of their batches."""
 
@@ -82,8 +82,9 @@ def texts() -> dict[str, str]:
         found |= {f"dqn_{place}": count(one_step), f"dqn_{place}_once": str(sum(solved_once(one_step)))}
         found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
     found |= {f"cut_{steps}": graphs.cut_off(steps) for steps in (8, 32, 128)}
-    found |= {f"{agent}_{length}": count(of[UNIQUE].get(name)) for (agent, length), name in LENGTHS.items()}
-    found["reinforce_long_100"] = count(of[UNIQUE._replace(num_wait_images="100")].get("reinforce, 128 steps"))
+    for images, end in (("500", ""), ("100", "_100")):
+        on_unique = of[UNIQUE._replace(num_wait_images=images)]
+        found |= {f"{place}{end}": count(on_unique.get(name)) for place, name in LENGTHS.items()}
     found["lower"], found["alike"] = graphs.distinguishable()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     return found | ladder.texts() | {"intervals": graphs.intervals()}
