@@ -38,8 +38,12 @@ class Exchange(TakesNumbers):
         self.drop_prob, self.delay_prob = drop_prob, delay_prob
         self.kinds: Mapping[str, Fields] = {}
 
+    def settings_of(self, member: int) -> Mapping[str, Any]:
+        """Return none; see `ctgraph_rl.learn.collective.Exchange`, as for all methods."""
+        return {}
+
     def connect(self, agents: Sequence[Agent]) -> None:
-        """See `ctgraph_rl.learn.collective.Exchange`, as for all methods."""
+        """Do nothing."""
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
         """Do nothing."""

@@ -60,7 +60,10 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
     labels = "labels that learners give themselves do not name the same tasks for all: leave out detector or exchange"
     require((cfg.together is False, batch), ("detector" not in cfg, labels))
     exchange = config.target(cfg, "exchange")()
-    runs = [(config.of_member(cfg, number), member_folder(run_dir, number)) for number in range(exchange.num_members)]
+    runs = []
+    for number in range(exchange.num_members):
+        own = config.of_member(cfg, number, exchange.settings_of(number))
+        runs.append((own, member_folder(run_dir, number)))
     with locked(run_dir):
         for each, _ in runs:
             config.check_values(each)

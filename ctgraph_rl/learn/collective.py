@@ -48,6 +48,10 @@ class Exchange(Protocol):
     kinds: Mapping[str, Fields]
     """The kinds of messages in the order in which they are sent within an exchange, each with its fields."""
 
+    def settings_of(self, member: int) -> Mapping[str, Any]:
+        """Return settings that only this member has, such as ``{"agent.learning_rate": 0.01}``; none: those of all."""
+        ...
+
     def connect(self, agents: Sequence[Agent]) -> None:
         """Take the agents of all members, before anything is learned.
 

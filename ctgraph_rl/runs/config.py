@@ -123,13 +123,27 @@ def of_seed(cfg: DictConfig, seed: int, run_dir: Path) -> tuple[DictConfig, Path
     return own, folder / name_of(own, choices)
 
 
-def of_member(cfg: DictConfig, number: int) -> DictConfig:
-    """Return the configuration of a member of a collective, from 0: its seed, and its curriculum if they differ."""
+def of_member(cfg: DictConfig, number: int, settings: Mapping[str, Any]) -> DictConfig:
+    """Return the configuration of a member of a collective: its seed, and its curriculum if they differ.
+
+    Args:
+        cfg: the configuration of the collective.
+        number: the member, from 0.
+        settings: those that only this member has, such as ``{"agent.learning_rate": 0.01}``.
+
+    Raises:
+        ValueError: for a setting that there is not.
+    """
     own = deepcopy(cfg)
     own.seed = cfg.seed + SEEDS_APART * number if is_int(cfg.seed) else cfg.seed
     OmegaConf.update(own, "exchange.member", number, force_add=True)
     if "agent" in cfg.curriculum:
         own.curriculum.agent = (cfg.curriculum.agent or 0) + number
+    missing = object()
+    for key, value in settings.items():
+        known = OmegaConf.select(own, key, default=missing) is not missing
+        require((known, f"the exchange gives member {number} {key}={value}, and there is no setting {key}"))
+        OmegaConf.update(own, key, value)
     return own
 
 

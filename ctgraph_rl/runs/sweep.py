@@ -231,7 +231,7 @@ class Sweeper(Base):
 
         try:
             shared = "exchange" in cfg  # then the first member stands for all
-            one, run_dir = (of_member(cfg, 0), member_folder(folder, 0)) if shared else (cfg, folder)
+            one, run_dir = (of_member(cfg, 0, {}), member_folder(folder, 0)) if shared else (cfg, folder)
             self._begun[folder] = tuple((first_line(run_dir) or {}).get("together", ()))
             changed, unknown = changed_code(one, run_dir, self._known)
         except Exception as error:  # of the code of a user, which may have changed so that it cannot be run

@@ -83,7 +83,7 @@ def build(cfg: DictConfig) -> None:
         Job.of(cfg, Interrupt())
         return
     exchange = config.target(cfg, "exchange")()
-    members = [config.of_member(cfg, number) for number in range(exchange.num_members)]
+    members = [config.of_member(cfg, number, exchange.settings_of(number)) for number in range(exchange.num_members)]
     for each in members[:1]:
         config.check_values(each)
         Job.of(each, Interrupt())

@@ -108,6 +108,96 @@ def test_a_stopped_collective_is_resumed_bit_by_bit_and_a_finished_one_is_left(m
     assert same(found / "member_001", whole / "member_001")
 
 
+POPULATION = """
+import torch
+from baselines.exchanges.exchange import Exchange
+from ctgraph_rl.learn.collective import Help
+from ctgraph_rl.learn.messages import Array, Number, to_all
+
+
+class Population(Exchange):
+    def __init__(self, num_members, every, drop_prob, delay_prob, key, values):
+        super().__init__(num_members, every, drop_prob, delay_prob)
+        self.key, self.values, self.returns = key, values, {}
+
+    def settings_of(self, member):
+        return {self.key: self.values[member]}
+
+    def connect(self, agents):
+        self.policies = [agent.policy for agent in agents]
+        size = torch.nn.utils.parameters_to_vector(self.policies[0].parameters()).numel()
+        self.kinds = {"weights": {"reward": Number(), "weights": Array((size,))}}
+
+    def observe(self, member, batch, episode_return):
+        self.returns[member] = episode_return
+
+    def send(self, kind, member, received):
+        weights = torch.nn.utils.parameters_to_vector(self.policies[member].parameters()).detach()
+        return to_all(kind, member, self.num_members, {"reward": self.returns[member], "weights": weights})
+
+    def receive(self, member, received):
+        better = [each for each in received if each.content["reward"] >= self.returns[member]]
+        for each in better[:1]:
+            torch.nn.utils.vector_to_parameters(each.content["weights"], self.policies[member].parameters())
+        return [Help(each.sender, member, {"reward": each.content["reward"]}) for each in better[:1]]
+
+    def state_dict(self):
+        return {"returns": dict(self.returns)}
+
+    def load_state_dict(self, state):
+        self.returns = dict(state["returns"])
+"""
+"""A population of a user: members with learning rates of their own copy the weights of one that does as well."""
+
+GROWN = (
+    *("curriculum=su_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", *TINY[4:-2]),
+    *("+exchange._target_=population.Population", "+exchange.num_members=2", "+exchange.every=1"),
+    *("+exchange.drop_prob=0.0", "+exchange.delay_prob=0.0"),
+    *("+exchange.key=agent.learning_rate", "+exchange.values=[0.001,0.1]"),
+)
+
+
+@pytest.fixture
+def population(monkeypatch):
+    Path("population.py").write_text(POPULATION)
+    yield
+    sys.modules.pop("population", None)
+
+
+def test_a_population_has_settings_of_its_own_for_each_member_and_resumes(monkeypatch, capsys, population):
+    assert command_line(monkeypatch, *GROWN, "hydra.run.dir=whole") == 0
+    whole = the_collective("whole")
+    calls = []
+    save = Checkpoints.save
+
+    def killed(*given):
+        save(*given)
+        calls.append(given)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "save", killed)
+        assert command_line(patch, *GROWN, "checkpoint_seconds=1e-9", "hydra.run.dir=stopped") == 130
+    assert command_line(monkeypatch, *GROWN, "hydra.run.dir=stopped") == 0
+    stopped = the_collective("stopped")
+
+    rates = [content(whole / f"member_{number:03d}")[0][0]["config"]["agent"]["learning_rate"] for number in range(2)]
+    assert rates == [0.001, 0.1]
+    assert len(RunLog.read(whole / "collective.jsonl").of_kind("help")) > 0
+    for number in range(2):
+        assert same(whole / f"member_{number:03d}", stopped / f"member_{number:03d}")
+    assert (whole / "members.csv").read_bytes() == (stopped / "members.csv").read_bytes()
+
+
+def test_a_setting_of_a_member_that_there_is_not_is_refused(monkeypatch, capsys, population):
+    assert command_line(monkeypatch, *GROWN[:-2], "+exchange.key=agent.speed", GROWN[-1]) == 1
+
+    assert (
+        "the exchange gives member 0 agent.speed=0.001, and there is no setting agent.speed" in capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
