@@ -41,9 +41,11 @@ def delays(lines: Lines) -> list[str]:
 def test_each_row_has_the_means_over_its_seeds():
     for (curriculum, detector), lines in RUNS.items():
         cells = SECTION.split(f"| `{curriculum}` | {NAMES[detector]} | ")[1].split(" | ")
-        means = [sum(float(line[key]) for line in lines) / 3 for key in ("average_performance", "online_return")]
+        values = {key: [float(line[key]) for line in lines] for key in ("average_performance", "online_return")}
+        means = [sum(each) / len(each) for each in values.values()]
+        seeds = ["0", "1", "2"] if curriculum == "task_free_abrupt" else ["0"]
 
-        assert {line["seed"] for line in lines} == {"0", "1", "2"} and cells[0] == "3"
+        assert sorted(line["seed"] for line in lines) == seeds and cells[0] == f"{len(seeds)}"
         assert [cell.split(" [")[0] for cell in cells[1:3]] == [f"{mean:.2f}" for mean in means]
         assert {int(line["frames"]) for line in lines} == {curricula.load(curriculum).num_frames}
 
