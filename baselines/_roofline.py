@@ -56,7 +56,8 @@ class Products(TorchDispatchMode):
 def _seconds_of(shape: Shape) -> float:
     """Return the processor time of one product of a shape."""
     rows, inner, columns = shape
-    left, right = torch.randn(rows, inner), torch.randn(inner, columns)
+    left = torch.randn(rows, inner, dtype=torch.float32, device="cpu")
+    right = torch.randn(inner, columns, dtype=torch.float32, device="cpu")
     torch.mm(left, right)
     start = time.process_time()
     for _ in range(ROUNDS):

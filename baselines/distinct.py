@@ -45,14 +45,14 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 def renumbered(groups: Tensor) -> tuple[Tensor, Tensor]:
     """Return what `distinct` does of some of its frames, from the groups that it gave them, int64 [num_frames]."""
     different, numbers = groups.unique(return_inverse=True)
-    examples = torch.empty_like(different).scatter_(0, numbers, torch.arange(len(groups)))
+    examples = torch.empty_like(different).scatter_(0, numbers, torch.arange(len(groups), device="cpu"))
     return examples, numbers
 
 
 @cache
 def random_weights(count: int) -> Tensor:
     """Return random numbers, float32 [count], always the same."""
-    return torch.randn(count, generator=torch.Generator().manual_seed(0))
+    return torch.randn(count, generator=torch.Generator(device="cpu").manual_seed(0), dtype=torch.float32, device="cpu")
 
 
 class Histories(NamedTuple):
@@ -78,7 +78,7 @@ def histories(groups: Tensor, starts: Tensor, state: State) -> Histories:
     """
     found, flat, num_groups = segments(starts), groups.flatten(), int(groups.max()) + 1
     states = [torch.cat([torch.zeros_like(value[:1]), value]) for value in state]
-    none = torch.zeros(len(starts) + 1, dtype=torch.int64)
+    none = torch.zeros(len(starts) + 1, dtype=torch.int64, device="cpu")
     examples, equal = distinct(states) if states else (none[:1], none)
     last = torch.where(found.at_first, equal[found.rows + 1], equal[0])
     of_frames, branches, count = torch.empty_like(flat), [], 0

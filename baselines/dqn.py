@@ -14,9 +14,10 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.data import Composite, TensorSpec
-from torchrl.modules import MLP, QValueActor
+from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
+from baselines.cells.cell import linear_layer
 from baselines.networks import Data, encoder, num_actions_of, require_weights
 from baselines.prioritized import LARGEST_ALPHA
 from baselines.q_learning import QLearner, require_replay
@@ -67,7 +68,12 @@ class DQN(QLearner):
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
         self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
         super().__init__(gamma=gamma, **settings)
-        head = MLP(hidden_size, num_actions_of(action_spec), num_cells=[hidden_size], activation_class=nn.ReLU)
+        layers = [
+            linear_layer(hidden_size, hidden_size),
+            nn.ReLU(),
+            linear_layer(hidden_size, num_actions_of(action_spec)),
+        ]
+        head = nn.Sequential(*layers)
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
         features = encoder(observation_spec, hidden_size)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)

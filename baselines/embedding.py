@@ -42,12 +42,14 @@ def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions
 
 def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
     """Return points drawn uniformly from [0, 1)^n, float32 [M, n]; the same for equal arguments."""
-    return torch.rand(number, width, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    return torch.rand(number, width, generator=generator, dtype=torch.float32, device="cpu")
 
 
 def unit_directions(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:
     """Return directions drawn uniformly from the unit sphere, float32 [L, n]; the same for equal arguments."""
-    return normalize(torch.randn(number, width, generator=torch.Generator().manual_seed(seed)), dim=1)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    return normalize(torch.randn(number, width, generator=generator, dtype=torch.float32, device="cpu"), dim=1)
 
 
 def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
@@ -67,7 +69,7 @@ def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
     distinct, counts = points.cpu().double().unique(dim=0, return_counts=True)
     targets, number = reference.cpu().double(), len(reference)
     cost = (targets.square().sum(1, keepdim=True) - 2 * targets @ distinct.T + distinct.square().sum(1)).numpy()
-    plan = optimal_plan(cost, torch.full([number], len(points)).numpy(), (number * counts).numpy())
+    plan = optimal_plan(cost, np.full(number, len(points)), (number * counts).numpy())
     means = torch.from_numpy(plan).double() @ distinct / len(points)
     return ((means - targets) / math.sqrt(number)).flatten().to(points)
 

@@ -155,7 +155,7 @@ class Seeds:
         items = self._items(batch)
         size = items["action"].shape[1] // self.first.num_minibatches
         for _ in range(self.first.num_epochs):
-            order = torch.rand(items["action"].shape[:2], device=batch.device).argsort(dim=1)
+            order = torch.rand(items["action"].shape[:2], device=batch.device, dtype=torch.float32).argsort(dim=1)
             for part in order.split(size, dim=1):
                 self.update({key: _taken(value, part) for key, value in items.items()})
         return batch.numel()

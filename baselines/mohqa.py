@@ -35,6 +35,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
+from baselines.cells.cell import linear_layer
 from baselines.networks import Data, EncoderModule, encoder, guided, num_actions_of, require_weights
 from baselines.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
@@ -57,7 +58,7 @@ class Projected(nn.Module):
 
     def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
         super().__init__()
-        self.encoder, self.linear = encoder, nn.Linear(num_inputs, num_features)
+        self.encoder, self.linear = encoder, linear_layer(num_inputs, num_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the encoder's inputs to float32 [..., num_features]."""
@@ -92,7 +93,7 @@ class HebbianHead(nn.Module):
         super().__init__()
         self.decay, self.share = math.exp(-1 / eligibility_steps), hebbian_share
         self.change, self.fall, self.reward_baseline = hebbian_change, hebbian_decay, reward_baseline
-        self.register_buffer("weights", torch.zeros(num_actions, num_features))
+        self.register_buffer("weights", torch.zeros(num_actions, num_features, dtype=torch.float32, device="cpu"))
 
     def forward(self, y: Tensor) -> Tensor:
         """Compute u, [..., num_actions], from y, [..., num_features]."""
@@ -100,10 +101,12 @@ class HebbianHead(nn.Module):
 
     def eligibility(self, before: Tensor, y: Tensor, action: Tensor) -> Tensor:
         """Return the eligibility after an action, [n, num_actions, num_features]; y is [n, num_features]."""
-        number = (self.share * y.count_nonzero(dim=-1)).ceil().unsqueeze(-1)
+        number = (self.share * y.count_nonzero(dim=-1).to(y.dtype)).ceil().unsqueeze(-1)
         place = y.argsort(dim=-1).argsort(dim=-1)
         largest, smallest = place >= y.shape[-1] - number, place < number
-        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * ~(largest | smallest)
+        row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * (~(largest | smallest)).to(
+            y.dtype
+        )
         return self.decay * before + one_hot(action, len(self.weights)).unsqueeze(-1) * row.unsqueeze(-2)
 
     def modulate(self, eligibility: Tensor, reward: Tensor) -> None:
@@ -264,13 +267,13 @@ class MOHQA(QLearner):
         inner = encoder(observation_spec, hidden_size)
         projected = Projected(inner.module, hidden_size, num_features)
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
-        layers = nn.Sequential(nn.ReLU(), nn.Linear(num_features, num_actions), nn.Sigmoid())
+        layers = nn.Sequential(nn.ReLU(), linear_layer(num_features, num_actions), nn.Sigmoid())
         head = TensorDictModule(layers, in_keys=["features"], out_keys=["action_value"])
         how = {"eligibility_steps": eligibility_steps, "hebbian_share": hebbian_share, "hebbian_change": hebbian_change}
         how |= {"hebbian_decay": hebbian_decay, "reward_baseline": reward_baseline}
         self.hebbian = HebbianHead(num_features, num_actions, **how)
         self.register_buffer("target_weights", self.hebbian.weights.clone())
-        self.register_buffer("average", torch.zeros(num_features))
+        self.register_buffer("average", torch.zeros(num_features, dtype=torch.float32, device="cpu"))
         self.greedy = network = TensorDictSequential(trunk, head)
         self.target = Target(network)
         self.set_networks(network, self.target, action_spec, learning_rate)

@@ -16,7 +16,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, reset
+from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, linear_layer, reset
 from baselines.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
@@ -62,8 +62,10 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         self.event_dims, self.scale = len(shape), 1 / high
-        self.linear = nn.Linear(shape.numel() + num_extra, num_features)
-        layers = [layer for _ in range(num_layers - 1) for layer in (nn.Linear(num_features, num_features), nn.ReLU())]
+        self.linear = linear_layer(shape.numel() + num_extra, num_features)
+        layers = [
+            layer for _ in range(num_layers - 1) for layer in (linear_layer(num_features, num_features), nn.ReLU())
+        ]
         self.further = nn.Sequential(*layers)
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
@@ -172,8 +174,11 @@ class RecurrentModule(TensorDictModuleBase):
         """Return the state before the first step: the cell's zeros, and no last action or reward."""
         state = dict(zip(self.state_keys, self.cell.zeros(num_envs), strict=True))
         device = next(self.parameters()).device
-        zeros = {PREVIOUS_ACTION: torch.zeros(num_envs, dtype=torch.int64), REWARD: torch.zeros(num_envs, 1)}
-        return TensorDict(state | {key: zeros[key].to(device) for key in self.own_keys}, batch_size=[num_envs])
+        zeros = {
+            PREVIOUS_ACTION: torch.zeros(num_envs, dtype=torch.int64, device=device),
+            REWARD: torch.zeros(num_envs, 1, device=device, dtype=torch.float32),
+        }
+        return TensorDict(state | {key: zeros[key] for key in self.own_keys}, batch_size=[num_envs])
 
     def _own(self, data: Data) -> list[Tensor]:
         """Return the last action, one-hot, and the last reward, as far as the cell reads them; 0 at ``is_init``."""
@@ -272,7 +277,7 @@ def recurrent(
 
 def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> TensorDictModule:
     """Build a linear layer from ``in_key`` to ``out_key``."""
-    return TensorDictModule(nn.Linear(num_features, num_outputs), in_keys=[in_key], out_keys=[out_key])
+    return TensorDictModule(linear_layer(num_features, num_outputs), in_keys=[in_key], out_keys=[out_key])
 
 
 def make_orthogonal(module: nn.Module, gain: float = 1.0) -> None:
@@ -296,7 +301,7 @@ def actor(in_key: str, num_features: int, action_spec: TensorSpec) -> Probabilis
 
 def critic(in_key: str, num_features: int) -> ValueOperator:
     """Build a linear critic of features, which writes ``state_value``."""
-    return ValueOperator(nn.Linear(num_features, 1), in_keys=[in_key])
+    return ValueOperator(linear_layer(num_features, 1), in_keys=[in_key])
 
 
 class ActorCritic(TensorDictSequential):

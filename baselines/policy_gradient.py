@@ -33,6 +33,7 @@ from baselines.networks import (
 )
 from baselines.update.optimiser import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
+from ctgraph_rl.core.device import torchs_defaults
 
 MOST_LAYERS = 1000
 """Far beyond what trains."""
@@ -247,7 +248,8 @@ class PolicyGradient(Learner):
 def generalized_advantages(gamma: float, gae_lambda: float, *given: Tensor) -> tuple[Tensor, Tensor]:
     """Compute advantages and value targets; TorchRL's faster way makes the host wait for a GPU."""
     estimate = vec_generalized_advantage_estimate if given[0].is_cpu else generalized_advantage_estimate
-    return estimate(gamma, gae_lambda, *given)
+    with torchs_defaults():  # TorchRL multiplies flags by numbers, which gives torch's default dtype
+        return estimate(gamma, gae_lambda, *given)
 
 
 def critic_loss(values: Tensor, batch: Data, weight: float) -> Tensor:

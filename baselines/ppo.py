@@ -55,7 +55,9 @@ class PPO(PolicyGradient):
         require(self._split_rule(num_minibatches))
         self.num_epochs, self.num_minibatches = num_epochs, num_minibatches
         self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
-        self.clip_range = torch.tensor([-clip_epsilon, clip_epsilon]).log1p().tolist()
+        self.clip_range = (
+            torch.tensor([-clip_epsilon, clip_epsilon], dtype=torch.float32, device="cpu").log1p().tolist()
+        )
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
         """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""

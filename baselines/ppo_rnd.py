@@ -29,6 +29,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
+from baselines.cells.cell import linear_layer
 from baselines.learner import reset_layer
 from baselines.networks import Data, critic, encoder, highest
 from baselines.policy_gradient import generalized_advantages
@@ -53,9 +54,9 @@ class Moments(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("variance", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64, device="cpu"))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64, device="cpu"))
+        self.register_buffer("variance", torch.zeros(size, dtype=torch.float64, device="cpu"))
 
     def reset(self) -> None:
         """Forget all rows."""
@@ -93,12 +94,16 @@ class Novelty(nn.Module):
         super().__init__()
         self.num_inputs, self.scale, self.gamma = num_inputs, 1 / high, gamma
         self.target, self.predictor = (
-            nn.Sequential(nn.Linear(num_inputs, hidden_size), nn.ReLU(), nn.Linear(hidden_size, num_features))
+            nn.Sequential(
+                linear_layer(num_inputs, hidden_size),
+                nn.ReLU(),
+                linear_layer(hidden_size, num_features),
+            )
             for _ in range(2)
         )
         self.target.requires_grad_(False)
         self.of_observations, self.of_returns = Moments(num_inputs), Moments(1)
-        self.register_buffer("returns", torch.zeros(num_envs))
+        self.register_buffer("returns", torch.zeros(num_envs, dtype=torch.float32, device="cpu"))
 
     def reset(self) -> None:
         """Draw a new predictor, and reset the statistics."""

@@ -33,8 +33,8 @@ class PrioritySampler(Sampler):
 
     def __init__(self, num_items: int, alpha: float, beta: float) -> None:
         self.alpha, self.beta = alpha, beta
-        self.priorities = torch.zeros(num_items)
-        self.most = torch.ones(())
+        self.priorities = torch.zeros(num_items, dtype=torch.float32, device="cpu")
+        self.most = torch.ones((), dtype=torch.float32, device="cpu")
 
     def extend(self, index: Tensor) -> None:
         """Give new items the largest priority so far."""
@@ -65,7 +65,7 @@ class PrioritySampler(Sampler):
 
     def _empty(self) -> None:
         self.priorities.zero_()
-        self.most = torch.ones(())
+        self.most = torch.ones((), dtype=torch.float32, device="cpu")
 
     def dumps(self, path: Any) -> None:
         """Not used: `state_dict` holds all."""

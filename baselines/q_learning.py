@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from copy import deepcopy
+from typing import Any, Self
 
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, TensorSpec
 from torchrl.data.postprocs import MultiStep
 from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
@@ -20,6 +23,7 @@ from baselines.networks import Data, guided
 from baselines.prioritized import PrioritySampler
 from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
+from ctgraph_rl.core.device import torchs_defaults
 
 LONGEST_TARGET = 10**4
 """Most steps of a multi-step target: beyond any episode that replay can hold, and held as a table."""
@@ -41,6 +45,31 @@ def require_replay(observation_spec: Composite, buffer_size: int, batch_size: in
     require(*at_least_one(buffer_size=buffer_size, batch_size=batch_size))
     require_memory(f"replay of buffer_size={buffer_size} steps", buffer_size * observation, "steps")
     require_memory(f"minibatches of batch_size={batch_size}", batch_size * (observation + 4 * size), "items")
+
+
+class Exploration(EGreedyModule):
+    """TorchRL's epsilon-greedy exploration, float32 on the CPU whatever torch's defaults are; for whole numbers.
+
+    Args:
+        action_spec: the actions to draw from.
+        eps_init: probability of a random action at the start.
+        eps_end: probability after ``num_steps``.
+        num_steps: steps over which it falls linearly.
+    """
+
+    def __init__(self, action_spec: TensorSpec, eps_init: float, eps_end: float, num_steps: int) -> None:
+        super().__init__(action_spec, eps_init, eps_end, num_steps)
+        for name, value in (("eps_init", eps_init), ("eps_end", eps_end), ("eps", eps_init)):
+            setattr(self, name, torch.tensor(value, dtype=torch.float32, device="cpu"))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replace some of the actions by random ones, unless actions are to be greedy."""
+        if exploration_type() in (ExplorationType.RANDOM, None):
+            action = tensordict["action"]
+            explores = torch.rand(action.shape, dtype=torch.float32, device=self.eps.device) < self.eps
+            drawn = self.spec["action"].rand(action.shape).to(action.device)
+            tensordict.set("action", torch.where(explores, drawn, action))
+        return tensordict
 
 
 class EpsilonGreedy(TensorDictSequential):
@@ -123,7 +152,8 @@ class QLearner(Learner):
         self.eps_range = float(eps_init), float(eps_end)
         self.annealing_batches = max(1, annealing_num_steps // (num_envs * num_steps))
         self.target_update_interval = target_update_interval
-        self.multi_step = MultiStep(gamma, n_steps)
+        with torchs_defaults():  # TorchRL's table of discounts names no device
+            self.multi_step = MultiStep(gamma, n_steps)
         self.multi_step.done_keys = ()  # so that the end of an episode is known where the target reaches it
         self.prioritized = self.priority_alpha != 0
         self.replay = make_replay(self.num_items(buffer_size), batch_size, self.priority_alpha, self.priority_beta)
@@ -151,11 +181,33 @@ class QLearner(Learner):
             state: keys under which the network writes its recurrent state.
             copied: what `copied_action` returns for the network.
         """
-        self.exploration = EGreedyModule(action_spec, *self.eps_range, self.annealing_batches)
+        self.exploration = Exploration(action_spec, *self.eps_range, self.annealing_batches)
         keys = ["action", *state, *(key for module in copied for key in module.out_keys)]
         self.policy = EpsilonGreedy(greedy, self.exploration, *copied, selected_out_keys=keys)
-        self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
+        self.set_target_update(objective, age=0)
         self.optimiser = make_optimiser("adam", greedy.parameters(), learning_rate)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return an equal and independent learner.
+
+        TensorDicts copy parameters that are shared once more, so the objective gets those of the network's copy, and
+        the target network its own values.
+        """
+        made = type(self).__new__(type(self))
+        memo[id(self)] = made
+        for name, value in vars(self).items():
+            made.__dict__[name] = deepcopy(value, memo)
+        objective = made.target_update.loss_module
+        objective.value_network_params = TensorDict.from_module(objective.value_network, as_module=True)
+        target = objective.target_value_network_params.data.clone()
+        made.set_target_update(objective, self.target_update.counter)
+        objective.target_value_network_params.data.update_(target)
+        return made
+
+    def set_target_update(self, objective: LossModule, age: int) -> None:
+        """Set what copies the weights to the target network, which they are copied to now, and its age."""
+        self.target_update = HardUpdate(objective, value_network_update_interval=self.target_update_interval - 1)
+        self.target_update.counter = age
 
     def start_task(self, task: int | None = None) -> None:
         """Reset exploration; clear the replay buffer if so configured."""
@@ -179,7 +231,8 @@ class QLearner(Learner):
 
     def with_targets(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a batch with multi-step rewards, what follows them, and how many steps they span."""
-        return self.multi_step(batch)
+        with torchs_defaults():  # TorchRL's powers of the discount have torch's default dtype
+            return self.multi_step(batch)
 
     def experience(self, batch: TensorDictBase) -> TensorDictBase:
         """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""

@@ -17,7 +17,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
 from torchrl.objectives.common import LossModule
 
-from baselines.cells.cell import MakeCell
+from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
 from baselines.networks import Data, copied_action, num_actions_of, recurrent, require_weights
 from baselines.q_learning import QLearner, require_replay
@@ -37,7 +37,7 @@ class Quantiles(nn.Module):
     def __init__(self, num_features: int, num_actions: int, num_quantiles: int) -> None:
         super().__init__()
         self.shape = (num_actions, num_quantiles)
-        self.linear = nn.Linear(num_features, num_actions * num_quantiles)
+        self.linear = linear_layer(num_features, num_actions * num_quantiles)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Map float32 [..., num_features] to values [..., A] and quantiles [..., A, K]."""

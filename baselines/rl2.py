@@ -117,7 +117,7 @@ class RL2(PPO):
         state, device = self.trunk.trunk.zero_state(num_envs), next(self.parameters()).device
         state["trial"] = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
         state["previous_action"] = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        return state.set("reward", torch.zeros(num_envs, 1, device=device))
+        return state.set("reward", torch.zeros(num_envs, 1, device=device, dtype=torch.float32))
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from a batch; return mean losses and the success rates of the first and last episodes of trials.

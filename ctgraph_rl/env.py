@@ -106,9 +106,9 @@ class CTGraphEnv(EnvBase):
             tasks, seed, first_row, task_pool=task_pool, device=self.device, noise_bank=noise_bank, kernel=kernel
         )
         ids = {} if task_ids is None else task_ids
-        numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device)
+        numbers = torch.tensor([ids.get(task, -1) for task in self.rows.pool], device=self.device, dtype=torch.int64)
         self.register_buffer("_id_of_task", numbers, persistent=False)
-        self._task_id = torch.empty(0), torch.empty(0)
+        self._task_id: tuple[Tensor | None, Tensor] = None, numbers
         self._steps: list[TensorDictBase] | None = None
         self._running: dict[str, Tensor] = {}
         self._make_specs()

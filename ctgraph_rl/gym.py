@@ -105,7 +105,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         if seed is not None or not self._is_seeded:
             self._is_seeded = True
             first = int(self.np_random.integers(2**63 - 1)) if seed is None else seed
-            self.rows.set_streams(torch.tensor([first]), torch.tensor([0]))
+            self.rows.set_seed(first)
         self._is_over = False
         return self.rows.restart().numpy()[0], {"task": self._number, "outcome": OUTCOME_RUNNING, "leaf": NO_LEAF}
 
@@ -295,7 +295,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
             drawn = self.np_random.integers(2**63 - 1, size=self.num_envs) if not given[start].all() else self._seeds
             chosen = np.array([draw if one is None else one for one, draw in zip(seeds, drawn, strict=True)])
             self._seeds, self._is_seeded = np.where(start, chosen, self._seeds), True
-            row = torch.zeros(self.num_envs, dtype=torch.int64)
+            row = torch.zeros(self.num_envs, dtype=torch.int64, device="cpu")
             self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
 
     def _seeds_of(self, seed: int | Sequence[int | None] | None) -> tuple[int | None, ...]:
@@ -369,7 +369,7 @@ def _as_int(action: object) -> int:
 
 @lru_cache(maxsize=256)
 def _as_tensor(action: int) -> Tensor:
-    return torch.tensor([action])
+    return torch.tensor([action], dtype=torch.int64, device="cpu")
 
 
 def _known_mode(render_mode: str | None) -> str | None:

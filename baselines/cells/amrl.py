@@ -7,9 +7,9 @@ m_t = (x_1 + ... + x_t) / t; the other half y_t is handed on, and a layer reads 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
 from baselines.cells.lstm import LSTM
 from baselines.cells.scan import linear_scan, max_scan
 from ctgraph_rl.checks import one_of, require, true_or_false
@@ -49,7 +49,7 @@ class AMRL(Cell):
             (num_outputs % 2 == 0, f"{even}: use {num_outputs + 1}"),
         )
         self.inner = LSTM(num_features, num_outputs, num_actions, **reads)
-        self.linear = nn.Linear(num_outputs, num_outputs)
+        self.linear = linear_layer(num_outputs, num_outputs)
         self.is_max, self.straight_through = aggregator == "max", straight_through
         own = ("recurrent_state_max",) if self.is_max else ("recurrent_state_sum", "recurrent_state_count")
         self.state_keys = (*LSTM.state_keys, *own)

@@ -24,7 +24,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
 from baselines.cells.plastic_sequence import Plastic, PlasticSequence, Steps, columns_times
 from ctgraph_rl.checks import one_of, require
 
@@ -53,12 +53,14 @@ class Backpropamine(Cell):
         require(*one_of(MODULATIONS, modulation=modulation))
         self.modulation = modulation
         self.state_keys = ("unstored_hidden", "unstored_hebb", *["unstored_trace"] * (modulation == "retroactive"))
-        self.input = nn.Linear(self.num_inputs, num_outputs)
-        self.recurrent, self.plasticity = (nn.Parameter(torch.empty(num_outputs, num_outputs)) for _ in range(2))
+        self.input = linear_layer(self.num_inputs, num_outputs)
+        self.recurrent = nn.Parameter(torch.empty(num_outputs, num_outputs, dtype=torch.float32, device="cpu"))
+        self.plasticity = nn.Parameter(torch.empty(num_outputs, num_outputs, dtype=torch.float32, device="cpu"))
         if modulation != "none":
-            self.modulator, self.fan_out = nn.Linear(num_outputs, 1), nn.Linear(1, num_outputs)
+            self.modulator = linear_layer(num_outputs, 1)
+            self.fan_out = linear_layer(1, num_outputs)
         if modulation != "simple":
-            self.rate = nn.Parameter(torch.empty(()))
+            self.rate = nn.Parameter(torch.empty((), dtype=torch.float32, device="cpu"))
         self.reset_parameters()
 
     def reset_parameters(self) -> None:

@@ -117,3 +117,8 @@ def reset(state: Sequence[Tensor], starts: Tensor) -> State:
 def zeros_like_weights(cell: nn.Module, *shape: int) -> Tensor:
     """Return zeros with the dtype and the device of a cell's weights."""
     return next(cell.parameters()).new_zeros(shape)
+
+
+def linear_layer(num_inputs: int, num_outputs: int) -> nn.Linear:
+    """Return a linear layer of float32 on the CPU, whatever torch's default dtype and device are."""
+    return nn.Linear(num_inputs, num_outputs, dtype=torch.float32, device="cpu")

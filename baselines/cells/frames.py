@@ -6,9 +6,9 @@ As in Mnih et al. 2015 (arXiv 1312.5602), which stacks the images themselves.
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
 from ctgraph_rl.checks import at_most, is_int, require
 
 MOST_FRAMES = 1000
@@ -34,7 +34,7 @@ class Frames(Cell):
         rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
         require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
         self.num_frames = num_frames
-        self.linear = nn.Linear(num_frames * self.num_inputs, num_outputs)
+        self.linear = linear_layer(num_frames * self.num_inputs, num_outputs)
 
     def zeros(self, num_rows: int) -> State:
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""

@@ -20,7 +20,7 @@ class GRU(Cell):
 
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
-        self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True)
+        self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
     def zeros(self, num_rows: int) -> State:
         """Return zeros, [num_rows, num_outputs]."""

@@ -6,9 +6,9 @@ Feng et al. 2024 (arXiv 2410.01201): z = sigmoid(W_z x + b_z), h <- (1 - z) h + 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
 from baselines.cells.scan import linear_scan
 
 
@@ -20,8 +20,8 @@ class MinGRU(Cell):
 
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
-        self.gate = nn.Linear(self.num_inputs, num_outputs)
-        self.candidate = nn.Linear(self.num_inputs, num_outputs)
+        self.gate = linear_layer(self.num_inputs, num_outputs)
+        self.candidate = linear_layer(self.num_inputs, num_outputs)
 
     def zeros(self, num_rows: int) -> State:
         """Return zeros, [num_rows, num_outputs]."""

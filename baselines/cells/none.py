@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+from torch import Tensor
 
-from baselines.cells.cell import Cell, State
+from baselines.cells.cell import Cell, State, linear_layer
 
 
 class NoMemory(Cell):
@@ -15,7 +15,7 @@ class NoMemory(Cell):
 
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
-        self.linear = nn.Linear(self.num_inputs, num_outputs)
+        self.linear = linear_layer(self.num_inputs, num_outputs)
 
     def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
         """See `Cell`."""

@@ -101,7 +101,7 @@ class ADWIN(Detector):
 
     def _ended(self, seen: Seen) -> list[float]:
         """Return the returns of the episodes that ended, of those that began with the label, row after row."""
-        before = torch.zeros(len(seen.done), dtype=torch.bool) if self.is_whole is None else self.is_whole
+        before = torch.zeros(len(seen.done), dtype=torch.bool, device="cpu") if self.is_whole is None else self.is_whole
         is_whole = before.unsqueeze(1) | (seen.is_init.cumsum(dim=1) > 0)
         self.is_whole = is_whole[:, -1].clone()
         return seen.episode_return[seen.done & is_whole].tolist()
@@ -129,7 +129,7 @@ class ADWIN(Detector):
     def state_dict(self) -> dict[str, Any]:
         """Return what verdicts depend on; 8 bytes for each return in the window, 1 for each row."""
         kept = {label: tuple(each) for label, each in self.kept.items()}
-        returns = torch.tensor(self.returns, dtype=torch.float64)
+        returns = torch.tensor(self.returns, dtype=torch.float64, device="cpu")
         now = {"label": self.label, "is_trial": self.is_trial, "is_whole": self.is_whole}
         return {**now, "returns": returns, "kept": kept}
 

@@ -103,13 +103,13 @@ class AMD(Detector):
         self.models: dict[int, Counts] = {0: Counts()}
         """Of each label."""
 
-        self.recent = torch.zeros(num_rows, self.order - 1, dtype=torch.int64)
+        self.recent = torch.zeros(num_rows, self.order - 1, dtype=torch.int64, device="cpu")
         """The last pairs of action and next observation of each row's episode, from 1; 0 stands for none."""
 
-        self.last_action = torch.zeros(num_rows, dtype=torch.int64)
+        self.last_action = torch.zeros(num_rows, dtype=torch.int64, device="cpu")
         """Of each row."""
 
-        self.pending = torch.zeros(0, 3, dtype=torch.int64)
+        self.pending = torch.zeros(0, 3, dtype=torch.int64, device="cpu")
         """History, action and next observation of the steps behind the last window."""
 
     def observe(self, seen: Seen) -> Verdict:
@@ -155,7 +155,7 @@ class AMD(Detector):
 
     def _predicted(self, label: int, history: Tensor) -> Tensor:
         """Return P(o | a) after histories by the model of a label, float64 [..., actions, observations]."""
-        outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes)
+        outcomes = history.unsqueeze(-1) * self.num_outcomes + torch.arange(self.num_outcomes, device="cpu")
         counts = self.models[label].of(outcomes).double() + self.smoothing
         counts = counts.unflatten(-1, (self.num_actions, self.num_observations))
         return counts / counts.sum(dim=-1, keepdim=True)
@@ -214,7 +214,7 @@ class Counts:
     """
 
     def __init__(self, keys: Tensor | None = None, counts: Tensor | None = None) -> None:
-        empty = torch.zeros(0, dtype=torch.int64)
+        empty = torch.zeros(0, dtype=torch.int64, device="cpu")
         self.keys, self.counts = empty if keys is None else keys, empty if counts is None else counts
 
     @property
@@ -269,7 +269,7 @@ def clusters(points: Tensor, radius: float, min_neighbours: int) -> Tensor:
     number = points.shape[-2]
     near = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist") <= radius
     core = near.sum(dim=-1) >= min_neighbours
-    firsts = torch.where(core, torch.arange(number), number)
+    firsts = torch.where(core, torch.arange(number, device="cpu"), number)
     joined = near & core.unsqueeze(-2)
     for _ in range(number):
         spread = torch.where(joined, firsts.unsqueeze(-2), number).amin(dim=-1)

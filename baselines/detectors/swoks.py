@@ -99,7 +99,7 @@ class SWOKS(Detector):
         self.num_points = 0
         """In windows since the label was started."""
 
-        self.pending = torch.zeros(0)
+        self.pending = torch.zeros(0, dtype=torch.float32, device="cpu")
         """The points behind the last window."""
 
         self.history: list[Tensor] = []
@@ -126,7 +126,7 @@ class SWOKS(Detector):
     def start_label(self, label: int, trial: bool) -> None:
         """Forget the points that are in no window yet, and the history."""
         self.label, self.is_trial = label, trial
-        self.num_points, self.history, self.pending = 0, [], torch.zeros(0)
+        self.num_points, self.history, self.pending = 0, [], torch.zeros(0, dtype=torch.float32, device="cpu")
         if not trial:
             self.references.pop(label, None)
             self.distances[label] = []

@@ -84,7 +84,7 @@ class Mosaic(MaskExchange):
         self.threshold, self.top_n, self.own_share = threshold, top_n, own_share
         self.num_samples, self.buffer_size, self.num_references = num_samples, buffer_size, num_references
         self.use_similarity, self.use_return = use_similarity, use_return
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(device="cpu").manual_seed(seed)
 
     def takes(self, method: Masks) -> bool:
         """Return whether a method combines masks that it receives."""
@@ -210,7 +210,7 @@ class Known:
 
     def sample(self, number: int, num_actions: int, generator: torch.Generator) -> Tensor:
         """Draw transitions without replacement, as points; see `baselines.embedding.transitions`."""
-        drawn = torch.randperm(len(self.recent["action"]), generator=generator)[:number]
+        drawn = torch.randperm(len(self.recent["action"]), generator=generator, device="cpu")[:number]
         observation, action, reward = (self.recent[key][drawn] for key in ("observation", "action", "reward"))
         return transitions(observation, action, reward.squeeze(-1), num_actions)
 

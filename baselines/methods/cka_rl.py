@@ -108,7 +108,8 @@ class CKARL(TaskMethod):
         elif self.slot:
             self._set_own(self.base)
         if self.num_combined:
-            drawn = torch.randn(self.num_combined) if self.random_alpha else torch.zeros(self.num_combined)
+            make = torch.randn if self.random_alpha else torch.zeros
+            drawn = make(self.num_combined, dtype=torch.float32, device="cpu")
             self.alpha[: self.num_combined] = drawn.to(self.alpha) / (self.num_combined * self.alpha_rate)
         self.agent.replace_optimiser(self.trainable)
         self.after_step()

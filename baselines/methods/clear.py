@@ -42,11 +42,13 @@ class Reservoir:
         if not self.items:
             self.items = {key: value.new_zeros(self.capacity, *value.shape[1:]) for key, value in items.items()}
         number = next(iter(items.values())).shape[0]
-        order = torch.arange(self.offered, self.offered + number)
-        drawn = (torch.rand(number, dtype=torch.float64) * (order + 1)).long()
+        order = torch.arange(self.offered, self.offered + number, device="cpu")
+        drawn = (torch.rand(number, dtype=torch.float64, device="cpu") * (order + 1)).long()
         place = torch.where(order < self.capacity, order, drawn)
         taken = place < self.capacity
-        last = torch.full([self.capacity], -1).scatter_reduce(0, place[taken], taken.nonzero().squeeze(-1), "amax")
+        last = torch.full([self.capacity], -1, dtype=torch.int64, device="cpu").scatter_reduce(
+            0, place[taken], taken.nonzero().squeeze(-1), "amax"
+        )
         places = (last >= 0).nonzero().squeeze(-1)
         for key, value in items.items():
             self.items[key][places.to(value.device)] = value.index_select(0, last[places].to(value.device))
@@ -54,7 +56,7 @@ class Reservoir:
 
     def sample(self, number: int) -> dict[Any, Tensor]:
         """Draw items with replacement."""
-        places = torch.randint(len(self), [number])
+        places = torch.randint(len(self), [number], device="cpu")
         return {key: value.index_select(0, places.to(value.device)) for key, value in self.items.items()}
 
 

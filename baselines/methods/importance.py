@@ -52,14 +52,15 @@ class Importance(Method):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        self.register_buffer("importance", torch.zeros(len(weights)))
-        self.register_buffer("anchor", torch.zeros(len(weights)))
+        self.register_buffer("importance", torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
+        self.register_buffer("anchor", torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
         ids = curriculum.protocol.task_id != "hidden" and not multi_task_blocks(curriculum)
         if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
             self.heads.max_labels = self.max_labels
             self.heads.setup(agent, weights, curriculum)
-        self.register_buffer("held", torch.ones(len(weights)) if self.heads is None else 1.0 - weights.in_heads.float())
+        everywhere = torch.ones(len(weights), dtype=torch.float32, device="cpu")
+        self.register_buffer("held", everywhere if self.heads is None else 1.0 - weights.in_heads.float())
 
     def start_task(self, task: int | None) -> None:
         """Load the task's output layers."""

@@ -116,11 +116,13 @@ class MaskAMSC(SelectedMasks):
             return []
         given = similarities(known[self.slot], torch.stack([known[slot] for slot in earlier]), self.distance)
         given = standardised(given) if self.z_score else given
-        able = torch.tensor([self.episodes == "none" or self.competence[slot] > 0 for slot in earlier])
-        candidates = torch.tensor(earlier)[able]
+        able = given.new_tensor(
+            [self.episodes == "none" or self.competence[slot] > 0 for slot in earlier], dtype=torch.bool
+        )
+        candidates = torch.tensor(earlier, dtype=torch.int64, device="cpu")[able]
         support = candidates[sparsemax(given[able] / self.temperature) > 0]
         if self.shuffled:
-            support = candidates[torch.randperm(len(candidates), generator=self.shuffle)[: len(support)]]
+            support = candidates[torch.randperm(len(candidates), generator=self.shuffle, device="cpu")[: len(support)]]
         return support.tolist()
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -153,7 +155,8 @@ def sparsemax(values: Tensor) -> Tensor:
     Martins and Astudillo 2016 (arXiv 1602.02068): w = max(z - tau, 0), tau = (sum of the K largest - 1) / K, with the
     largest K that has 1 + K z_(K) > sum of the K largest.
     """
-    ordered, counts = values.sort(descending=True).values, torch.arange(1, len(values) + 1)
+    ordered = values.sort(descending=True).values
+    counts = torch.arange(1, len(values) + 1, device="cpu")
     sums = ordered.cumsum(0)
     held = (1 + counts * ordered > sums).nonzero().flatten()
     if not len(held):  # no values

@@ -17,4 +17,4 @@ class MaskBLC(CombinedMasks):
     def initial_betas(self, num_earlier: int) -> Tensor:
         """Return the logarithms of the shares."""
         shares = [0.5 / max(num_earlier, 1)] * num_earlier + [0.5]
-        return torch.tensor(shares).log()
+        return torch.tensor(shares, dtype=torch.float32, device="cpu").log()

@@ -16,4 +16,4 @@ class MaskLC(CombinedMasks):
 
     def initial_betas(self, num_earlier: int) -> Tensor:
         """Return equal numbers."""
-        return torch.zeros(num_earlier + 1)
+        return torch.zeros(num_earlier + 1, dtype=torch.float32, device="cpu")

@@ -67,7 +67,7 @@ class MaskSC(SelectedMasks):
         if self.selection == "similarity":
             return self._similar()
         if self.selection == "random":
-            return torch.randperm(len(earlier), generator=self.generator)[: self.top_k].tolist()
+            return torch.randperm(len(earlier), generator=self.generator, device="cpu")[: self.top_k].tolist()
         if self.selection in ("all", "none"):
             return [*earlier] if self.selection == "all" else []
         tasks = ct_graphs([*map(self.task_in, range(self.num_combined)), self.task_in(self.slot)], self.selection)

@@ -49,8 +49,10 @@ class MaskShared(Masks):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         self.num_actions = most_actions(curriculum.tasks)
-        self.betas = nn.Parameter(torch.zeros(len(weights.parameters), self.max_received + 1))
-        self._keep(torch.zeros(0, len(weights)))
+        self.betas = nn.Parameter(
+            torch.zeros(len(weights.parameters), self.max_received + 1, dtype=torch.float32, device="cpu")
+        )
+        self._keep(torch.zeros(0, len(weights), dtype=torch.float32, device="cpu"))
         super().setup(agent, weights, curriculum)
 
     @property
@@ -101,8 +103,8 @@ class MaskShared(Masks):
         excluded = room - count
         self.num_received = count
         self.received = torch.cat([scores, scores.new_zeros(excluded, scores.shape[1])]) if excluded else scores
-        self.places = torch.tensor([*range(count), *[0] * excluded, count], device=device)
-        self.offsets = torch.tensor([0.0] * count + [-torch.inf] * excluded + [0.0], device=device)
+        self.places = torch.tensor([*range(count), *[0] * excluded, count], device=device, dtype=torch.int64)
+        self.offsets = torch.tensor([0.0] * count + [-torch.inf] * excluded + [0.0], device=device, dtype=torch.float32)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return what `Masks` does, and the received scores."""

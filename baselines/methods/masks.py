@@ -57,7 +57,7 @@ class Masks(TaskMethod):
         self.ended = 0
         """Number of tasks whose scores are stored."""
 
-        scores = torch.zeros(self.num_tasks, len(weights))
+        scores = torch.zeros(self.num_tasks, len(weights), dtype=torch.float32, device="cpu")
         own = self.initial_scores()
         if self.backbone_seed is not None:
             with _seeded(self.backbone_seed):
@@ -172,7 +172,9 @@ class CombinedMasks(Masks):
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
-        self.betas = nn.Parameter(torch.zeros(len(weights.parameters), self.num_ids(curriculum)))
+        self.betas = nn.Parameter(
+            torch.zeros(len(weights.parameters), self.num_ids(curriculum), dtype=torch.float32, device="cpu")
+        )
         super().setup(agent, weights, curriculum)
 
     @property

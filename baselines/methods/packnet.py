@@ -60,10 +60,10 @@ class PackNet(TaskMethod):
         self.block = -1
         self.frames = 0
         size = len(weights)
-        self.register_buffer("owner", torch.full([size], FREE, dtype=torch.int16))
-        self.register_buffer("packed", torch.zeros(size))
-        self.register_buffer("live", torch.ones(size, dtype=torch.bool))
-        self.register_buffer("mine", torch.zeros(size, dtype=torch.bool))
+        self.register_buffer("owner", torch.full([size], FREE, dtype=torch.int16, device="cpu"))
+        self.register_buffer("packed", torch.zeros(size, dtype=torch.float32, device="cpu"))
+        self.register_buffer("live", torch.ones(size, dtype=torch.bool, device="cpu"))
+        self.register_buffer("mine", torch.zeros(size, dtype=torch.bool, device="cpu"))
         self.in_matrices = weights.in_matrices & ~weights.in_heads
         self.in_heads = weights.in_heads
 

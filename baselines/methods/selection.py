@@ -27,7 +27,7 @@ STREAM = 0x5E1EC7
 
 def own_generator(stream: int = STREAM) -> torch.Generator:
     """Return a generator whose stream depends on the seed of torch's global one, from which nothing is drawn."""
-    return torch.Generator().manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
+    return torch.Generator(device="cpu").manual_seed((torch.initial_seed() ^ stream << 32) % 2**63)
 
 
 class TaskEmbeddings:
@@ -83,7 +83,7 @@ class TaskEmbeddings:
         seen = len(self.recent["action"])
         if seen < self.num_samples:
             return
-        drawn = torch.randperm(seen, generator=generator)[: self.num_samples]
+        drawn = torch.randperm(seen, generator=generator, device="cpu")[: self.num_samples]
         observation, action, reward = (value[drawn] for value in self.recent.values())
         new = normalize(self._embed(transitions(observation, action, reward.squeeze(-1), num_actions)), dim=0)
         old = self.of_slot.get(slot, new)
@@ -162,7 +162,7 @@ class SelectedMasks(MaskLC):
         self.of_id = {number: task for task, number in curriculum.task_ids.items()}
         self.num_actions = most_actions(curriculum.tasks)
         for name in ("community", "places", "offsets"):
-            self.register_buffer(name, torch.zeros(0), persistent=False)
+            self.register_buffer(name, torch.zeros(0, dtype=torch.float32, device="cpu"), persistent=False)
 
     def task_in(self, slot: int) -> TaskLike:
         """Return the task of a slot."""
@@ -223,8 +223,10 @@ class SelectedMasks(MaskLC):
         device = self.scores.device
         self.selected = list(slots)
         self.community = self.scores[filled]
-        self.places = torch.tensor([*filled, self.slot], device=device)
-        self.offsets = torch.tensor([0.0] * len(slots) + [-torch.inf] * excluded + [0.0], device=device)
+        self.places = torch.tensor([*filled, self.slot], device=device, dtype=torch.int64)
+        self.offsets = torch.tensor(
+            [0.0] * len(slots) + [-torch.inf] * excluded + [0.0], device=device, dtype=torch.float32
+        )
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return what is selected, and all that selections depend on."""

@@ -46,7 +46,7 @@ class SI(Importance):
         """See `Method`."""
         super().setup(agent, weights, curriculum)
         for name in ("path", "start", "before", "slope"):
-            self.register_buffer(name, torch.zeros(len(weights)))
+            self.register_buffer(name, torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:

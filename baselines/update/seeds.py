@@ -88,7 +88,7 @@ class Group:
         """The learners' tensors, as many learners in each as learn at once."""
         if not self._stacks:
             count = len(self.learners)
-            bounds = torch.arange(count).tensor_split(math.ceil(count / self.most_at_once))
+            bounds = torch.arange(count, device="cpu").tensor_split(math.ceil(count / self.most_at_once))
             self._stacks = [Stack([self.learners[number] for number in numbers.tolist()]) for numbers in bounds]
         return self._stacks
 

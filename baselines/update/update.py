@@ -122,7 +122,10 @@ def _beside(scale: Tensor, gradient: Tensor) -> Tensor:
 
 def total_loss(losses: Mapping[str, Tensor]) -> Tensor:
     """Return the sum of the losses named ``loss_*``, which is what is minimised."""
-    return sum((value for key, value in losses.items() if key.startswith("loss_")), start=torch.zeros(()))
+    return sum(
+        (value for key, value in losses.items() if key.startswith("loss_")),
+        start=torch.zeros((), dtype=torch.float32, device="cpu"),
+    )
 
 
 def stacked(tensors: Sequence[Tensor]) -> Tensor:

@@ -85,28 +85,23 @@ class GymEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        n, space = self.batch_size[0], spaces_of(self.pool[0])[0]
-        shape, column = (n, *self.pool[0].observation_shape), (n, 1)
-        if hasattr(space, "n"):
-            shown: Any = Bounded(0, 1, shape=shape, dtype=torch.uint8)
-        elif space.dtype == np.uint8:
-            shown = Bounded(0, 255, shape=shape, dtype=torch.uint8)
-        else:
-            shown = Unbounded(shape=shape, dtype=torch.float32)
-        flag = Binary(1, shape=column, dtype=torch.bool)
+        n = self.batch_size[0]
+        column = (n, 1)
+        shown = _observation_spec(spaces_of(self.pool[0])[0], (n, *self.pool[0].observation_shape))
+        flag = Binary(1, shape=column, dtype=torch.bool, device="cpu")
         keys = {
             "observation": shown,
             "is_init": flag.clone(),
-            "step_count": Unbounded(shape=column, dtype=torch.int64),
-            "episode_reward": Unbounded(shape=column, dtype=torch.float32),
+            "step_count": Unbounded(shape=column, dtype=torch.int64, device="cpu"),
+            "episode_reward": Unbounded(shape=column, dtype=torch.float32, device="cpu"),
         }
         if self.num_task_ids:
-            keys["task_id"] = Bounded(0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8)
-        self.observation_spec = Composite(keys, shape=(n,)).to(self.device)
+            keys["task_id"] = Bounded(0, 1, shape=(n, self.num_task_ids), dtype=torch.uint8, device="cpu")
+        self.observation_spec = Composite(keys, shape=(n,), device="cpu").to(self.device)
         self.action_spec = _action_spec(spaces_of(self.pool[0])[1], n).to(self.device)
-        self.reward_spec = Unbounded(shape=column, dtype=torch.float32).to(self.device)
+        self.reward_spec = Unbounded(shape=column, dtype=torch.float32, device="cpu").to(self.device)
         done = {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
-        self.full_done_spec = Composite(done, shape=(n,)).to(self.device)
+        self.full_done_spec = Composite(done, shape=(n,), device="cpu").to(self.device)
         zeros = self.observation_spec.zero()
         self._data = {key: zeros[key] for key in keys} | {key: self.full_done_spec.zero()[key] for key in done}
 
@@ -165,7 +160,7 @@ class GymEnv(EnvBase):
             played.append(taken)
         observations, reward, terminated, truncated, _ = self._rows.step(self._as_given(action))
         flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        data = {key: torch.tensor(value, device=self.device).unsqueeze(-1) for key, value in flags.items()}
+        data = {key: torch.from_numpy(value).to(self.device, copy=True).unsqueeze(-1) for key, value in flags.items()}
         rewards = torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1)
         data |= self._observed(observations)
         data["is_init"] = torch.zeros_like(data["done"])
@@ -181,7 +176,7 @@ class GymEnv(EnvBase):
     def _observed(self, observations: Any) -> dict[str, Tensor]:
         """Return what rows show of their observations and tasks."""
         shape, space = self.pool[0].observation_shape, spaces_of(self.pool[0])[0]
-        seen = torch.as_tensor(np.array(observations), device=self.device)
+        seen = torch.from_numpy(np.array(observations)).to(self.device)
         if hasattr(space, "n"):
             seen = one_hot(seen.long() - int(space.start), shape[0]).to(torch.uint8)
         elif space.dtype == np.uint8:
@@ -190,7 +185,7 @@ class GymEnv(EnvBase):
             seen = seen.float()
         data = {"observation": seen.contiguous()}
         if self.num_task_ids:
-            ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device)
+            ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device, dtype=torch.int64)
             data["task_id"] = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
         return data
 
@@ -247,13 +242,22 @@ class GymEnv(EnvBase):
 FIX = "make reset(seed=...) decide all of an episode, or give GymTask(repeats=False)"
 
 
+def _observation_spec(space: Any, shape: tuple[int, ...]) -> Any:
+    if hasattr(space, "n"):
+        return Bounded(0, 1, shape=shape, dtype=torch.uint8, device="cpu")
+    if space.dtype == np.uint8:
+        return Bounded(0, 255, shape=shape, dtype=torch.uint8, device="cpu")
+    return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
+
+
 def _action_spec(space: Any, num_rows: int) -> Any:
     if hasattr(space, "n"):
-        return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64)
+        return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64, device="cpu")
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        return Unbounded(shape=(num_rows, *space.shape), dtype=torch.float32)
-    low, high = (torch.as_tensor(bound).expand(num_rows, *space.shape) for bound in (space.low, space.high))
-    return Bounded(low, high, shape=(num_rows, *space.shape), dtype=torch.float32)
+        return Unbounded(shape=(num_rows, *space.shape), dtype=torch.float32, device="cpu")
+    low = torch.tensor(space.low, dtype=torch.float32, device="cpu").expand(num_rows, *space.shape)
+    high = torch.tensor(space.high, dtype=torch.float32, device="cpu").expand(num_rows, *space.shape)
+    return Bounded(low, high, shape=(num_rows, *space.shape), dtype=torch.float32, device="cpu")
 
 
 def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:

@@ -256,8 +256,10 @@ def _packed(tables: Tables) -> Tensor:
     """Return the different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
     tree, x, g = tables.tree, tables.x, tables.g
     count = len(tree.first_leaf)
-    extra = torch.zeros(count) if tree.extra_end_step is None else tree.extra_end_step
-    reward_fn = torch.tensor([KERNEL_REWARDS.index(type(fn)) for fn in tables.uses.reward_fns])[g.reward_fn]
+    extra = torch.zeros_like(tree.first_leaf) if tree.extra_end_step is None else tree.extra_end_step
+    reward_fn = torch.tensor(
+        [KERNEL_REWARDS.index(type(fn)) for fn in tables.uses.reward_fns], dtype=torch.int64, device="cpu"
+    )[g.reward_fn]
     legacy = torch.ones_like(x.num_ids) if x.legacy is None else x.legacy.num_ids
     none = torch.full_like(tree.first_leaf, -1)
     plain = [tree.branching_factor, tree.first_leaf, tree.stay_below, extra, *(tree.swap or (none, none, none))]

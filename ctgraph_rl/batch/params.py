@@ -114,7 +114,7 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
         return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
 
     def table(values: list[list[int]]) -> Tensor:
-        return torch.tensor(values, device=bank_start.device).flatten()
+        return torch.tensor(values, device=bank_start.device, dtype=torch.int64).flatten()
 
     bank_start, angles = each(starts), max(map(_num_angles, tasks))
     taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []

@@ -42,7 +42,7 @@ class Steps(NamedTuple):
             observation=torch.empty(t + 1, n, *rows.image_shape, dtype=torch.uint8, device=device),
             is_init=torch.empty(t + 1, n, dtype=torch.bool, device=device),
             action=torch.empty(t, n, dtype=torch.int64, device=device),
-            reward=torch.empty(t, n, device=device),
+            reward=torch.empty(t, n, device=device, dtype=torch.float32),
             done=torch.empty(t, n, dtype=torch.bool, device=device),
             outcome=torch.empty(t, n, dtype=torch.uint8, device=device),
         )

@@ -95,7 +95,7 @@ class Rows(TakesNumbers, nn.Module):
         super().__init__()
         self.kernel = kernel
         self.max_branching = max(task.graph.branching_factor for task in self.pool)
-        self.register_buffer("seed", torch.tensor([seed], device=device))
+        self.register_buffer("seed", torch.tensor([seed], device=device, dtype=torch.int64))
         self.register_buffer("row", torch.arange(first_row, first_row + self.num_rows, device=device))
         self._choose_engine()
         bank = shared_bank(self.pool, self.num_rows, noise_bank)
@@ -174,7 +174,7 @@ class Rows(TakesNumbers, nn.Module):
         tasks, n = require_all(Task, "tasks", tasks), self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
         whole_pool = torch.arange(len(self.pool), device=self.device)
-        numbers = torch.tensor(numbers_in(self.pool, tasks), device=self.device)
+        numbers = torch.tensor(numbers_in(self.pool, tasks), device=self.device, dtype=torch.int64)
         self._choose(whole_pool, numbers, None, at_episode_end)
 
     def switch_tasks(self, tasks: Iterable[Task], switch: Switch, at_episode_end: bool = False) -> None:
@@ -188,7 +188,7 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: for less than two tasks, one that is not in the pool, and what is no switch.
         """
-        choices = torch.tensor(numbers_in(self.pool, tasks), device=self.device)
+        choices = torch.tensor(numbers_in(self.pool, tasks), device=self.device, dtype=torch.int64)
         enough = len(choices) > 1, "switch_tasks needs at least two tasks, got one; use set_tasks"
         require(enough, switch_rule(switch))
         self._choose(choices, torch.zeros_like(self.row), switch, at_episode_end)
@@ -256,7 +256,7 @@ class Rows(TakesNumbers, nn.Module):
             ValueError: if a goal is not one of its row's tree.
         """
         if not isinstance(goals, Tensor) or goals.ndim == 2:
-            goals = torch.tensor(goal_leaves(self.tasks, plain(goals)), device=self.device)
+            goals = torch.tensor(goal_leaves(self.tasks, plain(goals)), device=self.device, dtype=torch.int64)
         fits = goals.shape == (self.num_rows,) and goals.dtype == torch.int64
         require((fits, f"goals must be int64 of shape [{self.num_rows}], got {goals.dtype} {list(goals.shape)}"))
         outside = (goals < 0) | (goals >= self.params.g.num_leaves)
@@ -267,7 +267,7 @@ class Rows(TakesNumbers, nn.Module):
     def set_seed(self, seed: int) -> None:
         """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""
         require(seed_rule(seed))
-        self.set_streams(torch.tensor([seed], device=self.device), self.row)
+        self.set_streams(torch.tensor([seed], device=self.device, dtype=torch.int64), self.row)
 
     def set_streams(self, seed: Tensor, row: Tensor) -> None:
         """Restart all rows with random streams of their own.

@@ -39,20 +39,19 @@ def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_id
     shape, column = observation_shape(pool, math.prod(batch_size)), (*batch_size, 1)
     white = 255 if len(shape) == 3 else max(int(white_level(task.images)) for task in pool)
     keys: dict[str, Bounded | Binary | Unbounded] = {
-        "observation": Bounded(0, white, shape=(*batch_size, *shape), dtype=torch.uint8),
-        "is_init": Binary(1, shape=column, dtype=torch.bool),
+        "observation": Bounded(0, white, shape=(*batch_size, *shape), dtype=torch.uint8, device="cpu"),
+        "is_init": Binary(1, shape=column, dtype=torch.bool, device="cpu"),
     }
     if info:
-        keys["step_count"] = Unbounded(shape=column, dtype=torch.int64)
-        keys["episode_reward"] = Unbounded(shape=column, dtype=torch.float32)
-        keys["outcome"] = Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=column, dtype=torch.uint8)
-        keys["leaf"] = Unbounded(shape=column, dtype=torch.int64)
+        keys["step_count"] = Unbounded(shape=column, dtype=torch.int64, device="cpu")
+        keys["episode_reward"] = Unbounded(shape=column, dtype=torch.float32, device="cpu")
+        keys["outcome"] = Bounded(OUTCOME_RUNNING, OUTCOME_GOAL, shape=column, dtype=torch.uint8, device="cpu")
+        keys["leaf"] = Unbounded(shape=column, dtype=torch.int64, device="cpu")
     if num_task_ids:
-        keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8)
+        keys["task_id"] = Bounded(0, 1, shape=(*batch_size, num_task_ids), dtype=torch.uint8, device="cpu")
     num_actions = 1 + max(task.graph.branching_factor for task in pool)
-    return Specs(
-        Composite(keys, shape=batch_size, device="cpu"), Categorical(num_actions, shape=batch_size, dtype=torch.int64)
-    )
+    action = Categorical(num_actions, shape=batch_size, dtype=torch.int64, device="cpu")
+    return Specs(Composite(keys, shape=batch_size, device="cpu"), action)
 
 
 def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:

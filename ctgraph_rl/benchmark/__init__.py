@@ -94,10 +94,11 @@ class Counter(EnvBase):
 
     def __init__(self, num_rows: int) -> None:
         super().__init__(batch_size=torch.Size([num_rows]))
-        self.observation_spec = Composite(observation=Unbounded((num_rows, 1), dtype=torch.int64), shape=(num_rows,))
-        self.action_spec = Categorical(3, shape=(num_rows,))
-        self.reward_spec = Unbounded((num_rows, 1))
-        self.first = torch.arange(num_rows).unsqueeze(-1) % 4
+        count = Unbounded((num_rows, 1), dtype=torch.int64, device="cpu")
+        self.observation_spec = Composite(observation=count, shape=(num_rows,), device="cpu")
+        self.action_spec = Categorical(3, shape=(num_rows,), dtype=torch.int64, device="cpu")
+        self.reward_spec = Unbounded((num_rows, 1), dtype=torch.float32, device="cpu")
+        self.first = torch.arange(num_rows, device="cpu").unsqueeze(-1) % 4
         self.count = self.first
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
@@ -122,8 +123,8 @@ def _num_steps(num_rows: int, size: int = 144) -> int:
 
 def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
     steps = _num_steps(num_rows)
-    target = torch.empty(steps, num_rows, 1, 12, 12, dtype=torch.uint8)
-    source = torch.randint(0, 255, target.shape, dtype=torch.uint8)
+    target = torch.empty(steps, num_rows, 1, 12, 12, dtype=torch.uint8, device="cpu")
+    source = torch.randint(0, 255, target.shape, dtype=torch.uint8, device="cpu")
 
     def run(write: Callable[[Tensor, int], object]) -> int:
         for t in range(steps):
@@ -137,7 +138,7 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
 def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
     rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
     steps = Steps.empty(rows, _num_steps(num_rows))
-    actions = torch.randint(0, 3, steps.action.shape)
+    actions = torch.randint(0, 3, steps.action.shape, device="cpu")
 
     def run(rows: Rows, kernel: str) -> int:
         rollout(rows, actions, steps, kernel)
@@ -195,13 +196,13 @@ class _Random(TensorDictModuleBase):
         self.num_rows = num_rows
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", torch.randint(0, 3, (self.num_rows,)))
+        return tensordict.set("action", torch.randint(0, 3, (self.num_rows,), device="cpu"))
 
 
 def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
     envs = CTGraphVectorEnv(num_rows, task, kernel=kernel)
     envs.reset(seed=0)
-    actions = torch.randint(0, 3, (16, num_rows)).numpy()
+    actions = torch.randint(0, 3, (16, num_rows), device="cpu").numpy()
 
     def run_batch() -> int:
         for action in actions:
@@ -215,7 +216,7 @@ def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Ca
 
 def _single(env: gymnasium.Env) -> Callable[[], int]:
     """Steps of any Gymnasium environment with random actions."""
-    actions = torch.randint(0, 3, (256,)).tolist()
+    actions = torch.randint(0, 3, (256,), device="cpu").tolist()
     env.reset(seed=0)
 
     def run() -> int:

@@ -85,13 +85,13 @@ def sized_curriculum(num_tasks: int) -> Curriculum:
 
 def write_sized_log(curriculum: Curriculum, path: Path) -> None:
     """Write the log of a run that evaluates all tasks before training and after every block; returns are drawn."""
-    draw, log = torch.Generator().manual_seed(0), RunLog(path)
+    draw, log = torch.Generator(device="cpu").manual_seed(0), RunLog(path)
     trained = [[number + 1 for number in block] for block in curriculum.trained]
     config = {"seed": 0, "agent": "none"}
     about = {"curriculum": curriculum.name, "fingerprint": curriculum.fingerprint, "config": config}
     log.append("run", **about, schema=1, trained=trained, tasks=list(curriculum.labels))
     for block, frames in enumerate((0, *curriculum.ends)):
-        returns = torch.rand(len(curriculum.tasks), generator=draw).tolist()
+        returns = torch.rand(len(curriculum.tasks), generator=draw, dtype=torch.float32, device="cpu").tolist()
         if block:
             log.append("training", block=block, frames=frames, **_means(returns[0]))
         for task, (label, value) in enumerate(zip(curriculum.labels, returns, strict=True), 1):

@@ -1,6 +1,9 @@
-"""The devices of this machine."""
+"""The devices of this machine, and the dtype and device that torch takes where none is named."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -22,3 +25,21 @@ def checked_device(device: object) -> torch.device:
     there = found is not None and (found.type == "cpu" or str(found) in choices)
     require((there, f"device must be one of {', '.join(choices)} on this machine, got {device!r}"))
     return torch.device("cpu") if found is None or found.type == "cpu" else found
+
+
+@contextmanager
+def torchs_defaults() -> Iterator[None]:
+    """Let code of others that names no dtype and no device have float32 and the CPU, whatever the user's defaults are.
+
+    Code of this package names both. Where the defaults are the usual ones, nothing is set.
+    """
+    dtype = torch.get_default_dtype()
+    if dtype == torch.float32 and torch.get_default_device().type == "cpu":
+        yield
+        return
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)

@@ -73,7 +73,9 @@ def draw(seed: Tensor, row: Tensor, tick: Tensor, stream: int, block: Tensor | i
     """
     last = block + (stream << _STREAM_SHIFT)
     if not isinstance(last, Tensor):
-        last = torch.full((), last, device=tick.device)  # written there: `torch.as_tensor` copies from the CPU
+        last = torch.full(
+            (), last, dtype=torch.int64, device=tick.device
+        )  # written there: `torch.as_tensor` copies from the CPU
     return philox((tick & _WORD, tick >> 32, row, last), (seed & _WORD, seed >> 32))
 
 
@@ -122,7 +124,7 @@ _NORMAL_UNIT = 2.0**-20
 
 def normal_table() -> Tensor:
     """Upper-tail quantiles of the normal distribution at (1 + i / 256) 2**e, e = -1..30, for `normal`; float64."""
-    cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64)
+    cell = torch.arange(32 * _NORMAL_CELLS + 1, dtype=torch.float64, device="cpu")
     octave = (cell / _NORMAL_CELLS).floor()
     tail = (1 + cell / _NORMAL_CELLS - octave) * 2 ** (octave - 1 - 32)
     return (-torch.special.ndtri(tail) / _NORMAL_UNIT).round() * _NORMAL_UNIT

@@ -73,10 +73,11 @@ _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images)
 
 def noise_bank(levels: tuple[int, ...], size: int, shape: tuple[int, ...]) -> Tensor:
     """Noise drawn in advance: for each largest addition so many noises, uint8 [levels * size, *shape]."""
-    numbers = torch.arange(len(levels) * size)
-    upper, lower, *_ = draw(torch.tensor(0), numbers, torch.tensor(0), STREAM_NOISE)
-    black = torch.zeros(len(numbers), *shape, dtype=torch.uint8)
-    return add_noise(black, (upper << 32) | lower, torch.tensor(levels).repeat_interleave(size))
+    numbers = torch.arange(len(levels) * size, device="cpu")
+    zero = numbers.new_tensor(0)
+    upper, lower, *_ = draw(zero, numbers, zero, STREAM_NOISE)
+    black = torch.zeros(len(numbers), *shape, dtype=torch.uint8, device="cpu")
+    return add_noise(black, (upper << 32) | lower, numbers.new_tensor(levels).repeat_interleave(size))
 
 
 def add_saturating(images: Tensor, noise: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
 def taps_of(size: int, degrees: int) -> tuple[Tensor, Tensor]:
     """For each pixel the four source pixels and their weights * 2**16; both int64 [r * r, 4]."""
     angle, centre = math.radians(degrees), (size - 1) / 2
-    grid = torch.arange(size, dtype=torch.float64) - centre
+    grid = torch.arange(size, dtype=torch.float64, device="cpu") - centre
     y, x = torch.meshgrid(grid, grid, indexing="ij")
     source_x = math.cos(angle) * x - math.sin(angle) * y + centre
     source_y = math.sin(angle) * x + math.cos(angle) * y + centre

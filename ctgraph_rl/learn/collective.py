@@ -227,7 +227,7 @@ class _Learner:
 
 def _cuda_stream(seed: int, device: torch.device) -> Tensor | None:
     """Return the state of a GPU's generator of a run with this seed; None on a CPU."""
-    return torch.Generator(device).manual_seed(seed).get_state() if device.type == "cuda" else None
+    return torch.Generator(device=device).manual_seed(seed).get_state() if device.type == "cuda" else None
 
 
 class _Collective:

@@ -160,7 +160,7 @@ class LogitsPolicy:
             f"a plain module must map observations, float {shape}, to logits, float [{shape[0]}, {self.num_actions}]"
         )
         fix = "write one that does, or a function of a TensorDict that sets 'action', or a TensorDictModule"
-        like = next(self.module.parameters(), torch.zeros(()))
+        like = next(self.module.parameters(), torch.zeros((), dtype=torch.float32, device="cpu"))
         keys = ["observation", "task_id"] if self._takes_ids and "task_id" in data.keys() else ["observation"]  # noqa: SIM118
         try:
             with _evaluation_mode(self.module):

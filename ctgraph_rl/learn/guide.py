@@ -50,7 +50,7 @@ class Guide:
         if not share:
             return self.policy(tensordict)
         actions, before = self.navigation.action(tensordict), tensordict.get(GUIDED, None)
-        guided = torch.rand(actions.shape, device=actions.device) < share
+        guided = torch.rand(actions.shape, device=actions.device, dtype=torch.float32) < share
         if before is not None:
             guided = torch.where(tensordict["is_init"].squeeze(-1), guided, before)
         given = torch.where(guided, actions, -1)

@@ -201,7 +201,7 @@ class Lockstep:
         tasks = count * self.curriculum.blocks[0].rows(num_envs)
         env = make_env(self.curriculum, tasks, self.seeds[0], device)
         if self.group.generators is not None:
-            seed = torch.tensor(self.seeds, device=device).repeat_interleave(num_envs)
+            seed = torch.tensor(self.seeds, device=device, dtype=torch.int64).repeat_interleave(num_envs)
             env.rows.set_streams(seed, torch.arange(num_envs, device=device).repeat(count))
         return env
 

@@ -117,7 +117,7 @@ class Mail:
     def __init__(self, drop_prob: float = 0.0, delay_prob: float = 0.0, seed: int = 0) -> None:
         require(*fraction(drop_prob=drop_prob, delay_prob=delay_prob))
         self.drop_prob, self.delay_prob = drop_prob, delay_prob
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(device="cpu").manual_seed(seed)
         self.here: list[Message] = []
         self.late: list[Message] = []
         self.counts: Counter[tuple[str, str]] = Counter()
@@ -134,7 +134,7 @@ class Mail:
 
     def post(self, message: Message) -> None:
         """Send a message."""
-        lost, late = torch.rand(2, generator=self.generator).tolist()
+        lost, late = torch.rand(2, generator=self.generator, dtype=torch.float32, device="cpu").tolist()
         self.counts[message.kind, SENT] += 1
         self.bytes[message.kind] += message.num_bytes
         if lost < self.drop_prob:

@@ -366,7 +366,7 @@ def label_of(evaluation: Mapping[str, Any]) -> str:
 
 
 def _row(values: Sequence[float | None]) -> Tensor:
-    return torch.tensor([math.nan if value is None else value for value in values], dtype=torch.float64)
+    return torch.tensor([math.nan if value is None else value for value in values], dtype=torch.float64, device="cpu")
 
 
 def _finite(value: Any) -> Any:

@@ -130,7 +130,7 @@ def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """
     if not are_graphs(tasks):
         return _said_by(tasks, "optimal_value", lambda task: task.optimal_value(1.0))
-    return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64)
+    return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64, device="cpu")
 
 
 def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
@@ -150,7 +150,7 @@ def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """Each task's return of a failure, of others than CT-graphs the lowest mean return, float64 [tasks]."""
     if not are_graphs(tasks):
         return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
-    return torch.tensor([task.fail_reward for task in tasks], dtype=torch.float64)
+    return torch.tensor([task.fail_reward for task in tasks], dtype=torch.float64, device="cpu")
 
 
 def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
@@ -163,7 +163,7 @@ def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], floa
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
     """Return a value of each task; the reason of the first that has none."""
     try:
-        return torch.tensor([value(task) for task in tasks], dtype=torch.float64)
+        return torch.tensor([value(task) for task in tasks], dtype=torch.float64, device="cpu")
     except ValueError as error:
         return Undefined(str(error))
 
@@ -200,7 +200,12 @@ def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
     """The evaluation curves; where nothing was evaluated, one evaluation without values."""
     if any(not m.get("held_out") for m in log.of_kind("evaluation")):
         return log.curves(curriculum.trained)
-    return Curves(torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64), (0,), (0,), curriculum.trained)
+    return Curves(
+        torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64, device="cpu"),
+        (0,),
+        (0,),
+        curriculum.trained,
+    )
 
 
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
@@ -209,7 +214,9 @@ def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined
         return best
     of_task = best.tolist()
     values = [{of_task[task] for task in block} for block in curriculum.trained]
-    alone = torch.tensor([each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64)
+    alone = torch.tensor(
+        [each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64, device="cpu"
+    )
     return alone[log.training("block").long() - 1]
 
 
@@ -221,7 +228,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
     trained = [block[0] if len(block) == 1 else SEVERAL for block in curriculum.trained]
     return Labelling(
         acted.long() - 1,
-        torch.tensor(trained)[blocks.long() - 1],
+        acted.new_tensor(trained).long()[blocks.long() - 1],
         ends.diff(prepend=ends.new_zeros(1)).long(),
         learned=log.training("learned") > 0,
         alarm=log.training("alarm") > 0,
@@ -242,7 +249,7 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
         reason = "needs announced boundaries: an episode of one task may end in the block of the next"
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))
-    starts, nothing = (0, *curriculum.ends), torch.empty(0, dtype=torch.float64)
+    starts, nothing = (0, *curriculum.ends), torch.empty(0, dtype=torch.float64, device="cpu")
     names = ("frames", "episodes", "success_rate")
     frames, episodes, success_rates = (log.training_by_block(name) for name in names)
     return {

@@ -195,6 +195,6 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
     ends = curves.ends
     last = {task: block for block, tasks in enumerate(curves.trained, 1) for task in tasks}
     reached = torch.stack([ends[last[task], task] for task in sorted(last)])
-    needed = torch.as_tensor(threshold, dtype=ends.dtype).expand(ends.shape[1])[sorted(last)]
+    needed = torch.as_tensor(threshold, dtype=ends.dtype, device="cpu").expand(ends.shape[1])[sorted(last)]
     unknown = reached.isnan() | needed.isnan()
     return torch.where(unknown, torch.nan, (reached >= needed).double())

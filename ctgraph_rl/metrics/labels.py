@@ -78,7 +78,7 @@ def false_alarms(labelling: Labelling) -> Tensor:
     """Return the alarms per 100,000 frames that are not the first ones after a change of task."""
     detected = int((~_delays(labelling).isnan()).sum())
     rate = PER * (int(labelling.alarm.sum()) - detected) / int(labelling.frames.sum())
-    return torch.tensor([rate], dtype=torch.float64)
+    return torch.tensor([rate], dtype=torch.float64, device="cpu")
 
 
 @defined("ctgraph_rl/labels-per-task", "labels learned with / tasks trained", HERE, bounds=not_negative)
@@ -86,7 +86,7 @@ def labels_per_task(labelling: Labelling) -> Tensor:
     """Return the number of different labels that were learned with, over the number of tasks; 1 is right."""
     labelling.check_one_task_each()
     labels, tasks = labelling.acted[labelling.learned].unique(), labelling.task.unique()
-    return torch.tensor([len(labels) / len(tasks)], dtype=torch.float64)
+    return torch.tensor([len(labels) / len(tasks)], dtype=torch.float64, device="cpu")
 
 
 @defined(
@@ -102,7 +102,7 @@ def label_agreement(labelling: Labelling) -> Tensor:
     1: each task has a label of its own, whatever its number. 0 is expected of labels without relation to the tasks.
     """
     labelling.check_one_task_each()
-    return torch.tensor([adjusted_rand_index(*labelling[:3])], dtype=torch.float64)
+    return torch.tensor([adjusted_rand_index(*labelling[:3])], dtype=torch.float64, device="cpu")
 
 
 @defined("ctgraph_rl/frames-not-learned", "frames of batches that were not learned from", HERE, bounds=not_negative)
@@ -193,4 +193,4 @@ def _delays(labelling: Labelling) -> Tensor:
     alarms = ends[labelling.alarm].tolist()
     spans = pairwise([*changes, math.inf])
     delays = [next((alarm - start for alarm in alarms if start <= alarm < stop), math.nan) for start, stop in spans]
-    return torch.tensor(delays, dtype=torch.float64)
+    return torch.tensor(delays, dtype=torch.float64, device="cpu")

@@ -55,7 +55,7 @@ def smooth(values: Tensor) -> Tensor:
     if window < 3:
         return values
     head, tail = values[1:window].flip(0), values[-window:-1].flip(0)
-    weights = torch.full((window,), 1 / window, dtype=values.dtype)
+    weights = torch.full((window,), 1 / window, dtype=values.dtype, device="cpu")
     means = (torch.cat([head, values, tail]).unfold(0, window, 1) * weights).sum(1)
     return means[math.floor(window / 2 - 1) : len(means) - math.ceil(window / 2)]
 
@@ -73,7 +73,9 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     smoothed = table.replaced(_smoothed(table))
     expert_curves = {task: [smooth(curve) for curve in curves] for task, curves in (experts or {}).items()}
     scales = _ranges(smoothed, expert_curves) if ranges is None else ranges
-    low, high = (torch.tensor([scales[task][i] for task in table.names], dtype=torch.float64) for i in (0, 1))
+    low, high = (
+        torch.tensor([scales[task][i] for task in table.names], dtype=torch.float64, device="cpu") for i in (0, 1)
+    )
     of_task = torch.from_numpy(table.task.repeat(table.length))
     scaled = smoothed.replaced(_scaled(smoothed.values, low[of_task], high[of_task]))
     known = {task: curves for task, curves in expert_curves.items() if task in scales}
@@ -340,7 +342,7 @@ def _efficiency(level: float, time: int, expert_level: float, expert_time: int, 
 
 def _falls(table: RegimeTable, trainings: Sequence[int]) -> bool:
     """Whether the least-squares line through a task's training falls, over the experiences of the whole run."""
-    times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1]) for i in trainings]).double()
+    times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1], device="cpu") for i in trainings]).double()
     values = _joined(table, trainings)
     return bool(((times - times.mean()) * (values - values.mean())).sum() < 0)
 
@@ -375,7 +377,7 @@ def _scaled(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def _scaled_by(limits: tuple[float, float], values: Tensor) -> Tensor:
-    return _scaled(values, *torch.tensor(limits, dtype=torch.float64))
+    return _scaled(values, *torch.tensor(limits, dtype=torch.float64, device="cpu"))
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -383,4 +385,4 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _tensor(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+    return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -181,7 +181,7 @@ def _changes_after_own_block(performance: Tensor, trained: Trained | None) -> Te
 
 def _pairs(matrix: Tensor, chosen: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Entries [block, task] of the rows 1.. for which ``chosen(block, task)`` holds, row by row."""
-    count = torch.arange(matrix.shape[1])
+    count = torch.arange(matrix.shape[1], device="cpu")
     return matrix[1 : len(count) + 1][chosen(count.unsqueeze(1), count)]
 
 
@@ -191,12 +191,14 @@ def _changes_by_others(performance: Tensor, trained: Trained | None, scale: Tens
     alone = _alone(performance, trained)
     if tasks == 1:
         raise Undefined(ONE_TASK)
-    scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else torch.as_tensor(scale)
-    changes = ratio(performance.diff(dim=0), scale.to(performance).expand(performance.shape[0] - 1, tasks))
+    scale = performance.nan_to_num(0).abs().amax(dim=0) if scale is None else scale
+    scale = torch.as_tensor(scale, dtype=performance.dtype, device=performance.device)
+    changes = ratio(performance.diff(dim=0), scale.expand(performance.shape[0] - 1, tasks))
     first_blocks = {task: block for block, task in reversed([*enumerate(alone)])}
-    first = torch.tensor([first_blocks.get(task, len(alone)) for task in range(tasks)]).unsqueeze(1)
-    others = torch.tensor(alone) != torch.arange(tasks).unsqueeze(1)
-    chosen = others & ((torch.arange(len(alone)) < first) == before)
+    block = torch.arange(len(alone), device="cpu")
+    first = block.new_tensor([first_blocks.get(task, len(alone)) for task in range(tasks)]).unsqueeze(1)
+    others = block.new_tensor(alone) != torch.arange(tasks, device="cpu").unsqueeze(1)
+    chosen = others & ((block < first) == before)
     return changes.T[chosen]
 
 

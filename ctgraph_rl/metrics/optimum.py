@@ -105,7 +105,9 @@ def frames_to_first_reward(
         success_rates: for each task, share of each interval's episodes that reached the goal; NaN without episodes.
         random_frames: for each task, `ctgraph_rl.tasks.values.random_frames_to_goal`.
     """
-    return _at_first_success(frames, episodes, success_rates) / torch.tensor(random_frames, dtype=torch.float64)
+    return _at_first_success(frames, episodes, success_rates) / torch.tensor(
+        random_frames, dtype=torch.float64, device="cpu"
+    )
 
 
 @of_first_success(
@@ -129,13 +131,13 @@ def search_efficiency(
     """
     played = [each.cumsum(0) for each in episodes]
     first = _at_first_success(played, episodes, success_rates)
-    return torch.tensor(expected_episodes, dtype=torch.float64) / first
+    return torch.tensor(expected_episodes, dtype=torch.float64, device="cpu") / first
 
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:
     """For each task, the count at the first success, float64 [tasks]; NaN without one."""
     tasks = zip(counts, episodes, success_rates, strict=True)
-    return torch.tensor([_count_at_first_success(*task) for task in tasks], dtype=torch.float64)
+    return torch.tensor([_count_at_first_success(*task) for task in tasks], dtype=torch.float64, device="cpu")
 
 
 def _count_at_first_success(counts: Tensor, episodes: Tensor, success_rates: Tensor) -> float:

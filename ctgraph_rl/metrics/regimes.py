@@ -32,7 +32,7 @@ class Regime:
 
     def __post_init__(self) -> None:
         if self.values.ndim != 1 or len(self.values) == 0 or not self.values.isfinite().all():
-            raise ValueError(f"a regime of {self.task} needs finite values [experiences], got {self.values}")
+            raise ValueError(f"a regime of {self.task} needs finite values [experiences], got {self.values.tolist()}")
 
     @property
     def terminal(self) -> float:
@@ -81,7 +81,11 @@ class RegimeTable(Sequence[Regime]):
             return regimes
         names = {task: i for i, task in enumerate(dict.fromkeys(each.task for each in regimes))}
         columns = zip(*((names[each.task], each.training, len(each.values)) for each in regimes), strict=True)
-        values = torch.cat([each.values for each in regimes]) if regimes else torch.empty(0, dtype=torch.float64)
+        values = (
+            torch.cat([each.values for each in regimes])
+            if regimes
+            else torch.empty(0, dtype=torch.float64, device="cpu")
+        )
         return cls([*names], Column(*(columns if regimes else ((), (), ()))), values)
 
     def replaced(self, values: Tensor) -> RegimeTable:

@@ -20,7 +20,6 @@ from ctgraph_rl.checks import plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.rules import notes
-from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog
@@ -33,7 +32,16 @@ from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.settings import as_before, differences, flat
 from ctgraph_rl.runs.status import holds_results, marked_if_it_fails
 from ctgraph_rl.runs.trackers import FOLDER, Tracker
-from ctgraph_rl.runs.train import START_AGAIN, MakeAgent, RunDirectory, new_agent, remove_results, train, with_method
+from ctgraph_rl.runs.train import (
+    START_AGAIN,
+    MakeAgent,
+    RunDirectory,
+    is_whole,
+    new_agent,
+    remove_results,
+    train,
+    with_method,
+)
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import changed
 
@@ -308,28 +316,12 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     stale, unknown = changed_code(cfg, run_dir, {})
     if stale and cfg.overwrite != config.STALE:
         raise FileExistsError(f"{run_dir} holds a run of other code: {', '.join(stale)} changed; {START_AGAIN}")
-    finished = (run_dir / METRICS).exists() and not stale and _is_whole(run_dir)
+    finished = (run_dir / METRICS).exists() and not stale and is_whole(run_dir)
     if finished:
         print("this configuration was run before; overwrite=true runs it again")
         if unknown:
             print("note: this run does not say of which source it is, so whether that has changed is unknown")
     return finished
-
-
-def _is_whole(run_dir: Path) -> bool:
-    """Return whether the results of a run that says that it is complete are whole; False where it can be resumed.
-
-    Raises:
-        ValueError: if they are damaged and there is no checkpoint.
-    """
-    lost = damaged(run_dir)
-    if not lost:
-        return True
-    said = f"{run_dir} says that it is complete, but {', '.join(lost)} cannot be read or is not what was written"
-    has_checkpoint = bool(Checkpoints(run_dir / CHECKPOINTS).files())
-    require((has_checkpoint, f"{said}: restore it, or run again with overwrite=true"))
-    print(f"{said}: the run is resumed from its last checkpoint")
-    return False
 
 
 def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]]) -> tuple[list[str], bool]:

@@ -16,14 +16,14 @@ from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
 from ctgraph_rl.learn.evaluate import Evaluator, by_slices
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS
-from ctgraph_rl.log.provenance import provenance
+from ctgraph_rl.log.provenance import code_changes, provenance
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sources import full_name
 from ctgraph_rl.runs.checkpoints import SECONDS, Checkpoints
 from ctgraph_rl.runs.settings import differences, flat
 from ctgraph_rl.runs.trackers import FOLDER, Tracker, logger_of
-from ctgraph_rl.runs.train import remove_results, resumed_log, write_curriculum, write_results
+from ctgraph_rl.runs.train import is_whole, remove_results, resumed_log, write_curriculum, write_results
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -69,7 +69,10 @@ class Recorder:
             code are not averaged with those of before. None: it does not say.
         overwrite: replace the run that the directory holds.
         resume: resume the run that the directory holds from its last `checkpoint`; one that was stopped before its
-            first starts again. ``saved`` is what was saved, and ``frames`` after how many frames.
+            first starts again. ``saved`` is what was saved, and ``frames`` after how many frames. A run that is
+            finished is shown: ``finished`` is true, ``frames`` is the curriculum's number of frames, so that nothing is
+            learned again, ``log`` and ``metrics`` hold its results, `evaluate` returns what was measured then, and no
+            file is changed.
         logger: where measurements go as they are made, too: the name of a file in ``conf/logger``, such as
             ``"tensorboard"``, or a function that builds a logger of TorchRL in a folder.
         checkpoint_seconds: time between two checkpoints within a block, >= 0.
@@ -77,8 +80,7 @@ class Recorder:
     Raises:
         ValueError: for values out of range, before anything is written; and where a run of other settings or of code
             that has changed would be resumed.
-        FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it;
-            or if the run to resume is finished.
+        FileExistsError: if the directory holds a run, and neither ``overwrite`` nor ``resume`` says what to do with it.
 
     Example:
         >>> import curricula
@@ -128,6 +130,7 @@ class Recorder:
         self.curriculum, self.run_dir = curriculum, None if run_dir is None else as_path("run_dir", run_dir)
         self.saved: Mapping[str, Any] | None = None
         self.frames = 0
+        self.finished = False
         self._evaluated, self._trained = -1, 0
         self._tracker: Tracker | None = None
         names = None if code is None else [full_name(each) for each in code]
@@ -139,19 +142,22 @@ class Recorder:
             make_logger = logger_of(logger)
             self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
             self.log = self._opened(self.run_dir, overwrite, resume)
-            self._track(make_logger, self.run_dir)
+            if not self.finished:
+                self._track(make_logger, self.run_dir)
         self._evaluator = Evaluator(curriculum, seed, self.log)
 
     def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
         """Return the log of a run that begins, or of one that is resumed."""
         path, begun = run_dir / LOG, RunLog.begun(run_dir / LOG)
         stopped = begun is not None and not (run_dir / METRICS).exists()
-        if not overwrite and not (resume and stopped) and path.exists() and not RunLog.is_blank(path):
+        if not overwrite and not (resume and begun is not None) and path.exists() and not RunLog.is_blank(path):
             what = "a run that was stopped" if stopped else "no run" if begun is None else "a finished run"
-            fix = "choose another run_dir, or overwrite=True to replace it" + ", or resume=True" * stopped
+            fix = "choose another run_dir, or overwrite=True to replace it" + ", or resume=True" * (begun is not None)
             raise FileExistsError(f"{path} exists and is of {what}: {fix}")
         if resume and begun is not None:
             self._check_same(begun)
+            if not stopped and is_whole(run_dir):
+                return self._shown(run_dir)
         self._checkpoints.tidy()
         state = self._checkpoints.newest() if resume else None
         if state is not None:
@@ -182,6 +188,17 @@ class Recorder:
             (before == now, f"{other}: {fix}"),
             (not changed, f"{self.run_dir} holds a run with {', '.join(changed)}: {fix}"),
         )
+
+    def _shown(self, run_dir: Path) -> RunLog:
+        """Return the log of a finished run, which nothing is added to."""
+        log = RunLog.read(run_dir / LOG)
+        changed = ", ".join(code_changes(log.of_kind("run")[0], self._about))
+        fix = "choose another run_dir, or overwrite=True to run it again"
+        require((not changed, f"{run_dir} was made by other code: {changed} changed; {fix}"))
+        self.finished = True
+        self.frames = self._evaluated = self._trained = self.curriculum.num_frames
+        print(f"{run_dir} holds this run, finished: its results are shown; overwrite=True runs it again")
+        return log
 
     def _track(self, make_logger: Callable[[Path], Logger] | None, run_dir: Path) -> None:
         """Let a logger have all measurements."""
@@ -219,7 +236,8 @@ class Recorder:
             reached = {"frames": frames, "evaluated": self._evaluated, "trained": self._trained}
             return {**reached, "learner": dict(state()), "log": self.log.position()}
 
-        self._checkpoints.offer(make, self.curriculum.is_end(frames))
+        if not self.finished:
+            self._checkpoints.offer(make, self.curriculum.is_end(frames))
         self.frames = frames
 
     @property
@@ -247,6 +265,8 @@ class Recorder:
         Raises:
             ValueError: for frames out of order or beyond the curriculum, and what is not a policy.
         """
+        if self.finished:
+            return self._measured(frames)
         last = self.curriculum.num_frames
         require(
             (is_int(frames, 0, last), f"frames must be an integer in 0..{last}, the curriculum's, got {frames!r}"),
@@ -255,11 +275,16 @@ class Recorder:
         require((frames > self._evaluated, f"frames must grow: {frames} comes after {self._evaluated}"))
         acts = self._adapted(policy, policy_for, frames)
         where = "after" if frames in self.curriculum.ends else "during" if frames else "before"
-        before = len(self.log.measurements)
         self._evaluator.evaluate(acts, frames, where)
         self.log.sync()
         self._evaluated = frames
-        return {m["label"]: m["return_mean"] for m in self.log.measurements[before:]}
+        return self._measured(frames)
+
+    def _measured(self, frames: int) -> dict[str, float]:
+        """Return the mean return on each task, by label, after a number of frames."""
+        found = {m["label"]: m["return_mean"] for m in self.log.of_kind("evaluation") if m["frames"] == frames}
+        require((bool(found), f"the run is finished and has no evaluation after {frames!r} frames"))
+        return found
 
     @takes_numbers
     def training(self, frames: int, **values: Any) -> None:
@@ -295,7 +320,7 @@ class Recorder:
     def close(self) -> None:
         """Write tables and metrics, close the log and the logger, and remove the checkpoints."""
         self._end()
-        if self.run_dir is not None:
+        if self.run_dir is not None and not self.finished:
             write_curriculum(self.curriculum, self.run_dir)
             write_results(self.log, self.curriculum, self.run_dir)
             self._checkpoints.clear()
@@ -305,6 +330,12 @@ class Recorder:
         self.log.close()
         if self._tracker is not None:
             self._tracker.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has; two recorders cannot write into one directory."""
+        if self.run_dir is not None and not self.finished:
+            raise TypeError(f"a Recorder that writes into {self.run_dir} has no copies; copy one without a run_dir")
+        return dict(vars(self))
 
     def __enter__(self) -> Recorder:
         return self

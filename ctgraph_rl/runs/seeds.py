@@ -157,7 +157,7 @@ class Member(NamedTuple):
 
 def _generator() -> torch.Generator:
     """Return a generator that continues as torch's global one."""
-    return torch.Generator().set_state(torch.get_rng_state())
+    return torch.Generator(device="cpu").set_state(torch.get_rng_state())
 
 
 def _as_one(job: Job, curriculum: Curriculum, members: Sequence[Member]) -> Failures:

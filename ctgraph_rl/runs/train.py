@@ -26,6 +26,7 @@ from ctgraph_rl.learn.loop import Group
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.learn.rules import check_ids, check_rows
 from ctgraph_rl.learn.stacked import learn_together
+from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
 from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
@@ -381,3 +382,19 @@ def resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: b
     log = RunLog.resume(path, saved["log"])
     append_line(run_dir / RESTARTS, {"frames": saved["frames"], "versions": about["versions"], **machine()})
     return log
+
+
+def is_whole(run_dir: Path) -> bool:
+    """Return whether the results of a run that says that it is complete are whole; False where it can be resumed.
+
+    Raises:
+        ValueError: if they are damaged and there is no checkpoint.
+    """
+    lost = damaged(run_dir)
+    if not lost:
+        return True
+    said = f"{run_dir} says that it is complete, but {', '.join(lost)} cannot be read or is not what was written"
+    has_checkpoint = bool(Checkpoints(run_dir / CHECKPOINTS).files())
+    require((has_checkpoint, f"{said}: restore it, or run again with overwrite=true"))
+    print(f"{said}: the run is resumed from its last checkpoint")
+    return False

@@ -142,7 +142,7 @@ def _tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
 
 def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
     """Return a symmetric measure of all pairs; float64 [n, n]."""
-    matrix = torch.zeros(len(items), len(items), dtype=torch.float64)
+    matrix = torch.zeros(len(items), len(items), dtype=torch.float64, device="cpu")
     for i, one in enumerate(items):
         for j, other in enumerate(items[: i + 1]):
             matrix[i, j] = matrix[j, i] = share(one, other)

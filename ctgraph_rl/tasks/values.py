@@ -246,7 +246,7 @@ class _EveryNode:
     def end_rewards(self) -> Tensor:
         """float64 [b^d]."""
         task = self.task
-        leaf = torch.arange(task.graph.num_end_states)
+        leaf = torch.arange(task.graph.num_end_states, device="cpu")
         of_task = (task.goal_leaf, task.graph.branching_factor, task.graph.depth)
         goal, b, depth = (torch.full_like(leaf, value) for value in of_task)
         arrival = Arrival(leaf, goal, b, depth, task.graph.depth)
@@ -273,7 +273,7 @@ class _GoalPath:
 
     def end_rewards(self) -> Tensor:
         """float64 [2]."""
-        return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64)
+        return torch.tensor([self.task.goal_reward, 0.0], dtype=torch.float64, device="cpu")
 
     def children(self, values: Tensor, level: int) -> Tensor:
         """Values of level + 1 by parent and decision: float64 [2, b]."""
@@ -347,7 +347,9 @@ class _Memoryless:
         b, (first, last) = self.task.graph.branching_factor, self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
             return self.policy[first : last + 1].mean(0, keepdim=True)
-        number = self.task.observations.first_of_level(self.task.graph, kind, level) + torch.arange(b**level)
+        number = self.task.observations.first_of_level(self.task.graph, kind, level) + torch.arange(
+            b**level, device="cpu"
+        )
         return self.policy[first + number % (last - first + 1)]
 
 

@@ -97,7 +97,9 @@ class EnvironmentContract(_OfTasks):
         """They start again where an episode begins, and ``next`` shows those of its end."""
         first, _ = self.make_tasks()
         env = self.make_env([first] * 4)
-        count, total, ended = torch.zeros(4, 1, dtype=torch.int64), torch.zeros(4, 1), 0
+        count = torch.zeros(4, 1, dtype=torch.int64, device="cpu")
+        total = torch.zeros(4, 1, dtype=torch.float32, device="cpu")
+        ended = 0
 
         for step, following in self.steps(env):
             after, done = step["next"], step["next", "done"]
@@ -124,7 +126,7 @@ class EnvironmentContract(_OfTasks):
         """``set_tasks(tasks, at_episode_end=True)``, by the ids that rows show."""
         first, other = self.make_tasks()
         env = self.make_env([first] * 3, task_id="one_hot")
-        changed = torch.zeros(3, 1, dtype=torch.bool)
+        changed = torch.zeros(3, 1, dtype=torch.bool, device="cpu")
         env.reset()
         env.set_tasks([first] * 3)
         data = env.reset()

@@ -82,7 +82,7 @@ def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:
 
 def _stored(task: Task, ids: list[int]) -> Tensor:
     """The first image of each id as it is stored."""
-    return task.images.bank(0)[torch.tensor(ids) * task.images.num_variants]
+    return task.images.bank(0)[[place * task.images.num_variants for place in ids]]
 
 
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
@@ -91,8 +91,8 @@ def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int
     env = CTGraphEnv([one for one in pinned for _ in range(count)], seed)
     env.reset()
     state = env.get_state()
-    kinds = torch.tensor([kind for kind, _ in shown]).repeat_interleave(count)
-    state["state_type"] = kinds.to(state["state_type"].dtype)
+    kinds = state["state_type"].new_tensor([kind for kind, _ in shown]).repeat_interleave(count)
+    state["state_type"] = kinds
     state["node"] = torch.where(kinds == StateType.END, task.graph.num_decision_states, 0)
     env.rows.state = type(env.rows.state)(**state)
     return env.rows.show().observation.unflatten(0, (len(shown), count))

@@ -51,7 +51,7 @@ class Player:
     def step(self, action: int | None = None) -> bool:
         """Take a step with an action, or with the policy's; True where the episode is over."""
         if action is not None:
-            acted = self.data.set("action", torch.tensor([action]))
+            acted = self.data.set("action", torch.tensor([action], dtype=torch.int64, device="cpu"))
         else:
             assert self.policy is not None
             with set_exploration_type(self.exploration):

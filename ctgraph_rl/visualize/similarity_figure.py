@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ctgraph_rl.log.escape import figure_text
@@ -54,7 +54,7 @@ def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -
     axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
     axes.set_yticks(range(len(labels)), labels, fontsize=size)
     if len(labels) <= MOST_NUMBERS:
-        for i, j in torch.cartesian_prod(*2 * [torch.arange(len(labels))]).tolist():
+        for i, j in product(range(len(labels)), repeat=2):
             _write_number(axes, i, j, matrix[i, j].item())
     return image
 

@@ -21,10 +21,14 @@ from baselines.methods.importance import Importance
 from baselines.methods.method import AgentWithMethod, Method
 from baselines.policy_gradient import PolicyGradient
 from baselines.q_learning import QLearner
-from ctgraph_rl import Block, CTGraph, CTGraphEnv, OneHot, Task
+from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, OneHot, Protocol, Task
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import conf_dir
-from ctgraph_rl.runs import config
+from ctgraph_rl.runs import config, train
+from ctgraph_rl.runs.config import target
+from ctgraph_rl.runs.job import method_of
+from ctgraph_rl.runs.train import new_agent
+from helpers.paths import CHECKOUT
 from helpers.scripted import OBSERVATIONS, ONE, THREE, TWO, of
 
 YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
@@ -192,3 +196,50 @@ CURRICULUM = of(*(Block(task, 64) for task in TASKS), task_id="at_boundaries")
 def tiny(method: Importance, kind: type[Tiny] = Tiny) -> AgentWithMethod:
     torch.manual_seed(0)
     return AgentWithMethod(kind(), method, CURRICULUM)
+
+
+TWO_TASKS = of(Block(ONE, 32), Block(TWO, 64), evaluation=Evaluation(2, greedy=False, before=False), task_id="one_hot")
+HIDDEN = replace(TWO_TASKS, protocol=Protocol(boundaries="hidden"))
+
+SETTINGS = {
+    "clear": ["method.buffer_size=48"],
+    "mask_sc": ["method.num_samples=4", "method.every=1", "method.threshold=-1"],
+    **{name: ["method.num_samples=4"] for name in ("ewc", "ewc_published", "mas", "mask_amsc")},
+    "swoks": [
+        "detector.window=8",
+        "detector.num_windows=4",
+        "detector.num_tested=2",
+        "detector.num_kept=8",
+        "detector.num_left_out=2",
+    ],
+    "adwin": ["detector.clock=1", "detector.grace_period=1", "detector.min_window_length=1"],
+}
+
+
+def names_in(group: str) -> list[str]:
+    return sorted(path.stem for path in (CHECKOUT / "conf" / group).glob("*.yaml"))
+
+
+CHOICES = [
+    *((agent, {}) for agent in AGENTS),
+    *(("lstm_ppo", {"cell": cell}) for cell in names_in("cell")),
+    *(("drqn", {"cell": cell}) for cell in names_in("cell") if cell != "backpropamine"),  # whose state is not stored
+    *(("ppo", {"method": method}) for method in names_in("method")),
+    *(("ppo", {"method": "mask_ri", "detector": detector}) for detector in names_in("detector")),
+]
+"""Agents, and the choices of other groups of the configuration."""
+
+
+def learner_of(compose, agent: str, choices: dict[str, str]) -> tuple[Any, Curriculum]:
+    """A learner, and the curriculum that it can learn."""
+    names = [f"{group}={name}" for group, name in choices.items()]
+    more = [setting for name in choices.values() for setting in SETTINGS.get(name, [])]
+    cfg = compose(f"agent={agent}", *names, *TINY, *less(agent), *more)
+    make_method = method_of(cfg)
+    curriculum = make_method().prepare(HIDDEN if "detector" in choices else TWO_TASKS)
+    return new_agent(curriculum, train.with_method(target(cfg, "agent"), make_method, curriculum), 0), curriculum
+
+
+def name_of(choice: Any) -> str | None:
+    """A test's name for one of these."""
+    return " ".join([choice[0], *choice[1].values()]) if isinstance(choice, tuple) else None

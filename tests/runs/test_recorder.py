@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers.oracles import surjective
 from helpers.scripted import DECISION_ID, ONE, TWO, Scripted, curriculum, decide
-from stable_baselines3 import PPO
 
-import curricula
-from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, RunLog, learn_curriculum
-from ctgraph_rl.policies import NavigationPolicy
+from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.runs.recorder import Recorder
 from ctgraph_rl.runs.trackers import csv_logger
 from ctgraph_rl.runs.train import RESULTS
-from ctgraph_rl.sb3 import SB3VecEnv
 
 TASKS = curriculum(Block(ONE, 12), Block(TWO, 24))
 
@@ -64,40 +61,6 @@ def test_it_writes_the_files_of_a_run(tmp_path):
     assert metrics["forward_transfer"]["value"] == 1.0  # after block 1 the table has the second task's decision
 
 
-def test_a_policy_with_memory_is_given_its_state_and_the_starts_of_episodes():
-    starts = []
-
-    def remember(observation, state, start):
-        steps = np.where(start, 0, 0 if state is None else state + 1)
-        starts.append(start.copy())
-        return np.where(steps == 2, 1, 0), steps  # home, wait, decision
-
-    found = Recorder(TASKS).evaluate(remember, 0)
-
-    assert found == {"goal1": 1.0, "goal2": 0.0}
-    assert starts[0].all() and not any(start.any() for start in starts[1:])
-
-
-def test_task_ids_are_shown_with_the_observations():
-    told = Curriculum("told", 1, "here", TASKS.blocks, Evaluation(5), Protocol("one_hot", num_task_ids=4))
-
-    def by_task(observation):
-        assert observation["task_id"].shape == (10, 4)
-        decision = 1 + observation["task_id"].argmax(1)
-        return observation["observation"][:, DECISION_ID].astype(np.int64) * decision
-
-    assert Recorder(told).evaluate(by_task, 0) == {"goal1": 1.0, "goal2": 1.0}
-
-
-def test_a_policy_for_each_task_id_plays_its_own_task():
-    given = Curriculum("given", 1, "here", TASKS.blocks, Evaluation(5), Protocol("at_boundaries", task_ids=(2, 1)))
-
-    found = Recorder(given).evaluate(policy_for=table)  # decision 2 for the first task, 1 for the second
-
-    assert found == {"goal1": 0.0, "goal2": 0.0}
-    assert Recorder(given).evaluate(policy_for=lambda number: table(3 - number)) == {"goal1": 1.0, "goal2": 1.0}
-
-
 def test_evaluation_leaves_random_numbers_of_torch_as_they_were():
     recorder = Recorder(TASKS)
     torch.manual_seed(0)
@@ -129,26 +92,6 @@ def test_a_missing_evaluation_makes_what_needs_it_undefined():
     assert recorder.metrics["average_performance"].value == 0.5
     assert recorder.metrics["backward_transfer"].value is None
     assert recorder.metrics["backward_transfer"].undefined
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"policy": table(1), "frames": 37}, "frames must be an integer in 0..36, the curriculum's, got 37"),
-        ({"policy": table(1), "frames": 1.5}, "frames must be an integer"),
-        ({"policy": None}, "give either policy or policy_for"),
-        ({"policy": 3}, "policy must be a function, or an object with predict, got int"),
-        ({"policy": lambda a, b: a}, "not 2 arguments"),
-        ({"policy": lambda observation: observation[:, 0] * 0.5}, "must return 10 integer actions.*float64"),
-        ({"policy": lambda observation: 0}, "must return 10 integer actions"),
-        ({"policy": lambda observation: np.full(10, 7)}, "values in 0..2, got"),
-    ],
-)
-def test_what_is_no_policy_or_out_of_range_is_refused(arguments, message):
-    recorder = Recorder(TASKS)
-
-    with pytest.raises(ValueError, match=message):
-        recorder.evaluate(**arguments)
 
 
 def test_frames_must_grow_and_a_log_is_not_overwritten(tmp_path):
@@ -231,13 +174,50 @@ def test_a_directory_with_a_run_is_resumed_or_replaced_only_as_it_is_said(tmp_pa
     assert (tmp_path / "run.jsonl").read_bytes() == before
 
 
-def test_overwrite_replaces_a_finished_run_that_resume_does_not(tmp_path):
+def test_overwrite_replaces_a_finished_run(tmp_path):
     for _ in range(2):
         with Recorder(TASKS, tmp_path, overwrite=True) as recorder:
             assert [recorder.saved, *(path.name for path in tmp_path.iterdir())] == [None, "run.jsonl"]
             Learner().learn(recorder)
 
-    with pytest.raises(FileExistsError, match="is of a finished run: choose another run_dir, or overwrite=True"):
+    with pytest.raises(FileExistsError, match=r"is of a finished run: .*, or overwrite=True .*, or resume=True"):
+        Recorder(TASKS, tmp_path)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_a_finished_run_that_is_resumed_shows_its_results_and_changes_no_file(tmp_path, capsys):
+    with Recorder(TASKS, tmp_path) as recorder:
+        Learner().learn(recorder)
+    learned, before = recorder, contents(tmp_path)
+
+    with Recorder(TASKS, tmp_path, resume=True, logger="csv") as recorder:
+        learner = Learner()
+        learner.learn(recorder)
+        shown = recorder.evaluate(None, 36)
+        recorder.checkpoint(learner.state_dict, 36)
+
+    assert (recorder.finished, recorder.frames, learner.batches) == (True, 36, 0)
+    assert shown == {m["label"]: m["return_mean"] for m in learned.log.of_kind("evaluation") if m["frames"] == 36}
+    assert recorder.metrics == learned.metrics
+    assert contents(tmp_path) == before
+    assert not any(path.is_dir() for path in tmp_path.iterdir())
+    assert capsys.readouterr().out.endswith("finished: its results are shown; overwrite=True runs it again\n")
+
+
+def test_a_finished_run_is_shown_only_if_it_is_whole_and_was_never_another(tmp_path):
+    with Recorder(TASKS, tmp_path) as recorder:
+        Learner().learn(recorder)
+
+    shown = Recorder(TASKS, tmp_path, resume=True)
+    with pytest.raises(ValueError, match="is finished and has no evaluation after 4 frames"):
+        shown.evaluate(table(0), 4)
+    with pytest.raises(ValueError, match="holds a run with seed=0 instead of 1"):
+        Recorder(TASKS, tmp_path, seed=1, resume=True)
+    (tmp_path / "performance.csv").write_text("0\n")
+    with pytest.raises(ValueError, match=r"says that it is complete, but performance.csv cannot be read"):
         Recorder(TASKS, tmp_path, resume=True)
 
 
@@ -269,6 +249,17 @@ def test_a_logger_has_measurements_as_they_are_made_and_all_of_a_resumed_run(tmp
 
     assert first.splitlines() == ["4,1.0", "8,7.0"]
     assert [line.partition(",")[0] for line in values.read_text().splitlines()] == [str(4 * i) for i in range(1, 10)]
+
+
+def test_a_recorder_is_copied_only_where_it_writes_no_files(tmp_path):
+    alone = Recorder(TASKS)
+    copied = deepcopy(alone)
+
+    copied.evaluate(table(1), 0)
+
+    assert (len(alone.log.of_kind("evaluation")), len(copied.log.of_kind("evaluation"))) == (0, 2)
+    with pytest.raises(TypeError, match=r"a Recorder that writes into .* has no copies"):
+        deepcopy(Recorder(TASKS, tmp_path))
 
 
 def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path):
@@ -320,17 +311,6 @@ def test_a_recorder_that_is_closed_early_writes_its_files(tmp_path, learned):
     assert written["regret"]["value"] == (1.0 if learned else None)
 
 
-def test_a_policy_for_each_task_id_needs_a_protocol_that_gives_it_and_tasks_that_have_one():
-    held_out = Curriculum("held", 1, "here", (Block(ONE, 12),), Evaluation(held_out=(TWO,)), Protocol("at_boundaries"))
-
-    for told, message in (
-        (TASKS, "task ids, which are hidden in this protocol"),
-        (held_out, "held-out tasks, which have no task id"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Recorder(told).evaluate(policy_for=table)
-
-
 def test_changing_goals_that_are_only_held_out_need_rows_of_several_episodes():
     changing = replace(TWO, goal_change=(1, 2))
 
@@ -338,62 +318,8 @@ def test_changing_goals_that_are_only_held_out_need_rows_of_several_episodes():
         Recorder(replace(TASKS, evaluation=Evaluation(held_out=(changing,))))
 
 
-def test_arguments_with_a_default_are_left_to_the_policy():
-    def act(observation, decision=2, scale=1):
-        return table(decision * scale)(observation)
-
-    assert Recorder(TASKS).evaluate(act, 0) == {"goal1": 0.0, "goal2": 1.0}
-
-
-@pytest.mark.parametrize("greedy", [True, False])
-def test_a_model_is_greedy_where_the_protocol_says_so(greedy):
-    asked = []
-
-    class Model:
-        def predict(self, observation, state, episode_start, deterministic):
-            asked.append(deterministic)
-            return table(1)(observation), state
-
-    Recorder(replace(TASKS, evaluation=Evaluation(5, greedy=greedy))).evaluate(Model(), 0)
-
-    assert set(asked) == {greedy}
-
-
 def test_an_error_in_the_users_loop_leaves_an_unfinished_run(tmp_path):
     with pytest.raises(RuntimeError), Recorder(TASKS, tmp_path):
         raise RuntimeError("the user's own")
 
     assert [path.name for path in tmp_path.iterdir()] == ["run.jsonl"]
-
-
-def test_a_reference_policy_is_given_as_its_class():
-    one = Curriculum("one", 1, "here", (Block(surjective(), 8),), Evaluation(50))
-
-    found = Recorder(one).evaluate(NavigationPolicy, 0)
-
-    assert 0.0 < next(iter(found.values())) < 1.0
-
-
-def test_a_model_without_a_place_for_task_ids_is_refused_with_the_fix():
-    told = Curriculum("told", 1, "here", TASKS.blocks, Evaluation(5), Protocol("one_hot"))
-    model = PPO("MlpPolicy", SB3VecEnv(2, ONE), n_steps=8, batch_size=16)
-
-    with pytest.raises(ValueError, match=r"shows a task_id that PPO has no place for: .*protocol=Protocol\(\)"):
-        Recorder(told).evaluate(model, 0)
-
-
-def test_stable_baselines3_is_measured_by_the_protocol(tmp_path):
-    published = curricula.su_b1_4tasks(num_frames=512)
-    envs = SB3VecEnv(32, published.tasks[0], task_pool=published.tasks)
-    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=64, n_epochs=1, seed=0)
-
-    with Recorder(published, tmp_path / "sb3", about={"learner": "PPO of Stable-Baselines3"}) as recorder:
-        recorder.evaluate(model, 0)
-        for block, frames in zip(published.blocks, published.ends, strict=True):
-            envs.env_method("set_tasks", block.rows(32))
-            model.learn(block.num_frames)
-            recorder.evaluate(model, frames)
-
-    assert recorder.log.performance().shape == (5, 4)
-    assert recorder.metrics["average_performance"].value == 0.0  # without memory, a little training: at most luck
-    assert (tmp_path / "sb3" / "performance.csv").read_text().count("\n") == 6

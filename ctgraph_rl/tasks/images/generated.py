@@ -149,8 +149,8 @@ class GroupedImages(SquareImages):
 @lru_cache(maxsize=16)
 def _paper_images(image_set: PaperImages) -> Tensor:
     """The first different images of the seed's sequence of candidates."""
-    candidates, images = image_set.num_images, torch.empty(0)
-    while len(images) < image_set.num_images:
+    candidates, images = image_set.num_images, None
+    while images is None or len(images) < image_set.num_images:
         needed = candidates * (_BYTES_OF_A_PIXEL * image_set.size**2 + _BYTES_OF_A_BLUEPRINT)
         require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
         rendered = _render(_blueprints(image_set.seed, candidates), image_set.size)
@@ -161,14 +161,15 @@ def _paper_images(image_set: PaperImages) -> Tensor:
 
 def _blueprints(seed: int, count: int) -> Tensor:
     """int64 [count, 17]: 16 cells of a blueprint in {0, 1, 2} and one of three angles, by counter."""
-    words = draw(torch.tensor(seed), torch.tensor(0), torch.arange(count), STREAM_IMAGES)
-    powers = 3 ** torch.arange(BLUEPRINT_SIZE**2 + 1)
+    tick = torch.arange(count, device="cpu")
+    words = draw(tick.new_tensor(seed), tick.new_tensor(0), tick, STREAM_IMAGES)
+    powers = 3 ** torch.arange(BLUEPRINT_SIZE**2 + 1, device="cpu")
     return ((words[0] << 31) | (words[1] >> 1)).unsqueeze(-1) // powers % 3
 
 
 def _render(blueprints: Tensor, size: int) -> Tensor:
     """Blueprints as uint8 [count, size, size] images."""
-    levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8)[blueprints[:, :-1]]
+    levels = torch.tensor(BLUEPRINT_LEVELS, dtype=torch.uint8, device="cpu")[blueprints[:, :-1]]
     images = resize(levels.view(-1, BLUEPRINT_SIZE, BLUEPRINT_SIZE), size)
     for which, angle in enumerate(BLUEPRINT_ANGLES):
         chosen = blueprints[:, -1] == which
@@ -181,7 +182,7 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
 def _grouped_images(image_set: GroupedImages) -> Tensor:
     """Each group's first candidates that repeat none of any group, where candidate k of all groups precedes k + 1."""
     groups, cells = image_set.groups, image_set.cells
-    candidates, chosen = max(groups), [torch.empty(0)]
+    candidates, chosen = max(groups), [torch.empty(0, dtype=torch.int64, device="cpu")]
     while any(len(positions) < size for positions, size in zip(chosen, groups, strict=False)):
         needed = candidates * len(groups) * cells**2 * _BYTES_OF_A_CELL
         require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
@@ -199,18 +200,18 @@ def _candidates(image_set: GroupedImages, count: int) -> Tensor:
     kept_by_image = 1 - image_set.within / UNRELATED  # (1 - s_i)^2
     kept_by_both = 1 - image_set.between / UNRELATED
     group_share = 1 - math.sqrt(kept_by_both / kept_by_image) if kept_by_image else 0.0
-    group = torch.arange(1, len(image_set.groups) + 1)
-    zero = torch.tensor(0)
+    group = torch.arange(1, len(image_set.groups) + 1, device="cpu")
+    zero = group.new_tensor(0)
     common = _redraw(zero.expand(cells**2), 1.0, _words(seed, zero, zero, cells))
     blueprints = _redraw(common, group_share, _words(seed, group, zero, cells))
-    words = _words(seed, group, torch.arange(1, count + 1).unsqueeze(-1), cells)
+    words = _words(seed, group, torch.arange(1, count + 1, device="cpu").unsqueeze(-1), cells)
     return _redraw(blueprints, 1 - math.sqrt(kept_by_image), words)
 
 
 def _words(seed: int, row: Tensor, tick: Tensor, cells: int) -> Tensor:
     """At least 2 c * c + 1 random words per element, in a last dimension."""
-    blocks = _GROUPED_BLOCK + torch.arange((2 * cells**2 + 1 + 3) // 4)
-    words = draw(torch.tensor(seed), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_IMAGES, blocks)
+    blocks = _GROUPED_BLOCK + torch.arange((2 * cells**2 + 1 + 3) // 4, device="cpu")
+    words = draw(row.new_tensor(seed), row.unsqueeze(-1), tick.unsqueeze(-1), STREAM_IMAGES, blocks)
     return torch.stack(words, -1).flatten(-2)
 
 

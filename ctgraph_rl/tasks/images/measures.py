@@ -36,7 +36,7 @@ def distances(images: Tensor, groups: Sequence[int]) -> Distances:
         (len(groups) == len(images), f"groups must have one entry for each of {len(images)} images, got {len(groups)}"),
         (numbers == list(range(len(numbers))), f"groups must be numbered from 0 without a gap, got {numbers}"),
     )
-    group_of = torch.tensor(groups, device=images.device)
+    group_of = torch.tensor(groups, device=images.device, dtype=torch.int64)
     up_to = torch.stack([_counts_up_to_level(images[group_of == group]) for group in numbers]).to(torch.float64)
     sizes = torch.bincount(group_of).to(torch.float64)
     mixed = up_to.sum(1).unsqueeze(1) * sizes
@@ -65,6 +65,8 @@ def count_repeats(images: Tensor) -> int:
 def first_of_each(images: Tensor) -> Tensor:
     """Return the positions of the images that do not repeat an earlier one, in order."""
     _, group = torch.unique(images.flatten(1), dim=0, return_inverse=True)
-    positions = torch.arange(len(images))
-    first = torch.full((int(group.max()) + 1,), len(images)).scatter_reduce(0, group, positions, reduce="amin")
+    positions = torch.arange(len(images), device="cpu")
+    first = torch.full_like(group[: int(group.max()) + 1], len(images)).scatter_reduce(
+        0, group, positions, reduce="amin"
+    )
     return first.sort().values

@@ -34,4 +34,4 @@ class OneHot:
 
     def bank(self, read_rotation: int) -> Tensor:
         """The identity, uint8 [K, K]; a vector has no rotation."""
-        return torch.eye(self.num_images, dtype=torch.uint8)
+        return torch.eye(self.num_images, dtype=torch.uint8, device="cpu")

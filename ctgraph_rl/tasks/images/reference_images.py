@@ -107,7 +107,7 @@ class ReferenceOneHot:
 
     def bank(self, read_rotation: int) -> Tensor:
         """uint8 [K, K + 1]: 254 times the identity, and a column of zeros; a vector has no rotation."""
-        return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8)
+        return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8, device="cpu")
 
 
 def _num_images_rule(value: object) -> tuple[bool, str]:
