@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -87,6 +88,17 @@ def command(module: str) -> Callable[[], None]:
         check_packages()
     with first_imports():
         return import_module(module).main
+
+
+@contextmanager
+def importing_from_here() -> Iterator[None]:
+    """Find modules in the working directory, too, where a user's own function may be, as a run does."""
+    before = list(sys.path)
+    sys.path.append(os.getcwd())
+    try:
+        yield
+    finally:
+        sys.path[:] = before
 
 
 def curriculum_named(name: str) -> Curriculum:

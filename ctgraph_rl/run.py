@@ -20,7 +20,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.files import members_of
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
@@ -29,28 +31,41 @@ from ctgraph_rl.runs.settings import in_digits
 from ctgraph_rl.runs.sweep import sweepable
 
 
-def run(cfg: DictConfig, run_dir: Path) -> None:
+def run(cfg: DictConfig, run_dir: Path) -> float | None:
     """Learn the configured curriculum with the configured agent and write the results to a directory.
 
     Args:
         cfg: the composed configuration.
         run_dir: an existing directory.
 
+    Returns:
+        The metric that ``objective`` names, the mean of several learners or seeds; None if it names none.
+
     Raises:
-        ValueError: before any work, for a value out of range.
+        ValueError: before any work, for a value out of range; after it, if the objective has no value.
         FileExistsError: if the directory holds results that ``overwrite`` does not allow to replace.
     """
     check_packages()
     with first_imports():
         from ctgraph_rl.collective.job import run_cells  # here: --help and a wrong setting need no torch
+        from ctgraph_rl.report.objective import check_objective, objective_of  # here: as above
         from ctgraph_rl.report.style import require_packages  # here: as above
 
+    check_objective(cfg.objective, cfg.experts)
     if cfg.report:
         require_packages()
     run_dirs = run_cells(cfg, run_dir)
     if cfg.report or not in_sweep():
         for each in run_dirs:
             show(each, cfg.report)
+    if cfg.objective is None or _sweeper() == "cells":
+        return None
+    return objective_of(cfg.objective, run_dirs or members_of(run_dir))
+
+
+def _sweeper() -> str | None:
+    """Return the name of the sweeper that runs this; None outside of a sweep."""
+    return HydraConfig.get().runtime.choices["hydra/sweeper"] if in_sweep() else None
 
 
 def show(run_dir: Path, report: bool) -> None:
@@ -66,8 +81,15 @@ def show(run_dir: Path, report: bool) -> None:
     print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
 
 
-ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError)
+class CellError(RuntimeError):
+    """What stopped a cell of a sweep, in words: not every exception can travel between processes."""
+
+
+ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError, CellError)
 """Errors that a user can cause, each answered with one message."""
+
+SEARCHERS = ("ax", "nevergrad", "optuna")
+"""Sweepers of Hydra that search for what makes the value of a run best."""
 
 
 class Stop(BaseException):
@@ -84,20 +106,23 @@ class Stop(BaseException):
 
 
 @of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")
-def _job(cfg: DictConfig) -> None:
+def _job(cfg: DictConfig) -> float | None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().job.chdir:
         os.chdir(HydraConfig.get().runtime.cwd)  # relative paths are of the directory that the command was given in
     try:
         check_one_cell()
+        sweeper = _sweeper()
+        name_one = f"hydra/sweeper={sweeper} searches by a metric: name it, such as objective=average_performance"
+        require((cfg.objective is not None or sweeper not in SEARCHERS, name_one))
         if cfg.portable is True and not in_sweep():
             become_portable()
         with redirect_stdout(io.StringIO()) if in_sweep() else quiet_where_nobody_reads():
-            run(cfg, run_dir)
+            return run(cfg, run_dir)
     except BaseException as error:
         remove_empty(run_dir)
-        if in_sweep() and isinstance(error, Exception):  # not every exception can travel between processes
-            raise RuntimeError(f"{type(error).__name__}: {explain(error, cfg)}") from None
+        if in_sweep() and isinstance(error, Exception):
+            raise CellError(f"{type(error).__name__}: {explain(error, cfg)}") from None
         if isinstance(error, ERRORS):
             raise Stop(error, explain(error, cfg)) from error
         raise

@@ -41,6 +41,11 @@ def member_folder(folder: Path, number: int) -> Path:
     return folder / f"member_{number:03d}"
 
 
+def members_of(folder: Path) -> list[Path]:
+    """Return the run directories of a collective's members."""
+    return sorted(folder.glob("member_*"))
+
+
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
     """Work in a directory alone; the lock ends with the process, however that ends.

@@ -29,7 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
-from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named
+from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
 from ctgraph_rl.portable import check_portable
 from ctgraph_rl.runs.settings import as_typed, check_arguments, curriculum_names, digest, flat, names_in
 
@@ -72,8 +72,8 @@ SEEDS_APART = 1000
 """Between the seeds of two members of a collective, so that a collective of another seed has other ones."""
 
 NOT_HASHED = (
-    *("overwrite", "experts_dir", "resume", "checkpoint_seconds", "logger", "report"),
-    *("together", "seeds", "track"),
+    *("overwrite", "experts_dir", "resume", "checkpoint_seconds"),
+    *("logger", "objective", "report", "together", "seeds", "track"),
 )
 """Keys of the configuration that do not change results."""
 
@@ -272,7 +272,7 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
             raise ValueError(f"{error}{there}") from None
     check_packages()
     try:
-        with _importing_from_here():
+        with importing_from_here():
             cfg = composed([f"curriculum={name}"], config_dir)
             made = target(cfg, "curriculum")()
     except (HydraException, OmegaConfBaseException) as error:
@@ -280,17 +280,6 @@ def curriculum_of(name: str, config_dir: Path | None = None) -> Curriculum:
     kind = type(made).__name__
     require((isinstance(made, Curriculum), f"{cfg.curriculum._target_} must make a Curriculum, it made a {kind}"))
     return made
-
-
-@contextmanager
-def _importing_from_here() -> Iterator[None]:
-    """Find modules in the working directory, too, where a user's own function may be, as a run does."""
-    before = list(sys.path)
-    sys.path.append(os.getcwd())
-    try:
-        yield
-    finally:
-        sys.path[:] = before
 
 
 def composed(settings: Sequence[str], config_dir: Path | None = None) -> DictConfig:

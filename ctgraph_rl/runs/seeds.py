@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.stacked import why_not_together
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, locked
@@ -49,8 +49,12 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
     if "seeds" not in cfg:
         run_job(cfg, run_dir)
         return [run_dir]
+    seeds = cfg.seeds
+    are_seeds = isinstance(seeds, Sequence) and all(map(is_int, seeds)) and len({*seeds}) == len(seeds) > 0
+    rule = f"seeds must be a list of different seeds that begins with seed={cfg.seed}, got {seeds}"
+    require((are_seeds and seeds[0] == cfg.seed, rule))
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    runs = [config.of_seed(cfg, seed, run_dir) for seed in cfg.seeds]
+    runs = [config.of_seed(cfg, seed, run_dir) for seed in seeds]
     for each, folder in runs:
         config.check_values(each)
         folder.mkdir(parents=True, exist_ok=True)

@@ -71,6 +71,20 @@ def test_a_setting_of_a_group_can_be_swept(learned, monkeypatch):
     assert (code, [config["agent"]["num_envs"] for config in configs(learned)]) == (0, [1, 2])
 
 
+def test_a_sweep_of_cells_needs_no_value_of_its_objective(learned, monkeypatch):
+    code = sweep(monkeypatch, "seed=0", "objective=average_performance")  # which these cells lack
+
+    assert (code, len(learned)) == (0, 1)
+
+
+@pytest.mark.parametrize("seeds", ["[1,0]", "[0,0]", "[0,a]", "[]", "3"])
+def test_a_list_of_seeds_begins_with_that_of_the_job(seeds, learned, monkeypatch, capsys):
+    code = sweep(monkeypatch, "hydra/sweeper=basic", "seed=0", f"+seeds={seeds}")
+
+    assert (code, learned) == (1, [])
+    assert "seeds must be a list of different seeds that begins with seed=0, got " in capsys.readouterr().err
+
+
 def test_a_pattern_chooses_files_of_a_group(learned, monkeypatch):
     chosen = ("agent=glob(dq*)", "method=glob([ew*,l*],exclude=*_published)", "curriculum=glob(fo_b1_4t*)")
 

@@ -35,7 +35,7 @@ PAGES = {
 ELSEWHERE = {
     "README.md": "test_readme",
     "docs/how-to/migrate.md": "test_docs",
-    "docs/how-to/sweeps.md": "test_sweeps",
+    "docs/how-to/search.md": "test_search_page",
     "docs/how-to/torchrl.md": "test_docs",
     "docs/reference/curricula.md": "test_cli",
     "docs/reference/methods.md": "test_methods_docs",

@@ -1,0 +1,41 @@
+"""The metric that a run gives to a sweeper that searches for hyperparameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ctgraph_rl.checks import did_you_mean, require
+from ctgraph_rl.log.damage import metrics_of
+from ctgraph_rl.log.files import METRICS
+from ctgraph_rl.metrics import METRICS as DEFINED
+
+
+def check_objective(name: str | None, experts: bool) -> None:
+    """Refuse an objective that a run cannot have.
+
+    Args:
+        name: of a metric; None: there is no objective.
+        experts: does the run have experts?
+
+    Raises:
+        ValueError: for an unknown name, with the one that was probably meant or all, and for one that needs experts.
+    """
+    if name is None:
+        return
+    require((name in DEFINED, f"objective must be a metric, got {name!r}: {did_you_mean(str(name), list(DEFINED))}"))
+    needs_experts = any("expert" in each for each in DEFINED[name].required)
+    require((experts or not needs_experts, f"objective={name} compares with single-task experts: add experts=true"))
+
+
+def objective_of(name: str, run_dirs: Sequence[Path]) -> float:
+    """Return the mean of a metric over finished runs.
+
+    Raises:
+        ValueError: if a run has no value; says why.
+    """
+    found = {run_dir: metrics_of((run_dir / METRICS).read_bytes())[name] for run_dir in run_dirs}
+    for run_dir, metric in found.items():
+        why = f"objective={name} has no value in {run_dir}: {metric['undefined']}"
+        require((metric["value"] is not None, why))
+    return sum(metric["value"] for metric in found.values()) / len(found)
