@@ -22,7 +22,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
-from ctgraph_rl.log.files import members_of
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
@@ -47,11 +46,9 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
     """
     check_packages()
     with first_imports():
-        from ctgraph_rl.collective.job import run_cells  # here: --help and a wrong setting need no torch
-        from ctgraph_rl.report.objective import check_objective, objective_of  # here: as above
+        from ctgraph_rl.collective.job import run_cells, value_of  # here: --help and a wrong setting need no torch
         from ctgraph_rl.report.style import require_packages  # here: as above
 
-    check_objective(cfg.objective, cfg.experts)
     if cfg.report:
         require_packages()
     run_dirs = run_cells(cfg, run_dir)
@@ -60,7 +57,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
             show(each, cfg.report)
     if cfg.objective is None or _sweeper() == "cells":
         return None
-    return objective_of(cfg.objective, run_dirs or members_of(run_dir))
+    return value_of(cfg, run_dir, run_dirs)
 
 
 def _sweeper() -> str | None:

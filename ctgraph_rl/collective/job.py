@@ -17,9 +17,10 @@ from ctgraph_rl.collective.summary import COLLECTIVE, FILES, described, read_col
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.learn.collective import Exchange, Member, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
-from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder
+from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder, members_of
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
+from ctgraph_rl.report.objective import check_objective, objective_of
 from ctgraph_rl.runs import config, seeds
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Failures
@@ -38,12 +39,27 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
     Returns:
         The directories of single runs; those of a collective's members are within its own.
     """
+    check_objective(cfg.objective, cfg.experts)
     if "exchange" not in cfg:
         return seeds.run_cells(cfg, run_dir)
     run_collective(cfg, run_dir)
     if not config.in_sweep():
         print(described(read_collective(run_dir)))
     return []
+
+
+def value_of(cfg: Any, run_dir: Path, run_dirs: Sequence[Path]) -> float:
+    """Return the objective of a configuration that `run_cells` has run, the mean of its single runs or members.
+
+    Args:
+        cfg: the configuration.
+        run_dir: its directory.
+        run_dirs: what `run_cells` has returned.
+
+    Raises:
+        ValueError: if a run has no value; says why.
+    """
+    return objective_of(cfg.objective, run_dirs or members_of(run_dir))
 
 
 def run_collective(cfg: Any, run_dir: Path) -> None:
