@@ -46,18 +46,18 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
     """
     check_packages()
     with first_imports():
-        from ctgraph_rl.collective.job import run_cells, value_of  # here: --help and a wrong setting need no torch
+        from ctgraph_rl.collective import job  # here: --help and a wrong setting need no torch
         from ctgraph_rl.report.style import require_packages  # here: as above
 
     if cfg.report:
         require_packages()
-    run_dirs = run_cells(cfg, run_dir)
+    run_dirs = job.run_cells(cfg, run_dir)
     if cfg.report or not in_sweep():
         for each in run_dirs:
             show(each, cfg.report)
     if cfg.objective is None or _sweeper() == "cells":
         return None
-    return value_of(cfg, run_dir, run_dirs)
+    return job.value_of(cfg, run_dir, run_dirs)
 
 
 def _sweeper() -> str | None:
