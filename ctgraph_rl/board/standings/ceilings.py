@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
+from ctgraph_rl.log.scores import optimal_values
+from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.task import Task, are_graphs
@@ -28,7 +30,9 @@ def ceilings_of(curriculum: Curriculum) -> Ceilings:
     """Return what the tasks of a curriculum allow."""
     tasks = curriculum.tasks
     if not are_graphs(tasks):
-        return Ceilings(*[None] * len(Ceilings._fields))
+        best = optimal_values(tasks)
+        optimal = None if isinstance(best, Undefined) else best.mean().item()
+        return Ceilings(optimal, *[None] * (len(Ceilings._fields) - 1))
     changes = any(task.goal_change is not None for task in tasks)
     return Ceilings(
         optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),

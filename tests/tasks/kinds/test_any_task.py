@@ -16,9 +16,12 @@ from helpers.sweeping import command_line
 
 import curricula
 from ctgraph_rl import Block, Curriculum, Evaluation, Protocol, Recorder, evaluate, learn_curriculum, load, make_agent
+from ctgraph_rl.board.held_out import other_curriculum
+from ctgraph_rl.board.standings.ceilings import ceilings_of, in_words
 from ctgraph_rl.compare import main as compare
 from ctgraph_rl.policies import OptimalPolicy
 from ctgraph_rl.report.__main__ import main as report
+from ctgraph_rl.report.bounds import bounds_of_curriculum
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.switch import Drift
 
@@ -91,6 +94,14 @@ def test_an_environment_of_a_user_learns_from_the_command_line(tmp_path, monkeyp
     assert json.loads((run_dir / "metrics.json").read_text())["optimal_performance"]["value"] == 1
     [first, _] = json.loads((run_dir / "curriculum.json").read_text())["tasks"]
     assert first == {"type": "my_task.Corridor", "right": True}
+
+
+def test_the_board_shows_the_optimum_of_lakes_and_holds_out_seeds_alone():
+    lakes = curricula.load("frozen_lake_4maps")
+
+    assert in_words(ceilings_of(lakes)) == [("optimum", "0.986")]
+    assert other_curriculum(lakes, "key").fingerprint == lakes.fingerprint
+    assert bounds_of_curriculum(lakes).returns["right-firm"] == (0, 1)
 
 
 CONTINUOUS = Curriculum(

@@ -29,6 +29,7 @@ class TestA2C(AgentContract):
         self.make_agent = target(compose("agent=a2c", *small), "agent")
 
 
+@pytest.mark.slow
 class TestEWC(TestA2C, MethodContract):
     @pytest.fixture(autouse=True)
     def _method(self, compose):
@@ -70,6 +71,7 @@ def test_a_contract_fails_for_an_environment_that_breaks_it(kind, name, monkeypa
         getattr(TestGraphs(), name)()
 
 
+@pytest.mark.slow
 def test_a_contract_fails_for_an_agent_that_forgets_its_optimiser(compose):
     class Forgets(A2C):
         def load_state_dict(self, state_dict, *args, **kwargs):
