@@ -9,6 +9,7 @@ from functools import wraps
 from inspect import Parameter, signature
 from typing import Any, NamedTuple, ParamSpec
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -108,6 +109,8 @@ def defined(
 ) -> Callable[[Callable[Arguments, Tensor]], Callable[Arguments, Metric]]:
     """Make a metric of a function that returns the terms of its formula, NaN for a term without a value.
 
+    It takes lists and NumPy arrays for tensors, too.
+
     The metric is listed in `METRICS` and computed wherever there are its inputs: those of `INPUTS` that its arguments
     are named after. An argument with a default is left at it where its input is missing, or where it is none.
 
@@ -130,8 +133,18 @@ def defined(
     meaning = Definition(definition, formula, source, partial)
 
     def decorate(terms: Callable[Arguments, Tensor]) -> Callable[Arguments, Metric]:
+        given_as = signature(terms)
+        tensors = [name for name, each in given_as.parameters.items() if each.annotation in ("Tensor", "Tensor | None")]
+
         @wraps(terms)
         def metric(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
+            given = given_as.bind(*args, **kwargs)
+            for name in tensors:
+                if isinstance(given.arguments.get(name), (list, tuple, np.ndarray)):
+                    given.arguments[name] = torch.tensor(given.arguments[name], dtype=torch.float64, device="cpu")
+            return _measured(*given.args, **given.kwargs)
+
+        def _measured(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
             try:
                 why = missing if isinstance(missing, str) else missing(*args, **kwargs)
                 return _metric(meaning, terms(*args, **kwargs).flatten(), why, aggregate)

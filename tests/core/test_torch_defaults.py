@@ -211,6 +211,7 @@ def shared(compose) -> Any:
     cfg = compose(
         "agent=ppo",
         "method=mask_shared",
+        "method.backbone_seed=1",
         "exchange=mosaic",
         *TINY,
         *MINIBATCHES,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -231,3 +232,13 @@ def test_an_agent_that_learns_and_never_forgets_has_neither_transfer_nor_forgett
 
     assert [found[name].value for name in SUMMARY] == [1.0, 0.0, 0.0, 0.0]
     assert [found[name].value for name in ("accuracy_over_time", "remembering")] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("make", [list, np.array, lambda rows: np.array(rows, np.float32)])
+def test_a_metric_takes_lists_and_arrays_as_tensors(make):
+    rows = [[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]]
+
+    assert metrics.isolated_forgetting(make(rows), scale=make([2.0, 1.0])) == metrics.isolated_forgetting(
+        torch.tensor(rows, dtype=torch.float64), scale=torch.tensor([2.0, 1.0])
+    )
+    assert metrics.average_performance(performance=make(rows)).value == 0.75
