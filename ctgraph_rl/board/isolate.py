@@ -264,12 +264,14 @@ def _watched(process: subprocess.Popen[bytes], folder: Path, limits: Limits, wat
 def _broken(number: int, folder: Path, limits: Limits, is_late: bool) -> str | None:
     """Return the limit that a process, those that it started or their folder break."""
     family = list(_family(number))
-    memory = sum(each for _, each in family)
-    used = _used(folder)
+    try:
+        used = _used(folder)
+    except PermissionError:
+        used = _Used(strange="it closed its folder")
     disk = used.disk + sum(_removed([each for each, _ in family]).values())
     rules = {
         f"it took longer than {limits.seconds:g} seconds": is_late,
-        f"it used more than {limits.memory:,} bytes of memory": memory > limits.memory,
+        f"it used more than {limits.memory:,} bytes of memory": sum(each for _, each in family) > limits.memory,
         f"it wrote more than {limits.disk:,} bytes": disk > limits.disk,
         f"it made more than {MOST_FILES:,} files": used.files > MOST_FILES,
         str(used.strange): used.strange is not None,
@@ -350,10 +352,9 @@ def _used(folder: int | Path, depth: int = 0, files: int = 0) -> _Used:
 def _opened(entry: os.DirEntry[str], folder: int | Path, depth: int, files: int) -> _Used:
     """Return what a folder within another one holds; see `_used`."""
     within = folder if isinstance(folder, int) else None
+    name = entry.name if within else entry.path
     try:
-        opened = os.open(
-            entry.name if within else entry.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within
-        )
+        opened = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within)
     except PermissionError:
         return _Used(0, files, "it made a folder that cannot be read")
     try:
@@ -380,11 +381,10 @@ def _limit(limits: Limits, is_confined: bool) -> None:
     """Set the limits that the system holds, of this process and of each that it starts."""
     import resource  # here: POSIX systems alone have it
 
-    seconds = math.ceil(limits.seconds) * (os.cpu_count() or 1)
     wanted = {
         resource.RLIMIT_DATA: limits.memory,
         resource.RLIMIT_FSIZE: limits.disk,
-        resource.RLIMIT_CPU: seconds,
+        resource.RLIMIT_CPU: math.ceil(limits.seconds) * (os.cpu_count() or 1),
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: MOST_OPEN,
     }

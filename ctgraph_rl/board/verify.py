@@ -306,6 +306,7 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
     number = secrets.randbelow(10**9) if arguments.number is None else arguments.number
     name = f"{submission.digest[:12]}-{number}"
     folder = made_folder(arguments.folder / name)
+    folder.chmod(0o700)  # others' code may make a program there that runs as you, for other users of this machine
     plan = planned(submission, arguments.level, number, arguments.cells, folder)
     paths = () if arguments.code is None else (arguments.code,)
     isolated = isolation(folder, graphics=submission.config.get("device", "cpu") != "cpu")

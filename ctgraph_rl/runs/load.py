@@ -18,6 +18,7 @@ from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.labels import policies_by_label
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, read_plain, require_records
@@ -164,7 +165,8 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     name = str(settings.get("_target_"))
     ours, maker = OURS[part].fullmatch(name), "make_method" if part in ("method", "detector") else "make_agent"
     if ours is None:
-        raise ValueError(f"{run_dir} is of the {part} {name:.80}, no baseline: give load(..., {maker}=), in Python")
+        name = terminal_text(name[:80])
+        raise ValueError(f"{run_dir} is of the {part} {name}, no baseline: give load(..., {maker}=), in Python")
     kind: Any = class_named(ours[1], ours[2])
     defined = kind is not None and (issubclass(kind, torch.nn.Module) or hasattr(kind, "labelling"))
     require((defined, f"{run_dir} names the {part} {name}, and there is no such class; give load(..., {maker}=)"))

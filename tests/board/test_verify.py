@@ -88,6 +88,7 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
     assert (code, written["level"], written["number"], written["bits"]) == (0, "rerun", 3, True)
     assert sorted(written["cells"]) == ["tiny-seed0", "tiny-seed1"]
     assert len(in_process) == 2
+    assert in_process[0].parents[1].stat().st_mode & 0o777 == 0o700, "other users could run what others' code made"
     said = capsys.readouterr()
     assert "number 3 draws rerun of seeds" in said.out
     assert "isolated: bubblewrap 0.8.0; no network" in said.out

@@ -286,7 +286,7 @@ def test_a_browser_plays_to_the_goal_by_keys_from_a_file_opened_by_hand(tmp_path
     assert found["tree"] == "The tree of 4 end states. You are at the end state of node 4."
     assert found["again"].startswith("A new episode begins")
     assert found["wrong"] == "b must be an integer in 2..5 on this page, got 9."
-    assert (found["reward"], found["wide"]) == ("0.4115 %", True)
-    assert re.match(r"[\d,]+ of [\d,]+ random episodes reach the goal: 0\.[34]", found["measured"])
+    assert (found["reward"], found["wide"]) == ("0.004115", True)
+    assert re.match(r"[\d,]+ of [\d,]+ random episodes reach the goal, a share of 0\.00[345]", found["measured"])
     assert found["log"] == "run.jsonl: mine. Mean return on each task after each block; nothing left this browser."
     assert found["cells"] == ["0", "0", "0.5"]

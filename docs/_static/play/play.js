@@ -10,7 +10,7 @@ let task = null; // what is played
 let rows = null; // one row of the kernel
 let run = null; // the simulation: rows of the kernel and what was counted
 
-const percent = (share) => (share >= 1e-4 ? `${(100 * share).toPrecision(4)} %` : share.toExponential(3));
+const rounded = (number) => String(Number(number.toPrecision(4)));
 const grouped = (number) => number.toLocaleString("en");
 
 function placed(kind, node) {
@@ -127,9 +127,9 @@ function drawTree() {
 function showNumbers() {
   const forms = closedForms(task), { drawn, fixed } = ceilings(task);
   const values = {
-    states: grouped(forms.states), rewardProb: percent(forms.rewardProb), endProb: percent(forms.endProb),
-    navigationProb: percent(forms.navigationProb), length: String(Number(forms.length.toPrecision(6))),
-    search: grouped(forms.search), drawn: percent(drawn), fixed: percent(fixed),
+    states: grouped(forms.states), rewardProb: rounded(forms.rewardProb), endProb: rounded(forms.endProb),
+    navigationProb: rounded(forms.navigationProb), length: rounded(forms.length),
+    search: grouped(forms.search), drawn: rounded(drawn), fixed: rounded(fixed),
   };
   for (const [name, value] of Object.entries(values)) say(name, value);
 }
@@ -161,9 +161,9 @@ function showRun() {
     return;
   }
   const [low, high] = interval(run.goals, run.episodes), { rewardProb } = closedForms(task);
-  say("measured", `${grouped(run.goals)} of ${grouped(run.episodes)} random episodes reach the goal: `
-    + `${percent(run.goals / run.episodes)}, at 95 % between ${percent(low)} and ${percent(high)}. `
-    + `The closed form is ${percent(rewardProb)}.`);
+  say("measured", `${grouped(run.goals)} of ${grouped(run.episodes)} random episodes reach the goal, a share of `
+    + `${rounded(run.goals / run.episodes)}, at 95 % between ${rounded(low)} and ${rounded(high)}. `
+    + `The closed form is ${rounded(rewardProb)}.`);
 }
 
 function stop() {

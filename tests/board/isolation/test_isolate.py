@@ -62,6 +62,9 @@ if what == "nested folders":
 if what == "closed folder":
     os.mkdir("closed", 0)
     time.sleep(60)
+if what == "own folder closed":
+    os.chmod(".", 0)
+    time.sleep(60)
 if what == "processes":
     for _ in range(300):
         if os.fork() == 0:
@@ -157,6 +160,7 @@ def test_limits_hold_without_bubblewrap_too(place, what, limits, said):
     [
         pytest.param(*("removed", ROOMY._replace(disk=10**7), "stopped: it wrote more than"), marks=pytest.mark.slow),
         ("closed folder", ROOMY, "stopped: it made a folder that cannot be read"),
+        pytest.param("own folder closed", ROOMY, "stopped: it closed its folder", marks=pytest.mark.slow),
         pytest.param("threads", ROOMY, "can't start new thread", marks=pytest.mark.slow),
     ],
 )
