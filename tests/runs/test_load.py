@@ -159,7 +159,7 @@ def test_a_method_of_someone_else_must_be_given(tmp_path):
     ("name", "message"),
     [
         ("baselines.a2c.A2C", "no baseline: give load"),
-        ("baselines.\x1b[2J", r"the agent baselines\.\\x1b\[2J, no baseline"),
+        ("baselines.\x1b[2J", r"the method baselines\.\\x1b\[2J, no baseline"),
         ("baselines.methods.ewc.EWC.x", "no baseline: give load"),
         ("baselines.methods.sarsa.SARSA", "and there is no such class"),
         ("baselines.methods.ewc.SampledImportance", "and there is no such class"),
