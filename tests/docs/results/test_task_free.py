@@ -50,6 +50,27 @@ def test_each_row_has_the_means_over_its_seeds():
         assert {int(line["frames"]) for line in lines} == {curricula.load(curriculum).num_frames}
 
 
+def test_what_is_said_of_gradual_changes_holds():
+    [adwin], [none] = (RUNS["task_free_gradual", detector] for detector in ("adwin", ""))
+
+    assert (goals(adwin), none["final_returns"]) == (4, "0 0 0 1")
+    assert "labels end with all four goals and fine-tuning ends with the last one" in SECTION
+    assert adwin["delays"] == "" and "| no point of change | undefined |" in SECTION
+
+
+def test_what_is_said_of_recurring_tasks_holds():
+    [oracle], [adwin] = (RUNS["task_free_recurring", detector] for detector in ("oracle", "adwin"))
+
+    assert (goals(oracle), goals(adwin)) == (
+        4,
+        3,
+    ) and "labels end with all four goals. With ADWIN's they end" in SECTION
+    found = [each != "-" for each in delays([adwin])]
+    share = float(adwin["frames_not_learned"]) / float(adwin["frames"])
+    assert f"it finds {sum(found)} of {len(found)} changes and opens six labels, and {share:.0%}"[:-1] in SECTION
+    assert 4 * float(adwin["labels_per_task"]) == 6
+
+
 def test_what_is_said_of_abrupt_changes_holds():
     oracle, adwin, none = (RUNS["task_free_abrupt", detector] for detector in ("oracle", "adwin", ""))
 

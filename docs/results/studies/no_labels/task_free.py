@@ -59,7 +59,8 @@ def row(curriculum: str, name: str, lines: Raw) -> list[str]:
         return [*shown, "", "", ""]
     delays = [each for line in lines for each in line["delays"].split()]
     found = f"{sum(each != '-' for each in delays)} of {len(delays)}" if delays else "no point of change"
-    return [*shown, found, f"{mean(values(lines, 'labels_per_task')):.2f}", not_learned(lines)]
+    per_task = "undefined" if not delays else f"{mean(values(lines, 'labels_per_task')):.2f}"
+    return [*shown, found, per_task, not_learned(lines)]
 
 
 def not_learned(lines: Raw) -> str:
