@@ -55,6 +55,14 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
     return known[found[0]] if found else None
 
 
+def as_int(action: object) -> int:
+    """An integer, -1 for anything else."""
+    try:
+        return operator.index(action)  # type: ignore[arg-type]
+    except TypeError:
+        return -1
+
+
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """Return the end of a message about a word that is not among the choices: the nearest one, or else all."""
     choices = list(choices)

@@ -6,8 +6,7 @@ Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
@@ -24,8 +23,9 @@ from torch import Tensor
 from ctgraph_rl.batch.assignment import numbers_in
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
+from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
 from ctgraph_rl.batch.text_render import as_text
-from ctgraph_rl.checks import as_tuple, is_int, require, takes_numbers
+from ctgraph_rl.checks import as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.protocol import MOST_ROWS
@@ -37,7 +37,7 @@ Array = NDArray[Any]
 _RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
 
 
-class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
+class CTGraphGymEnv(gymnasium.Env[Any, int]):
     """One CT-graph.
 
     Observations are uint8 [1, r, r], or [K] when one-hot; action 0 waits and 1..b decides. Episodes end by themselves:
@@ -51,6 +51,9 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         task: see `make_task`, as for ``config`` and ``changes``.
         config: see `make_task`.
         task_pool: the tasks that `set_task` may be given. Default: the task alone.
+        task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
+            ``observation`` and ``task_id``, uint8 [num_task_ids]: the id as one-hot.
+        num_task_ids: length of ``task_id``; None: just enough.
         render_mode: ``rgb_array``, ``ansi`` or None.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         changes: see `make_task`.
@@ -68,6 +71,8 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         *,
         config: Json | None = None,
         task_pool: Iterable[Task] | None = None,
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
         render_mode: str | None = None,
         kernel: str = "auto",
         **changes: Any,
@@ -77,7 +82,8 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             self.rows = Rows([task], task_pool=task_pool, kernel=kernel)
         self.task_pool = self.rows.pool
         self.render_mode = _known_mode(render_mode)
-        self.observation_space, self.action_space = _spaces(self.rows)
+        images, self.action_space = _spaces(self.rows)
+        self.observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self._number = self._next_number = self.task_pool.index(task)
         self._num_actions = self.rows.max_branching + 1
         self._is_seeded, self._is_over = False, True
@@ -88,9 +94,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
 
     @torch.inference_mode()
     @takes_numbers
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -107,16 +111,17 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
             first = int(self.np_random.integers(2**63 - 1)) if seed is None else seed
             self.rows.set_seed(first)
         self._is_over = False
-        return self.rows.restart().numpy()[0], {"task": self._number, "outcome": OUTCOME_RUNNING, "leaf": NO_LEAF}
+        info = {"task": self._number, "outcome": OUTCOME_RUNNING, "leaf": NO_LEAF}
+        return with_id(self.rows.restart().numpy()[0], self._ids, self._number), info
 
     @torch.inference_mode()
-    def step(self, action: int) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step with an action in 0..b.
 
         Raises:
             ValueError: for another action, and after the end of an episode.
         """
-        number = _as_int(action)
+        number = as_int(action)
         is_action = 0 <= number < self._num_actions
         if self._is_over or not is_action:
             require(
@@ -127,8 +132,9 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         self._is_over, outcome, leaf = bool(done.item()), OUTCOME_RUNNING, NO_LEAF
         if self._is_over:
             outcome, leaf = (int(value.item()) for value in self.rows.result(done))
+        shown = with_id(observation.numpy()[0], self._ids, self._number)
         info = {"task": self._number, "outcome": outcome, "leaf": leaf}
-        return observation.numpy()[0], self.rows.reward.item(), self._is_over, False, info
+        return shown, self.rows.reward.item(), self._is_over, False, info
 
     def render(self) -> Frame | None:
         """The present state as a picture, uint8 [192, 384, 3], or as text."""
@@ -136,7 +142,7 @@ class CTGraphGymEnv(gymnasium.Env[NDArray[np.uint8], int]):
         return frames[0] if frames else None
 
 
-class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
+class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
     """A batch of CT-graphs, equal step for step to `gymnasium.vector.SyncVectorEnv` of as many `CTGraphGymEnv`.
 
     Row i has the random stream of its own seed, ``seed + i`` or ``seed[i]``. What is returned is not changed later.
@@ -146,10 +152,11 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         task: see `make_task`, as for ``config`` and ``changes``; or a list of one task per row.
         config: see `make_task`.
         task_pool: the tasks that `set_tasks` may be given. Default: the rows' tasks.
+        task_ids: see `CTGraphGymEnv`, as for ``num_task_ids``; ids are uint8 [num_envs, num_task_ids].
         render_mode: ``rgb_array``, ``ansi`` or None.
-        autoreset_mode: when a row whose episode is over starts the next one: ``NextStep``, in the next step, which
-            ignores its action; ``SameStep``, at once, with what was last in ``final_obs`` and ``final_info``;
-            ``Disabled``, with ``reset(options={"reset_mask": mask})``.
+        autoreset_mode: when a row starts its next episode: ``NextStep``, in the next step, which ignores its action;
+            ``SameStep``, at once, with what was last in ``final_obs`` and ``final_info``; ``Disabled``, with
+            ``reset(options={"reset_mask": mask})``.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         changes: see `make_task`.
 
@@ -167,6 +174,8 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         *,
         config: Json | None = None,
         task_pool: Iterable[Task] | None = None,
+        task_ids: Mapping[Task, int] | None = None,
+        num_task_ids: int | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         kernel: str = "auto",
@@ -187,7 +196,8 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         self.render_mode = _known_mode(render_mode)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**_RENDERING, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = _spaces(self.rows)
+        images, self.single_action_space = _spaces(self.rows)
+        self.single_observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._numbers = self._next_numbers = np.array(numbers_in(self.task_pool, tasks))
@@ -205,7 +215,7 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
     @takes_numbers
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all rows, or in those of a mask.
 
         Args:
@@ -220,10 +230,10 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
         self._change_tasks(mask)
         self._is_over = self._is_over & ~mask
         shown = self.rows.reset(torch.from_numpy(mask))
-        return shown.observation.numpy(), self._infos(shown, mask)
+        return with_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
 
     @torch.inference_mode()
-    def step(self, actions: NDArray[np.int64]) -> tuple[NDArray[np.uint8], Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: NDArray[np.int64]) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """One step of all rows with actions, integers [N] in 0..b.
 
         Raises:
@@ -234,20 +244,21 @@ class CTGraphVectorEnv(VectorEnv[NDArray[np.uint8], NDArray[np.int64], Array]):
             self._change_tasks(over)
             shown = self.rows.step_or_reset(action, torch.from_numpy(over))
         else:
-            observation, ends = self.rows.act(action)
-            shown = Shown(observation, *self.rows.result(ends), ends)
+            images, ends = self.rows.act(action)
+            shown = Shown(images, *self.rows.result(ends), ends)
         rewards, done = self.rows.reward.numpy().astype(np.float64), shown.done.numpy()
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             shown, infos = self._restart(done, shown)
         else:
             self._is_over, infos = done, self._infos(shown)
-        return shown.observation.numpy(), rewards, done.copy(), np.zeros_like(done), infos
+        observation = with_id(shown.observation.numpy(), self._ids, self._numbers)
+        return observation, rewards, done.copy(), np.zeros_like(done), infos
 
     def _restart(self, done: NDArray[np.bool_], final: Shown) -> tuple[Shown, dict[str, Any]]:
         """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
-            last[i] = observation
+            last[i] = with_id(observation, self._ids, self._numbers[i])
         infos: dict[str, Any] = {"final_obs": last, "_final_obs": done.copy()}
         infos |= {"final_info": self._infos(final, done), "_final_info": done.copy()}
         self._change_tasks(done)
@@ -357,14 +368,6 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
 def _seed_rule(seed: object) -> tuple[bool, str]:
     return (True, "") if seed is None else seed_rule(seed)
-
-
-def _as_int(action: object) -> int:
-    """An integer, -1 for anything else."""
-    try:
-        return operator.index(action)  # type: ignore[arg-type]
-    except TypeError:
-        return -1
 
 
 @lru_cache(maxsize=256)

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from ctgraph_rl.batch.specs import checked_num_ids
+from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
 from ctgraph_rl.checks import require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
 from ctgraph_rl.tasks.task import Task
@@ -50,21 +49,15 @@ class SB3VecEnv(VecEnv):
         num_task_ids: int | None = None,
         **kwargs: Any,
     ) -> None:
-        length = checked_num_ids(task_ids, num_task_ids)
         self.envs = CTGraphVectorEnv(num_envs, task, autoreset_mode=AutoresetMode.SAME_STEP, **kwargs)
-        space: spaces.Space[Any] = self.envs.single_observation_space
-        self._ids: NDArray[np.uint8] | None = None
-        if task_ids is not None:
-            without = [each for each in self.envs.task_pool if each not in task_ids]
-            require((not without, f"task_ids must name every task of the pool, got none for {without[:3]}"))
-            self._ids = np.eye(length, dtype=np.uint8)[[int(task_ids[each]) for each in self.envs.task_pool]]
-            space = spaces.Dict({"observation": space, "task_id": spaces.Box(0, 1, (length,), np.uint8)})
+        alone = self.envs.single_observation_space
+        space, self._ids = with_task_ids(alone, self.envs.task_pool, task_ids, num_task_ids)
         super().__init__(num_envs, space, self.envs.single_action_space)
         self.metadata = self.envs.metadata
 
     def _shown(self, observation: NDArray[np.uint8], tasks: Any) -> Any:
         """Observations with the ids of tasks, if there are ids."""
-        return observation if self._ids is None else {"observation": observation, "task_id": self._ids[tasks]}
+        return with_id(observation, self._ids, tasks)
 
     def reset(self) -> Any:
         """Start an episode in all rows, with the seeds that ``seed`` was given before."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -52,6 +53,50 @@ def test_the_vector_environment_equals_sync_vector_env_step_for_step(kind, mode)
 
     assert_equal(*played)
     assert any(result[2].sum() > 1 for result in played[0] if len(result) == 5)
+
+
+@every_mode
+def test_rows_show_the_ids_of_their_tasks_as_sync_vector_env_does(mode):
+    tasks = [surjective(goal=(2, 1)), surjective(goal=(1, 2)), surjective(goal=(1, 1))]
+    ours, theirs = both(tasks, mode, task_ids=dict(zip(tasks, (2, 0, 3), strict=True)), num_task_ids=5)
+    assert ours.observation_space == theirs.observation_space
+
+    played = [play(envs, 11, 60) for envs in (ours, theirs)]
+    for envs in (ours, theirs):
+        change(envs, tasks[::-1])
+    later = [play(envs, 11, 60) for envs in (ours, theirs)]
+
+    assert_equal(*played)
+    assert_equal(*later)
+    shown = [results[0][0]["task_id"].argmax(1).tolist() for results in (played[0], later[0])]
+    assert shown == [[2, 0, 3], [3, 0, 2]]
+    assert ours.observation_space.contains(later[0][-1][0])
+
+
+def change(envs, tasks):
+    """Give the rows other tasks."""
+    if isinstance(envs, CTGraphVectorEnv):
+        envs.set_tasks(tasks)
+    else:
+        for env, task in zip(envs.envs, tasks, strict=True):
+            env.unwrapped.set_task(task)
+
+
+def test_gymnasium_makes_environments_that_show_ids():
+    first, second = ct_su_b1((1, 1)), ct_su_b1((2, 1))
+    given = {"task": first, "task_pool": (first, second), "task_ids": {first: 0, second: 1}}
+
+    one = gymnasium.make("ctgraph/CTGraph-v0", **given)
+    many = gymnasium.make_vec("ctgraph/CTGraph-v0", 2, vectorization_mode="vector_entry_point", **given)
+
+    before = one.reset(seed=0)[0]
+    one.unwrapped.set_task(second)
+    after = one.reset()[0]
+    assert [before["task_id"].tolist(), after["task_id"].tolist()] == [[1, 0], [0, 1]]
+    assert one.step(0)[0]["task_id"].tolist() == [0, 1] and one.observation_space.contains(after)
+    assert many.reset(seed=0)[0]["task_id"].tolist() == [[1, 0], [1, 0]]
+    with pytest.raises(ValueError, match="task_ids must name every task of the pool, got none for"):
+        gymnasium.make("ctgraph/CTGraph-v0", **given | {"task_ids": {first: 0}})
 
 
 @every_mode
