@@ -155,8 +155,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
         task_ids: see `CTGraphGymEnv`, as for ``num_task_ids``; ids are uint8 [num_envs, num_task_ids].
         render_mode: ``rgb_array``, ``ansi`` or None.
         autoreset_mode: when a row starts its next episode: ``NextStep``, in the next step, which ignores its action;
-            ``SameStep``, at once, with what was last in ``final_obs`` and ``final_info``; ``Disabled``, with
-            ``reset(options={"reset_mask": mask})``.
+            ``SameStep``, at once, the last in ``final_obs`` and ``final_info``; ``Disabled``, by `reset` of a mask.
         kernel: ``"auto"``, ``"off"`` or ``"required"``, whether the C kernel takes the steps: see `Rows`.
         changes: see `make_task`.
 
