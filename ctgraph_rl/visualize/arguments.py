@@ -124,7 +124,7 @@ def _called(name: str, task: Task) -> Selection:
 
 
 def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
-    tasks, labels = ct_graphs(curriculum.tasks, "visualize"), curriculum.labels
+    tasks, labels = ct_graphs(curriculum.tasks, "a drawing or a game"), curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
     require((is_int(number, 1, len(tasks)), rule))
     return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
