@@ -23,9 +23,22 @@ from helpers.small_agents import CHOICES, MINIBATCHES, TINY, TWO_TASKS, learner_
 from helpers.task_families import FAMILIES, RICH, SWITCHED, VECTORS
 from torch import nn
 
-from ctgraph_rl import CTGraphEnv, Evaluation, GroupedImages, Recorder, RunLog, Task, learn_curriculum, scores
+import curricula
+from baselines.update.seeds import Group
+from ctgraph_rl import (
+    CTGraphEnv,
+    Evaluation,
+    GroupedImages,
+    Recorder,
+    RunLog,
+    Task,
+    learn_curriculum,
+    make_agent,
+    scores,
+)
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.learn.collective import Member, learn_collective
+from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.policies import SearchPolicy
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.job import run_job
@@ -228,12 +241,33 @@ def shared(compose) -> Any:
     return [(lines(member.log), member.agent.state_dict()) for member in members]
 
 
-def ran(compose, folder: Path, *overrides: str) -> Any:
-    """The files of runs, and the agents that are loaded from them."""
+def ran(compose, folder: Path) -> Any:
+    """The log of a run, and the agent that is loaded from its directory."""
     small = ["curriculum=su_b1_4tasks", "curriculum.num_frames=64", "evaluation.num_episodes=4"]
-    run_job(compose("agent=dqn", *small, *TINY, *less("dqn"), *overrides), folder)
-    logs = [lines(RunLog.read(path)) for path in sorted(folder.rglob("run.jsonl"))]
-    return logs, [load(path.parent).agent.state_dict() for path in sorted(folder.rglob("agent.pt"))]
+    run_job(compose("agent=dqn", *small, *TINY, *less("dqn")), folder)
+    return lines(RunLog.read(folder / "run.jsonl")), load(folder).agent.state_dict()
+
+
+def stacked(compose) -> Any:
+    """What two seeds measure that learn as one batch."""
+    generators, agents = [], []
+    for seed in range(2):
+        agents.append(learner_of(compose, "dqn", {}, seed)[0])
+        generators.append(torch.Generator("cpu").set_state(torch.get_rng_state()))
+    logs = [RunLog(), RunLog()]
+    learn_together(TWO_TASKS, Group(agents, generators), [0, 1], logs)
+    return [lines(log) for log in logs], [agent.state_dict() for agent in agents]
+
+
+def of_gymnasium() -> Any:
+    """What an agent measures on tasks of Gymnasium."""
+    logs = []
+    for name in ("frozen_lake_4maps", "cartpole_3lengths"):
+        curriculum = curricula.load(name, num_frames=64)
+        curriculum = replace(curriculum, evaluation=Evaluation(2))
+        agent = make_agent("dqn", curriculum, 0, num_envs=8, num_steps=4, hidden_size=8, batch_size=8)
+        logs.append(lines(learn_curriculum(curriculum, agent, 3)))
+    return logs
 
 
 JOBS: dict[str, Callable[[Any, Path], Any]] = {
@@ -241,7 +275,8 @@ JOBS: dict[str, Callable[[Any, Path], Any]] = {
     "stable-baselines3": lambda compose, path: played_by_stable_baselines(),
     "collective": lambda compose, path: shared(compose),
     "run": ran,
-    "group of seeds": lambda compose, path: ran(compose, path, "seed=[0,1]", "together=true"),
+    "seeds as one batch": lambda compose, path: stacked(compose),
+    "tasks of Gymnasium": lambda compose, path: of_gymnasium(),
 }
 
 

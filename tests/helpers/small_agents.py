@@ -230,14 +230,14 @@ CHOICES = [
 """Agents, and the choices of other groups of the configuration."""
 
 
-def learner_of(compose, agent: str, choices: dict[str, str]) -> tuple[Any, Curriculum]:
+def learner_of(compose, agent: str, choices: dict[str, str], seed: int = 0) -> tuple[Any, Curriculum]:
     """A learner, and the curriculum that it can learn."""
     names = [f"{group}={name}" for group, name in choices.items()]
     more = [setting for name in choices.values() for setting in SETTINGS.get(name, [])]
     cfg = compose(f"agent={agent}", *names, *TINY, *less(agent), *more)
     make_method = method_of(cfg)
     curriculum = make_method().prepare(HIDDEN if "detector" in choices else TWO_TASKS)
-    return new_agent(curriculum, train.with_method(target(cfg, "agent"), make_method, curriculum), 0), curriculum
+    return new_agent(curriculum, train.with_method(target(cfg, "agent"), make_method, curriculum), seed), curriculum
 
 
 def name_of(choice: Any) -> str | None:
