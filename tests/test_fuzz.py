@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cache, partial
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.reference_files import SHIPPED_2023
+from helpers.stopped_runs import Slow, limited
 
 from baselines.catalogue import Entry, catalogue
 from ctgraph_rl import (
@@ -84,37 +83,17 @@ VALUES: list[Any] = [
 ]
 
 
-class Slow(Exception):
-    """A case that takes too long."""
-
-
-@contextmanager
-def limited() -> Iterator[None]:
-    """Stop what takes longer than a case may."""
-
-    def stop(*_: Any) -> None:
-        raise Slow
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(SECONDS)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
-
-
 def fails(case: Callable[[], object], names: Callable[[str], bool]) -> str | None:
     """What is wrong with the way in which a case ends; None if it works or is refused as it should be."""
     try:
-        with limited():
+        with limited(SECONDS):
             case()
     except ALLOWED as error:
         message = str(error)
         if not message or any(words in message for words in NOT_OURS) or not names(message):
             return f"{type(error).__name__}: {message[:200]}"
-    except Slow:
-        return f"takes more than {SECONDS} s"
+    except Slow as error:
+        return str(error)
     except Exception as error:
         return f"{type(error).__name__}: {str(error)[:200]}"
     return None

@@ -53,6 +53,7 @@ REFUSED = [
     (["curriculum=axes", "curriculum.depth=0"], ["error: curriculum.depth must be an integer"]),
     (["hydra/launcher=joblib"], ["error: hydra/launcher=joblib runs the cells of a sweep: add -m, or leave it out\n"]),
     (["objective=average_performanse"], ["objective must be a metric, got", "did you mean 'average_performance'?"]),
+    (["objective=[forgetting]"], ["objective must be a metric, got ['forgetting']: "]),
     (["objective=xyz"], ["objective must be a metric, got 'xyz': choices: ", ", average_performance, "]),
     (["objective=forward_transfer_from_experts"], ["compares with single-task experts: add experts=true"]),
     (["seed=range(2)"], ["error: seed has several values: add -m to run each\n"]),

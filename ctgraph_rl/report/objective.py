@@ -23,7 +23,8 @@ def check_objective(name: str | None, experts: bool) -> None:
     """
     if name is None:
         return
-    require((name in DEFINED, f"objective must be a metric, got {name!r}: {did_you_mean(str(name), list(DEFINED))}"))
+    is_known = isinstance(name, str) and name in DEFINED
+    require((is_known, f"objective must be a metric, got {name!r}: {did_you_mean(str(name), list(DEFINED))}"))
     needs_experts = any("expert" in each for each in DEFINED[name].required)
     require((experts or not needs_experts, f"objective={name} compares with single-task experts: add experts=true"))
 

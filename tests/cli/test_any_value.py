@@ -5,13 +5,12 @@ from __future__ import annotations
 import copy
 import math
 import random
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.stopped_runs import limited
 from helpers.sweeping import command_line
 from omegaconf import DictConfig, OmegaConf
 
@@ -52,26 +51,6 @@ FILES = [f"{group}={path.stem}" for group in OVER for path in sorted(Path(conf_d
 
 RUN = ("seed", "device", "num_threads", "together", "portable", "experts", "experts_dir", "report", "overwrite")
 OF_RUN = (*RUN, "resume", "checkpoint_seconds", "evaluation", "protocol")
-
-
-class Slow(Exception):
-    """A case that takes too long."""
-
-
-@contextmanager
-def limited() -> Iterator[None]:
-    """Stop what takes longer than a case may."""
-
-    def stop(*_: Any) -> None:
-        raise Slow(f"takes more than {SECONDS} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(SECONDS)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def build(cfg: DictConfig) -> None:
@@ -126,7 +105,7 @@ def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
     OmegaConf.update(changed, name, value, merge=False)
     case = f"{name}={value!r}"
     try:
-        with limited():
+        with limited(SECONDS):
             build(changed)
     except ERRORS as error:
         cause: BaseException = error

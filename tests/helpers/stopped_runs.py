@@ -1,12 +1,16 @@
-"""Runs that are stopped, and checkpoints that are broken or hostile."""
+"""Runs that are stopped, cases that take too long, and checkpoints that are broken or hostile."""
 
 from __future__ import annotations
 
 import json
 import os
 import pickle
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -44,6 +48,26 @@ class StopsAfter(Checkpoints):
         super().offer(state, at_block_end)
         if state()["frames"] == self.frames:
             raise Stopped
+
+
+class Slow(Exception):
+    """A case that takes too long."""
+
+
+@contextmanager
+def limited(seconds: int) -> Iterator[None]:
+    """Stop what takes longer than a case may, in the main thread."""
+
+    def stop(*_: Any) -> None:
+        raise Slow(f"takes more than {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def make_agent(observation_spec, action_spec) -> A2C:
