@@ -11,10 +11,11 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ctgraph_rl.batch.assignment import checked_num_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows
-from ctgraph_rl.batch.specs import checked_num_ids, specs_of
+from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.checks import require, require_all, takes_numbers
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device

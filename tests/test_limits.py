@@ -17,7 +17,7 @@ from helpers.reference_files import SHIPPED_2023
 from helpers.stopped_runs import with_header
 
 import curricula
-from ctgraph_rl import Curriculum, RunLog, Task
+from ctgraph_rl import Curriculum, RunLog, Task, strict
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.saved import read_plain
 from ctgraph_rl.log.sums import write_sums
@@ -25,7 +25,6 @@ from ctgraph_rl.log.tables import write_tables
 from ctgraph_rl.runs.checkpoints import BrokenCheckpoint, decoded
 from ctgraph_rl.runs.read import find_runs
 from ctgraph_rl.runs.status import FAILED, MISSING, lock_holder, status_of
-from ctgraph_rl.tasks import curriculum_json
 from ctgraph_rl.tasks.images import GroupedImages, PaperImages, ReferenceImages
 
 GIB = 2**30
@@ -293,8 +292,8 @@ def test_repeated_keys_are_found_in_linear_time():
     pairs = [(Counted(f"key{number}"), None) for number in range(2000)] + [(Counted("key7"), None)]
     Counted.compared = 0
 
-    with pytest.raises(ValueError, match=r"key \['key7'\] occurs twice"):
-        curriculum_json._without_repeats(pairs)
+    with pytest.raises(ValueError, match="key 'key7' occurs twice"):
+        strict._unique(pairs)
 
     assert Counted.compared < 5 * len(pairs)
 

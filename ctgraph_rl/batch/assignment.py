@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, require, require_all
+from ctgraph_rl.checks import as_tuple, is_int, plain, require, require_all
 from ctgraph_rl.core import philox
+from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
 from ctgraph_rl.tasks.task import Task
+
+
+def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
+    """Return the length of ``task_id``, 0 for none; see `ctgraph_rl.CTGraphEnv` for the arguments and errors."""
+    if task_ids is None:
+        require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
+        return 0
+    ids = plain(list(task_ids.values())) if isinstance(task_ids, Mapping) else [task_ids]
+    by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
+    require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
+    needed = max(ids) + 1
+    room = needed if num_task_ids is None else num_task_ids
+    rule = f"num_task_ids must be an integer in {needed}..{MOST_IDS}, from the largest id + 1, got {room!r}"
+    require((is_int(room, needed, MOST_IDS), rule))
+    return room
 
 
 def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:

@@ -15,8 +15,8 @@ from torch.nn.functional import one_hot
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ctgraph_rl.batch.assignment import checked_num_ids
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.batch.specs import checked_num_ids
 from ctgraph_rl.checks import require, require_all
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, spaces_of

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ctgraph_rl.batch.specs import checked_num_ids
+from ctgraph_rl.batch.assignment import checked_num_ids
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.task import Task
 

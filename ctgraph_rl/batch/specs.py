@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from ctgraph_rl.batch.params import observation_shape
-from ctgraph_rl.checks import is_int, plain, require
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL, OUTCOME_RUNNING
 from ctgraph_rl.tasks.images import white_level
-from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.task import Task
 
 
@@ -52,18 +50,3 @@ def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_id
     num_actions = 1 + max(task.graph.branching_factor for task in pool)
     action = Categorical(num_actions, shape=batch_size, dtype=torch.int64, device="cpu")
     return Specs(Composite(keys, shape=batch_size, device="cpu"), action)
-
-
-def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None) -> int:
-    """Return the length of ``task_id``, 0 for none; see `CTGraphEnv` for the arguments and errors."""
-    if task_ids is None:
-        require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
-        return 0
-    ids = plain(list(task_ids.values())) if isinstance(task_ids, Mapping) else [task_ids]
-    by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
-    require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
-    needed = max(ids) + 1
-    room = needed if num_task_ids is None else num_task_ids
-    rule = f"num_task_ids must be an integer in {needed}..{MOST_IDS}, from the largest id + 1, got {room!r}"
-    require((is_int(room, needed, MOST_IDS), rule))
-    return room

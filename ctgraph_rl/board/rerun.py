@@ -26,7 +26,7 @@ from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
-from ctgraph_rl.log.provenance import NUMBERS, machine, versions
+from ctgraph_rl.log.provenance import machine, numbers_of, versions
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
@@ -53,7 +53,7 @@ NOT_OF_THE_RUN = ("MemoryError", "ModuleNotFoundError")
 """Errors that limits and missing code cause here."""
 
 OWN_VERSION = ("ctgraph_rl", "python")
-"""Versions that may differ between equal bits; `NUMBERS` says when those of this package do."""
+"""Versions that may differ between equal bits; the numbers version says when those of this package do."""
 
 
 class Cell(NamedTuple):
@@ -255,18 +255,20 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
         ValueError: for runs of a package whose numbers are other ones.
     """
     about = submission.log(runs[0]).measurements[0]
-    stored, fix = about.get("numbers", 1), "install the versions of versions.txt"
-    require((stored == NUMBERS, f"the runs have numbers version {stored}, this ctgraph_rl has {NUMBERS}: {fix}"))
-    portable, here = is_portable(submission.config), {**machine(), "cpu": cpu_model() or ""}
+    stored = about.get("numbers", 1)
+    here = numbers_of(about)
+    fix = "install the versions of versions.txt"
+    require((stored == here, f"the runs have numbers version {stored}, this ctgraph_rl has {here}: {fix}"))
+    portable, this = is_portable(submission.config), {**machine(), "cpu": cpu_model() or ""}
     if portable:
-        here["machine"] = f"{platform.machine()} portable"
+        this["machine"] = f"{platform.machine()} portable"
     device = str(submission.config.get("device", "cpu"))
     reasons = [f"device {device}"] if device != "cpu" else []
     now = {name: version for name, version in versions().items() if name not in OWN_VERSION}
     then = {name: submission.versions.get(name) for name in now}
     reasons += [f"{name} {then[name]} there, {now[name]} here" for name in now if then[name] != now[name]]
     compared_parts = ("machine",) if portable else ("machine", "cpu")
-    pairs = dict.fromkeys((part, getattr(run, part), here[part]) for run in runs for part in compared_parts)
+    pairs = dict.fromkeys((part, getattr(run, part), this[part]) for run in runs for part in compared_parts)
     return reasons + [f"{part} {before} there, {own} here" for part, before, own in pairs if before != own]
 
 

@@ -18,11 +18,14 @@ from ctgraph_rl.packages import is_published
 from ctgraph_rl.portable import cpu_model, is_portable
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-NUMBERS = 2
+NUMBERS = 1
 """The numbers version of this package: raised when equal configurations and seeds give other weights or measurements.
 
 Every run stores it. A log without it is of numbers version 1.
 """
+
+NUMBERS_TOGETHER = 2
+"""The numbers version of runs whose seeds were trained as one batch, which rose by what changed for these only."""
 
 
 def versions() -> dict[str, str]:
@@ -106,12 +109,14 @@ def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         before: the first line of a log.
         now: the code of this process.
     """
-    stored, fingerprint, numbers = before.get("sources"), before.get("fingerprint"), before.get("numbers", 1)
+    stored = before.get("sources")
+    fingerprint = before.get("fingerprint")
+    numbers = before.get("numbers", 1)
     changed = []
     if fingerprint not in (None, now["fingerprint"]):
         changed.append(f"the curriculum (fingerprint {fingerprint} before, {now['fingerprint']} now)")
-    if numbers != now["numbers"]:
-        changed.append(f"ctgraph_rl (numbers version {numbers} before, {now['numbers']} now)")
+    if numbers != numbers_of(before):
+        changed.append(f"ctgraph_rl (numbers version {numbers} before, {numbers_of(before)} now)")
     if stored is not None and now["sources"] is not None:
         pairs = {name: (stored.get(name, ""), now["sources"].get(name, "")) for name in {*stored, *now["sources"]}}
         changed += [f"{name}" for name, pair in sorted(pairs.items()) if None not in pair and pair[0] != pair[1]]
@@ -122,6 +127,11 @@ def is_unknown(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Return whether a run does not say of which source it is where that counts now."""
     stored = before.get("sources")
     return bool(now["sources"]) and (stored is None or None in stored.values())
+
+
+def numbers_of(about: Mapping[str, Any]) -> int:
+    """Return the numbers version that this package gives a run, by the first line of its log."""
+    return NUMBERS_TOGETHER if about.get("together") else NUMBERS
 
 
 def machine() -> dict[str, Any]:

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_text
-from ctgraph_rl.log.provenance import NUMBERS
+from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
 from ctgraph_rl.runs.read import Curve, History, Problem, Run, code_of, read_run
@@ -237,10 +237,11 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
 
     Groups are those of runs, and those of the single-task experts that they are compared with.
     """
-    older = [run for run in runs if run.code["numbers version"] < NUMBERS]
+    older = [run for run in runs if run.code["numbers version"] < numbers_of(run.about)]
     unknown = [run for run in runs if None in run.code.values()]
     versions = ", ".join(sorted({str(run.code["numbers version"]) for run in older}))
-    said = f"of numbers version {versions}, this package is of {NUMBERS}: it may give other numbers"
+    present = ", ".join(sorted({str(numbers_of(run.about)) for run in older}))
+    said = f"of numbers version {versions}, this package is of {present}: it may give other numbers"
     found = [(older, said), (unknown, "of unknown code: they do not say of which source they are")]
     sizes = [group_size(run) for run in runs]
     for size in sorted({*sizes} - {1}) if len({*sizes}) > 1 else ():

@@ -84,6 +84,7 @@ class Recorder:
 
     Example:
         >>> import curricula
+        >>> import numpy as np
         >>> curriculum = curricula.load("su_b1_4tasks")
         >>> with Recorder(curriculum) as recorder:
         ...     for frames in (0, *curriculum.ends):  # learn a block before each but the first

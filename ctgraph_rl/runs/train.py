@@ -29,7 +29,7 @@ from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CHECKPOINTS, CURRICULUM, LOG, METRICS
-from ctgraph_rl.log.provenance import code_changes, learners, machine, provenance
+from ctgraph_rl.log.provenance import NUMBERS_TOGETHER, code_changes, learners, machine, provenance
 from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_performance
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import RESULTS, write_sums
@@ -206,7 +206,8 @@ class RunDirectory:
     def begin(self, curriculum: Curriculum, agent: Agent, saved: State | None) -> RunLog:
         """Return the log of a new run, or of one that is resumed from a saved state."""
         run_dir, about = self.run_dir, provenance(curriculum, learners(self.config, agent))
-        about |= {"together": list(self.together)} if self.together else {}
+        if self.together:
+            about |= {"together": list(self.together), "numbers": NUMBERS_TOGETHER}
         if saved is None:
             log = _new_log(run_dir)
         else:

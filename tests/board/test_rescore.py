@@ -190,12 +190,12 @@ def test_the_command_writes_what_it_found_and_exits_with_1_where_something_diffe
 
 
 def test_numbers_of_the_first_line_of_a_log_count_and_three_differing_values_are_shown(monkeypatch):
-    monkeypatch.setattr(rerun, "NUMBERS", 3)
+    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", 2)
     log = SimpleNamespace(
-        measurements=[{"kind": "run", "numbers": 3}, {"kind": "training", **dict.fromkeys("abcd", 1)}]
+        measurements=[{"kind": "run", "numbers": 2}, {"kind": "training", **dict.fromkeys("abcd", 1)}]
     )
     other = SimpleNamespace(
-        measurements=[{"kind": "run", "numbers": 3}, {"kind": "training", **dict.fromkeys("abcd", 2)}]
+        measurements=[{"kind": "run", "numbers": 2}, {"kind": "training", **dict.fromkeys("abcd", 2)}]
     )
     submission = SimpleNamespace(log=lambda run: log, config={"device": "cuda"}, versions={})
     run = SimpleNamespace(machine="", cpu="")

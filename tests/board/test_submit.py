@@ -151,7 +151,7 @@ def other_metric(run: Path) -> None:
             "seeds 1 are missing: .*; seeds 100 are for tuning: track tiny-v1",
         ),
         (other_code, "runs are of different code, my_agent differs between them: run all with one"),
-        (other_numbers, r"has changed since the runs, ctgraph_rl \(numbers version 0 before, 2 now\): run again"),
+        (other_numbers, r"has changed since the runs, ctgraph_rl \(numbers version 0 before, 1 now\): run again"),
         (other_version, r"runs are of different versions, torch .* and 1.0: run all with one"),
         (unknown_code, "do not say of which source they are: run again from files, and with Recorder"),
         (unfinished, r"tiny-seed1 has no results \(unfinished\): finish it, or account for it: failed: {1: why}"),

@@ -173,11 +173,11 @@ def test_modules_that_an_agent_finds_only_once_it_is_imported_are_no_change(mine
 
 def test_another_numbers_version_of_the_package_makes_its_own_runs_stale(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20")
-    monkeypatch.setattr(provenance, "NUMBERS", 3)
+    monkeypatch.setattr(provenance, "NUMBERS", 2)
     capsys.readouterr()
 
     assert sweep(monkeypatch, "seed=20") == 1
-    assert "  stale    seed=20  ctgraph_rl (numbers version 2 before, 3 now) changed" in printed(capsys)
+    assert "  stale    seed=20  ctgraph_rl (numbers version 1 before, 2 now) changed" in printed(capsys)
 
 
 def test_a_finished_run_of_other_code_is_refused_and_not_shown(mine, ran, monkeypatch, capsys):
@@ -281,15 +281,15 @@ def test_runs_of_one_configuration_whose_curriculum_changed_are_named(mine, ran,
 
 def test_runs_of_an_older_numbers_version_are_named(ran, monkeypatch, capsys):
     sweep(monkeypatch, "seed=20,21")
-    monkeypatch.setattr("ctgraph_rl.report.terminal.NUMBERS", 3)
+    monkeypatch.setattr("ctgraph_rl.log.provenance.NUMBERS", 2)
     capsys.readouterr()
 
     assert run_results(monkeypatch) == 0
-    said = "2 of 2 runs are of numbers version 2, this package is of 3: it may give other numbers"
+    said = "2 of 2 runs are of numbers version 1, this package is of 2: it may give other numbers"
     assert capsys.readouterr().err == f"code: {said}\n"
-    monkeypatch.setattr(provenance, "NUMBERS", 3)
+    monkeypatch.setattr(provenance, "NUMBERS", 2)
     sweep(monkeypatch, "seed=22")
-    assert [agent for _, agent in grouped(all_runs(["runs"]))] == [f"LSTMPPO (numbers version {i})" for i in (2, 3)]
+    assert [agent for _, agent in grouped(all_runs(["runs"]))] == [f"LSTMPPO (numbers version {i})" for i in (1, 2)]
     assert run_results(monkeypatch) == 1
 
 
@@ -301,8 +301,6 @@ def without(path: Path, *names: str) -> None:
 
 
 def test_a_run_that_does_not_say_its_code_is_of_version_1_and_of_unknown_source(mine, ran, monkeypatch, capsys):
-    monkeypatch.setattr(provenance, "NUMBERS", 1)
-    monkeypatch.setattr("ctgraph_rl.report.terminal.NUMBERS", 1)
     sweep(monkeypatch, "seed=20")
     sweep(monkeypatch, *MINE, "seed=20")
     for log in Path("runs").rglob("run.jsonl"):
@@ -373,10 +371,10 @@ def test_an_own_agent_that_changed_gets_new_experts_and_ours_keeps_its_own(mine,
     mine.write("my_network.py", "SIZE = 2\n")
     second = key("my_agent.MyAgent")
 
-    assert "sources" not in ours and ours["numbers"] == 2
+    assert "sources" not in ours and "numbers" not in ours
     assert {**first, "sources": 0} == {**second, "sources": 0} and first != second
-    monkeypatch.setattr(provenance, "NUMBERS", 3)
-    assert {**key("baselines.reinforce.Reinforce")} == {**ours, "numbers": 3}
+    monkeypatch.setattr(provenance, "NUMBERS", 2)
+    assert {**key("baselines.reinforce.Reinforce")} == {**ours, "numbers": 2}
 
 
 def test_runs_from_python_store_the_source_of_what_they_are_given(mine, compose):

@@ -16,6 +16,7 @@ from baselines.update.seeds import Group
 from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.log import run_log, sums, tables
+from ctgraph_rl.log.provenance import NUMBERS, NUMBERS_TOGETHER, code_changes
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import code_notes, group_size
 from ctgraph_rl.runs import checkpoints, config, train
@@ -100,10 +101,18 @@ def test_each_seed_leaves_the_files_of_a_run_alone_and_says_which_seeds_were_bes
     assert files[0] == files[1]
     assert first_line(one)["config"] == first_line(other)["config"]
     assert "together" not in first_line(other)
+    assert (first_line(one)["numbers"], first_line(other)["numbers"]) == (NUMBERS_TOGETHER, NUMBERS)
     assert load(one).agent.state_dict().keys() == load(other).agent.state_dict().keys()
     assert "seed=1" in (one / ".hydra" / "overrides.yaml").read_text()
     shown = compare(one, other).lines
     assert any("together" in line and "[0, 1, 2]" in line for line in shown), shown
+
+
+def test_a_group_of_an_older_numbers_version_is_noticed_where_a_run_alone_has_not_changed():
+    now = {"fingerprint": "0", "numbers": NUMBERS, "sources": {}}
+
+    assert code_changes({"numbers": 1}, now) == []
+    assert code_changes({"numbers": 1, "together": [0, 1]}, now) == ["ctgraph_rl (numbers version 1 before, 2 now)"]
 
 
 @pytest.mark.parametrize("method", ["finetune", pytest.param("ewc", marks=pytest.mark.slow)])
