@@ -79,8 +79,6 @@ class CTGraphEnv(EnvBase):
 
     _supports_set_state = True
 
-    set_seed = takes_numbers(EnvBase.set_seed)
-
     @takes_numbers
     def __init__(
         self,
@@ -386,6 +384,11 @@ class CTGraphEnv(EnvBase):
         """
         observation = self.rows.show().observation
         return render(self.tasks, self.state_type, self.node, self.goal_leaf, observation, size=size)
+
+    @takes_numbers
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Restart all rows with another seed, as every TorchRL environment does; return the seed for a next one."""
+        return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
         """Restart all rows with another seed and their tasks' goals; the next `reset` gives their first episodes."""

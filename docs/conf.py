@@ -46,4 +46,5 @@ autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 100
 napoleon_use_rtype = False
 OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
-nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", "Path|Sequence|Span|Tensor|TensorDictBase")]
+SHORT_NAMES = "Path|Sequence|Span|Tensor|TensorDictBase|nn.Module"
+nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", SHORT_NAMES)]

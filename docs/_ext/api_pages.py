@@ -31,6 +31,8 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.values",
             "ctgraph_rl.tasks.similarity",
             "ctgraph_rl.tasks.observability",
+            "ctgraph_rl.tasks.kinds.task_like:TaskLike",
+            "ctgraph_rl.tasks.kinds.gym_task:GymTask",
         ),
     ),
     "environments": (
@@ -48,6 +50,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (
             "ctgraph_rl.agent",
             "ctgraph_rl.learn.lifelong",
+            "ctgraph_rl.learn.loop:Progress,Group",
             "ctgraph_rl.learn.labels",
             "ctgraph_rl.learn.collective",
             "ctgraph_rl.learn.messages",
@@ -121,6 +124,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.networks",
             "baselines.update.optimiser",
+            "baselines.update.update:State,update",
             "baselines.embedding",
             "baselines.transport",
             "baselines.methods.method",
