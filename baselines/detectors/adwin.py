@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from statistics import fmean, pvariance
 from typing import Any, NamedTuple
 
@@ -74,8 +75,14 @@ class ADWIN(Detector):
             ),
         )
         self.delta, self.num_trial_episodes = delta, num_trial_episodes
-        make = _river_adwin()
-        self._new_window = lambda: make(delta, clock, max_buckets, min_window_length, grace_period)
+        self._new_window = partial(
+            _river_adwin(),
+            delta=delta,
+            clock=clock,
+            max_buckets=max_buckets,
+            min_window_length=min_window_length,
+            grace_period=grace_period,
+        )
         self.kept: dict[int, Returns] = {}
         """Of labels that were left."""
 
