@@ -41,7 +41,7 @@ def places(root: nn.Module, tensors: Sequence[Tensor]) -> list[Place]:
     found: dict[int, Place] = {}
     for module in root.modules():
         for name, value in module._parameters.items():
-            if not isinstance(module, TensorDictParams):  # has copies of other modules' under names of its own
+            if not isinstance(module, TensorDictParams):  # it repeats tensors of other modules by other names
                 found.setdefault(id(value), Place(module, name))
     return [found[id(tensor)] for tensor in tensors]
 

@@ -215,7 +215,7 @@ EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
 def episode_means(ends: TensorDictBase) -> dict[str, Any]:
     """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
 
-    Means of no episode are NaN, and so are the shares where tasks are no CT-graphs.
+    Means are NaN without an episode. Shares are NaN for tasks other than CT-graphs.
 
     Args:
         ends: the data of the last step of each episode.

@@ -44,7 +44,8 @@ def test_entropy_is_rewarded_and_the_critics_error_is_weighed(small_agent, name)
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm(small_agent, monkeypatch):
-    agent, given = small_agent("lstm_ppo", [ct_su_b1()], "agent.max_grad_norm=0.001"), []
+    agent = small_agent("lstm_ppo", [ct_su_b1()], "agent.max_grad_norm=0.001")
+    given = []
     monkeypatch.setattr("baselines.update.update.step", lambda optimiser, gradients: given.append(gradients))
 
     agent.learn(batches(agent, ct_su_b1(), 1)[0])

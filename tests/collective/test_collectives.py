@@ -50,6 +50,20 @@ def the_collective(folder: str = "runs") -> Path:
     return log.parent
 
 
+def stop_at_save(monkeypatch, count: int) -> None:
+    """Stop the process after so many checkpoints."""
+    calls = []
+    save = Checkpoints.save
+
+    def stopped(*given):
+        save(*given)
+        calls.append(given)
+        if len(calls) == count:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Checkpoints, "save", stopped)
+
+
 def test_members_of_an_isolated_collective_are_the_runs_that_their_settings_name(monkeypatch, capsys):
     assert command_line(monkeypatch, *TINY, "exchange=isolated", "exchange.num_members=2") == 0
     assert "2 members, Isolated, l2d2c_2x2: learned" in capsys.readouterr().out
@@ -73,16 +87,8 @@ def test_members_of_an_isolated_collective_are_the_runs_that_their_settings_name
 def test_a_stopped_collective_is_resumed_bit_by_bit_and_a_finished_one_is_left(monkeypatch, capsys):
     assert sweep(monkeypatch, *SHARING, "hydra.sweep.dir=whole") == 0
     whole = the_collective("whole")
-    calls, save = [], Checkpoints.save
-
-    def killed(*given):
-        save(*given)
-        calls.append(given)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(Checkpoints, "save", killed)
+        stop_at_save(patch, 3)
         assert sweep(patch, *SHARING, "checkpoint_seconds=1e-9") == 130
     capsys.readouterr()
     assert sweep(monkeypatch, *SHARING, "hydra.sweeper.status=true") == 1
@@ -147,7 +153,7 @@ class Population(Exchange):
     def load_state_dict(self, state):
         self.returns = dict(state["returns"])
 """
-"""A population of a user: members with learning rates of their own copy the weights of one that does as well."""
+"""A user's population: each member has another learning rate, and copies the weights of one with no lower return."""
 
 GROWN = (
     *("curriculum=su_b1_4tasks", "curriculum.num_frames=128", "evaluation.num_episodes=2", *TINY[4:-2]),
@@ -167,17 +173,8 @@ def population(monkeypatch):
 def test_a_population_has_settings_of_its_own_for_each_member_and_resumes(monkeypatch, capsys, population):
     assert command_line(monkeypatch, *GROWN, "hydra.run.dir=whole") == 0
     whole = the_collective("whole")
-    calls = []
-    save = Checkpoints.save
-
-    def killed(*given):
-        save(*given)
-        calls.append(given)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(Checkpoints, "save", killed)
+        stop_at_save(patch, 2)
         assert command_line(patch, *GROWN, "checkpoint_seconds=1e-9", "hydra.run.dir=stopped") == 130
     assert command_line(monkeypatch, *GROWN, "hydra.run.dir=stopped") == 0
     stopped = the_collective("stopped")

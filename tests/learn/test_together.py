@@ -211,22 +211,36 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
     its = make(
         name, method, "agent.compile=true", curriculum=of(Block(ONE, 64), Block(THREE, 64), task_id="at_boundaries")
     )
-    sizes, step = [], Group._step
+    sizes = []
+    step = Group._step
 
     def compared(group, stack, batch):
-        other = deepcopy(stack.state)
-        expected = update(stack.learners[0], other, batch)
-        measured = step(group, stack, batch)
+        first = stack.learners[0]
+        in_double = {key: wide(value) for key, value in batch.items()}
+        one = state_in_double(stack.state)
+        other = state_in_double(stack.state)
+        measured = first.compiled_step(first, one, in_double)
+        expected = update(first, other, in_double)
         sizes.append(len(batch["action"]))
-        torch.testing.assert_close(measured, expected, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(values_of(stack.state), values_of(other), rtol=1e-4, atol=1e-5)
-        return measured
+        torch.testing.assert_close(measured, expected, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(values_of(one), values_of(other), rtol=1e-10, atol=1e-10)
+        return step(group, stack, batch)
 
     monkeypatch.setattr(Group, "_step", compared)
     monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
     its.learn()
 
     assert set(sizes) == {2, 1}, "of two seeds, and of the third"
+
+
+def state_in_double(state):
+    """A copy of what an update of a stack changes, in float64."""
+    copied = deepcopy(state)
+    is_adam = copied.optimiser.is_adam  # whose compiled step computes with the number of steps
+    moments = [value for each in copied.optimiser.state for key, value in each.items() if is_adam or key != "step"]
+    for tensor in [*copied.tensors.values(), *moments, *copied.others.values()]:
+        tensor.data = wide(tensor.data)
+    return copied
 
 
 def values_of(state) -> dict[Any, torch.Tensor]:

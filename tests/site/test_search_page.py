@@ -1,4 +1,4 @@
-"""The page on searches for hyperparameters: what it shows runs, finds the best trial and goes on."""
+"""The page on searches for hyperparameters: its commands run, find the best trial and resume."""
 
 from __future__ import annotations
 
