@@ -22,6 +22,13 @@ const IMAGES = bytesOf(KERNEL.images);
 const NUM_IMAGES = IMAGES.length / PIXELS;
 const MODULE = new WebAssembly.Module(bytesOf(KERNEL.wasm));
 
+// The number of an image among those of the paper.
+function imageNumber(pixels) {
+  for (let number = 0; number < NUM_IMAGES; number++)
+    if (pixels.every((value, place) => value === IMAGES[number * PIXELS + place])) return number;
+  throw new Error("the kernel showed no image of the paper");
+}
+
 const firstNode = (b, level) => (b ** level - 1) / (b - 1);
 
 function sizes({ b, d }) {
@@ -177,8 +184,15 @@ function interval(hits, count) {
   return [Math.max(0, middle - half), Math.min(1, middle + half)];
 }
 
-// What a run.jsonl says: names of tasks, and after each block the mean return on each task.
-function performance(text) {
+// Where the episodes of an evaluation ended, in words; a log has no visits of single states.
+function endsOf({ success_rate: goal, end_rate: end }) {
+  if (typeof goal !== "number" || typeof end !== "number") return "";
+  const percent = (share) => `${Math.round(100 * share)} %`;
+  return `goal ${percent(goal)},\nother ends ${percent(end - goal)},\nfail ${percent(1 - end)}`;
+}
+
+// What a run.jsonl says: names of tasks, and after each block the mean return on each task and where episodes ended.
+function performanceMatrix(text) {
   const lines = text.split("\n"), measured = [];
   if (lines[lines.length - 1] !== "") lines.pop(); // torn, as the run was killed while it wrote
   lines.filter((line) => line).forEach((line, place) => {
@@ -192,8 +206,9 @@ function performance(text) {
   if (!own.length) throw new Error("This log has no evaluation yet.");
   const tasks = [...new Set(own.map((m) => m.task))].sort((a, b) => a - b), rows = [];
   for (const m of own) {
-    const row = rows.find((each) => each.block === m.block) || rows[rows.push({ block: m.block, frames: m.frames, returns: {} }) - 1];
+    const row = rows.find((each) => each.block === m.block) || rows[rows.push({ block: m.block, frames: m.frames, returns: {}, ends: {} }) - 1];
     row.returns[m.task] = m.return_mean;
+    row.ends[m.task] = endsOf(m);
   }
   const labels = tasks.map((task) => String((own.find((m) => m.task === task) || {}).label || `task ${task}`));
   return { name: String(measured[0].curriculum), tasks, labels, rows };

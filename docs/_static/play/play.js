@@ -76,7 +76,7 @@ function act(action) {
   rows.step();
   const reward = rows.rewards[0], outcome = OUTCOMES[rows.outcome[0]], steps = rows.steps[0];
   say("outcome", outcome === "running"
-    ? `Action ${action}, step ${steps}, reward ${reward}.`
+    ? `Action ${action}, step ${steps}, reward ${reward}. You see image ${imageNumber(rows.observation)}.`
     : `The episode ends after ${steps} steps: ${outcome}, reward ${reward}. Press n for a new one.`);
   show();
 }
@@ -87,7 +87,9 @@ function show() {
   for (let pixel = 0; pixel < PIXELS; pixel++)
     image.data.set([...Array(3).fill(rows.observation[pixel]), 255], 4 * pixel);
   context.putImageData(image, 0, 0);
-  for (const each of at("actions").children) each.disabled = rows.outcome[0] !== 0;
+  at("image").setAttribute("aria-label", `The agent sees image ${imageNumber(rows.observation)}`);
+  // `disabled` would take the focus from the button that ended the episode
+  for (const each of at("actions").children) each.setAttribute("aria-disabled", String(rows.outcome[0] !== 0));
   const kind = KINDS[rows.kind[0]], node = Number(rows.node[0]);
   say("hidden", at("reveal").checked ? `You are at ${placed(kind, node)}. The goal is ${task.goal}.` : "");
   drawTree();
@@ -188,17 +190,24 @@ async function showLog(file) {
   const table = at("matrix");
   table.replaceChildren();
   try {
-    const { name, tasks, labels, rows: blocks } = performance(await file.text());
-    say("log", `${file.name}: ${name}. Mean return on each task after each block; nothing left this browser.`);
-    const line = (cells, kind) => {
-      const row = table.insertRow();
-      cells.forEach((cell) => (row.appendChild(document.createElement(kind)).textContent = cell));
-      return row;
+    const { name, tasks, labels, rows: blocks } = performanceMatrix(await file.text());
+    say("log", `${file.name}: ${name}. Mean return on each task after each block, and where episodes ended; nothing left this browser.`);
+    const cell = (row, text, kind = "td") => {
+      const made = row.appendChild(document.createElement(kind));
+      made.textContent = text;
+      return made;
     };
-    line(["block", "frames", ...labels], "th");
-    for (const { block, frames, returns } of blocks) {
-      const row = line([block, grouped(frames), ...tasks.map((task) => returns[task] ?? "not measured")], "td");
-      tasks.forEach((task, place) => row.cells[2 + place].style.setProperty("--share", Math.max(0, Math.min(1, returns[task] || 0))));
+    const header = table.insertRow();
+    for (const label of ["block", "frames", ...labels]) cell(header, label, "th").scope = "col";
+    for (const { block, frames, returns, ends } of blocks) {
+      const row = table.insertRow();
+      cell(row, block, "th").scope = "row";
+      cell(row, grouped(frames));
+      for (const task of tasks) {
+        const made = cell(row, returns[task] ?? "not measured");
+        made.style.setProperty("--share", Math.max(0, Math.min(1, returns[task] || 0)));
+        if (ends[task]) made.appendChild(document.createElement("small")).textContent = ends[task];
+      }
     }
   } catch (error) {
     say("log", `${file.name}: ${error.message}`);

@@ -26,7 +26,7 @@ function play({ task, seed, actions, steps, count }) {
 }
 function answer(what, given) {
   if (what === "play") return { packed: [...packed(given.task)].map(String), rows: play(given) };
-  return { refusal, closedForms, ceilings, performance, leafOf }[what](...given);
+  return { refusal, closedForms, ceilings, performanceMatrix, leafOf }[what](...given);
 }`);
 
 const names = [
