@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require, takes_its_kinds
+from ctgraph_rl.core.rewards import Gradient, Needle, RewardFn
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.images import OneHot
+from ctgraph_rl.tasks.paper_json import shown_ids
 from ctgraph_rl.tasks.switch import AtRandom, ByEpisode, Drift, Switch
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
@@ -21,6 +25,8 @@ SWITCHES: dict[str, Callable[[int], Any]] = {
     "at_random": lambda episodes: AtRandom(1 / episodes),
     "drift": Drift,
 }
+REWARD_FNS: dict[str, RewardFn] = {"needle": Needle(), "gradient": Gradient()}
+IMAGE_SIZE = 12
 
 
 @takes_its_kinds
@@ -42,11 +48,24 @@ def from_axes(
     read_noise: int = 0,
     read_rotation: int = 0,
     random_graphs: int | None = None,
+    unique_decisions: bool | None = None,
+    unique_waits: bool | None = None,
+    decision_ids: Sequence[int] | None = None,
+    wait_ids: Sequence[int] | None = None,
+    num_images: int | None = None,
+    image_size: int = IMAGE_SIZE,
+    one_hot: bool = False,
+    goal_reward: float = 1.0,
+    fail_reward: float = 0.0,
+    step_reward: float = 0.0,
+    reward_std: float = 0.0,
+    reward_fn: str = "needle",
 ) -> Curriculum:
     """Tasks that differ in goal, images, depth and wait probability, in a chosen order.
 
-    Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. What the learner
-    observes and how it is evaluated is set by ``protocol`` and ``evaluation`` of a run, for any curriculum.
+    Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. All tasks share
+    rewards and the rules of what is observed. What the learner is told and how it is evaluated is set by ``protocol``
+    and ``evaluation`` of a run, for any curriculum.
 
     Args:
         configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.
@@ -71,6 +90,19 @@ def from_axes(
         read_rotation: largest rotation whenever an image is read, in whole degrees in 0..359.
         random_graphs: how many tasks to draw from ``seed``, each with one of the branching factors, depths, wait
             probabilities and image seeds, and any goal. None: all combinations.
+        unique_decisions: each decision state has an image of its own, MDP_D of the paper; None: as configured.
+        unique_waits: each wait state has an image of its own, MDP_W; None: as configured.
+        decision_ids: first and last id of decision states, D_IDs; None: the next free ids.
+        wait_ids: first and last id of wait states, W_IDs; None: the configured ones where wait states draw one of
+            several, else the next free ids.
+        num_images: length of the image set, nr_images; None: as many as there are ids.
+        image_size: r, the side of an image in pixels, a multiple of 4.
+        one_hot: vectors instead of images, 1D.
+        goal_reward: reward at the goal, high_r.
+        fail_reward: reward at the fail state, fail_r.
+        step_reward: reward of every step, in addition.
+        reward_std: standard deviation of the noise on the reward of end states, std_r.
+        reward_fn: g: ``needle`` pays at the goal, ``gradient`` also at other end states, the more the nearer.
 
     Raises:
         ValueError: for values out of range; lists the choices.
@@ -79,10 +111,34 @@ def from_axes(
         (order in ORDERS, f"order must be one of {', '.join(ORDERS)}, got {order!r}"),
         *at_least_one(num_goals=num_goals, repeats=repeats),
         (is_int(seed, 0), f"seed must be an integer >= 0, got {seed!r}"),
+        (reward_fn in REWARD_FNS, f"reward_fn must be one of {', '.join(REWARD_FNS)}, got {reward_fn!r}"),
+        (
+            not one_hot or (image_seeds, image_size) == (1, IMAGE_SIZE),
+            "one_hot has no image_seeds and no image_size: leave them out",
+        ),
+        (is_int(image_size, 4) and image_size % 4 == 0, f"image_size must be a multiple of 4, got {image_size!r}"),
+    )
+    observed = partial(
+        _observed,
+        unique_decisions=unique_decisions,
+        unique_waits=unique_waits,
+        decision_ids=decision_ids,
+        wait_ids=wait_ids,
+        num_images=num_images,
+        image_size=image_size,
+    )
+    rewarded = partial(
+        replace,
+        goal_reward=goal_reward,
+        fail_reward=fail_reward,
+        step_reward=step_reward,
+        reward_std=reward_std,
+        reward_fn=REWARD_FNS[reward_fn],
     )
     seeds = _several(image_seeds)
     if random_graphs is None:
         task, depths = _deepest(configuration, branching_factor, depth)
+        task = observed(task)
         _check_goals(goals, depths)
         if goals == "nested":
             (task,) = axes.random_goals(task, 1, seed)
@@ -93,7 +149,11 @@ def from_axes(
         require(((goals, order) == ("all", "product"), drawn))
         shapes = _choices(configuration, branching_factor=branching_factor, depth=depth, wait_prob=wait_prob)
         kinds = (KINDS[configuration],)
-        tasks = axes.random_tasks(random_graphs, seed, **shapes, kinds=kinds, image_seeds=seeds)
+        drawn_tasks = axes.random_tasks(random_graphs, seed, **shapes, kinds=kinds, image_seeds=seeds)
+        tasks = tuple(map(observed, drawn_tasks))
+    tasks = tuple(map(rewarded, tasks))
+    if one_hot:
+        tasks = axes.image_sets(tasks, [OneHot(tasks[0].images.num_images)])
     tasks = axes.cycle(axes.read_variation(tasks, read_noise, read_rotation), repeats)
     changes = _switch(switch, switch_episodes)
     return axes.sequence(name, [tasks] if changes else tasks, num_frames, switch=changes)
@@ -116,6 +176,20 @@ def _deepest(
     b = task.graph.branching_factor if branching_factor is None else branching_factor
     graph = replace(task.graph, branching_factor=b, depth=max(depths))
     return axes.reshaped(task, graph, KINDS[configuration], (1,) * graph.depth), depths
+
+
+def _observed(task: Task, num_images: int | None, image_size: int, **changes: Any) -> Task:
+    """The task with other ids of its states, and images for them; None: as configured."""
+    shown = task.observations
+    given = {name: value for name, value in changes.items() if value is not None}
+    if given:
+        draws = not shown.unique_waits and shown.wait_ids[0] < shown.wait_ids[1]
+        kept = {"wait_ids": shown.wait_ids} if draws and not given.get("unique_waits") else {}
+        found = {"unique_decisions": shown.unique_decisions, "unique_waits": shown.unique_waits, **kept, **given}
+        shown = shown_ids(task.graph, found)
+    count = shown.last_id + 1 if num_images is None else num_images
+    images = replace(task.images, num_images=count, size=image_size)  # type: ignore[type-var]
+    return replace(task, observations=shown, images=images)
 
 
 def _by_seed(

@@ -40,7 +40,23 @@ ADDED: dict[str, dict[str, Any]] = {
     **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL[2:]},
     **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False} for agent in WITH_CELL[:2]},
     **{f"baselines.methods.mask_{name.lower()}.Mask{name}": {"backbone_seed": None} for name in ("RI", "LC", "BLC")},
-    "curricula.from_axes": {"read_noise": 0, "read_rotation": 0, "random_graphs": None},
+    "curricula.from_axes": {
+        "read_noise": 0,
+        "read_rotation": 0,
+        "random_graphs": None,
+        "unique_decisions": None,
+        "unique_waits": None,
+        "decision_ids": None,
+        "wait_ids": None,
+        "num_images": None,
+        "image_size": 12,
+        "one_hot": False,
+        "goal_reward": 1.0,
+        "fail_reward": 0.0,
+        "step_reward": 0.0,
+        "reward_std": 0.0,
+        "reward_fn": "needle",
+    },
 }
 """Settings that were added after runs had been stored, each with the value for "as before".
 

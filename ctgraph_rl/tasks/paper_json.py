@@ -8,10 +8,11 @@ section ``image_dataset``, and `ctgraph_rl.tasks.reference` reads them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import as_tuple, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -78,8 +79,7 @@ def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int]
     )
     found = DEFAULTS | found
     graph = CTGraph(found["branching_factor"], found["depth"], found["wait_prob"])
-    shown = _kept(found, "unique_waits", "unique_decisions", "read_noise", "read_rotation")
-    observations = Observations(**_ids(graph, found), **shown)
+    observations = replace(shown_ids(graph, found), **_kept(found, "read_noise", "read_rotation"))
     count = found.get("num_images", observations.last_id + 1)
     one_hot = found["one_hot"]
     require((isinstance(one_hot, bool), f"{source}: image_set.1D must be true or false, got {one_hot!r}"))
@@ -113,8 +113,13 @@ def _choices(name: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
 
 
-def _ids(graph: CTGraph, found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ids of wait, decision and end states: given ones, else the next that are free."""
+def shown_ids(graph: CTGraph, found: Mapping[str, Any]) -> Observations:
+    """Return the ids of wait, decision and end states: given ones, else the next that are free.
+
+    Args:
+        graph: the tree.
+        found: ``unique_waits`` and ``unique_decisions``, and ``wait_ids`` and ``decision_ids`` if they are given.
+    """
     sizes = {
         "wait_ids": graph.num_wait_states if found["unique_waits"] else 1,
         "decision_ids": graph.num_decision_states if found["unique_decisions"] else 1,
@@ -126,12 +131,14 @@ def _ids(graph: CTGraph, found: Mapping[str, Any]) -> dict[str, Any]:
             first = _next(ids)
             ids[name] = (first, first + sizes[name] - 1)
     ends = graph.num_end_states if found["unique_waits"] or found["unique_decisions"] else 1
-    return {**ids, "end_ids": (_next(ids), _next(ids) + ends - 1)}
+    ids["end_ids"] = (_next(ids), _next(ids) + ends - 1)
+    return Observations(**ids, **_kept(found, "unique_waits", "unique_decisions"))
 
 
 def _next(ids: Mapping[str, Any]) -> int:
     """Return the id after all that are in use; 2 after the home and the fail state."""
-    lasts = [last for each in ids.values() if isinstance(each, (list, tuple)) for last in each[-1:] if is_int(last)]
+    ranges = [as_tuple(each) for each in ids.values()]
+    lasts = [last for each in ranges if isinstance(each, tuple) for last in each[-1:] if is_int(last)]
     return max([1, *lasts]) + 1
 
 
