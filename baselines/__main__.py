@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 
 NOTE = (
     "cell= is what an agent with memory remembers with. Without memory, or with cell=none, an agent acts on the\n"

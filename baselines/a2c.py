@@ -10,8 +10,8 @@ from typing import Any
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import Data
-from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss
+from baselines.parts.networks import Data
+from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
 from ctgraph_rl.checks import not_negative, require
 
 

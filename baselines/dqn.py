@@ -18,9 +18,9 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
 from baselines.cells.cell import linear_layer
-from baselines.networks import Data, encoder, num_actions_of, require_weights
-from baselines.prioritized import LARGEST_ALPHA
-from baselines.q_learning import QLearner, require_replay
+from baselines.parts.networks import Data, encoder, num_actions_of, require_weights
+from baselines.parts.prioritized import LARGEST_ALPHA
+from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 

@@ -1,13 +1,13 @@
 """DRQN: double Q-learning with an LSTM and replayed sequences.
 
-Hausknecht and Stone 2015 (arXiv 1507.06527), with stored states and double targets: see `baselines.recurrent_q`.
+Hausknecht and Stone 2015 (arXiv 1507.06527), with stored states and double targets: see `baselines.parts.recurrent_q`.
 """
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from baselines.recurrent_q import RecurrentQ
+from baselines.parts.recurrent_q import RecurrentQ
 
 
 class DRQN(RecurrentQ):

@@ -36,8 +36,8 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import linear_layer
-from baselines.networks import Data, EncoderModule, encoder, guided, num_actions_of, require_weights
-from baselines.q_learning import QLearner, require_replay
+from baselines.parts.networks import Data, EncoderModule, encoder, guided, num_actions_of, require_weights
+from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 STATE = ("eligibility", "average", "trial")

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from baselines.learner import MOST_PASSES
-from baselines.networks import Data
-from baselines.policy_gradient import PolicyGradient, critic_loss, entropy_loss
+from baselines.parts.learner import MOST_PASSES
+from baselines.parts.networks import Data
+from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
 from ctgraph_rl.checks import at_least_one, at_most, is_int, not_negative, positive, require
 
 

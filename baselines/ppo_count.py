@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import highest
+from baselines.parts.networks import highest
 from baselines.ppo import PPO
 from ctgraph_rl.checks import is_int, not_negative, require
 

@@ -30,9 +30,9 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
-from baselines.learner import reset_layer
-from baselines.networks import Data, critic, encoder, highest
-from baselines.policy_gradient import generalized_advantages
+from baselines.parts.learner import reset_layer
+from baselines.parts.networks import Data, critic, encoder, highest
+from baselines.parts.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
 from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, require_memory

@@ -1,6 +1,6 @@
 """QR-DQN with an LSTM: the distribution of returns by quantile regression, with memory.
 
-Dabney et al. 2018 (arXiv 1710.10044) on the recurrent parts of `baselines.recurrent_q`.
+Dabney et al. 2018 (arXiv 1710.10044) on the recurrent parts of `baselines.parts.recurrent_q`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 from torchrl.data import Composite, TensorSpec
 
-from baselines.recurrent_q import RecurrentQ
+from baselines.parts.recurrent_q import RecurrentQ
 
 
 class QRDQNLSTM(RecurrentQ):

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from baselines.networks import Data
-from baselines.policy_gradient import PolicyGradient, critic_loss
+from baselines.parts.networks import Data
+from baselines.parts.policy_gradient import PolicyGradient, critic_loss
 
 
 class Reinforce(PolicyGradient):

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.networks import GROUP, Data, RecurrentModule, num_actions_of, recurrent
+from baselines.parts.networks import GROUP, Data, RecurrentModule, num_actions_of, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 

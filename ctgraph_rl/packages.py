@@ -1,4 +1,4 @@
-"""The packages that this one finds by name alone: `curricula`, `baselines`, and the yaml files in ``conf``."""
+"""The packages that this one finds by name: `curricula`, `baselines`, `benchmarks`, and the yaml files in ``conf``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl.checks import require
@@ -58,24 +59,38 @@ def check_packages() -> None:
     Raises:
         ValueError: if a folder or a file, usually in the working directory, shadows one of them; names it.
     """
-    require(*((False, message) for message in _shadows()))
+    require(*((False, message) for message in _shadows("curricula", "baselines")))
 
 
 def warn_of_shadows() -> None:
     """Warn the importer of this package of what `check_packages` refuses."""
-    for message in _shadows():
+    for message in _shadows("curricula", "baselines"):
         warnings.warn(message, stacklevel=3)
 
 
-def _shadows() -> Iterator[str]:
-    """Yield what is wrong with packages that are not ours."""
-    for name in ("curricula", "baselines"):
+def _shadows(*names: str) -> Iterator[str]:
+    """Yield what is wrong with packages of these names that are not ours."""
+    for name in names:
         spec, ours = find_spec(name), HERE.parent / name
         origin = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
         found = origin.parent if origin is not None and origin.name == "__init__.py" else origin
         if found != ours:
             kind = "file" if found == origin else "folder"
             yield f"package {name!r} was found in {found} instead of {ours}; rename or move the {kind} found"
+
+
+def speed_suite(name: str) -> ModuleType:
+    """Return a module of ``benchmarks``, which measure speed and are beside this package in a checkout only.
+
+    Raises:
+        ImportError: if this package was installed from a wheel.
+        ValueError: if another package is named ``benchmarks``, too; names it.
+    """
+    if not (HERE.parent / "benchmarks" / f"{name}.py").is_file():
+        raise ImportError(f"benchmarks/{name}.py is in a checkout of ctgraph_rl and not in its wheel: run it there")
+    require(*((False, message) for message in _shadows("benchmarks")))
+    with first_imports():
+        return import_module(f"benchmarks.{name}")
 
 
 def command(module: str) -> Callable[[], None]:
@@ -151,5 +166,8 @@ def class_named(module: str, name: str) -> type | None:
         ValueError: see `check_packages`.
     """
     check_packages()
-    kind = getattr(import_module(module), name, None) if find_spec(module) is not None else None
-    return kind if isinstance(kind, type) and kind.__module__ == module else None
+    if find_spec(module) is None:
+        return None
+    home = import_module(module)  # its name is another one if it moved
+    kind = getattr(home, name, None)
+    return kind if isinstance(kind, type) and kind.__module__ == home.__name__ else None

@@ -32,8 +32,8 @@ FLOORS = (
     ("visualize", "hydra_plugins"),
     ("report",),
     ("collective", "board"),
-    ("cli", "run", "describe", "compare", "testing"),
-    ("benchmark",),
+    ("cli", "run", "describe", "compare", "testing", "benchmark"),
+    ("benchmarks",),
 )
 """Wings, lower ones first: each imports what is below, and itself; those of one floor do not import each other."""
 
@@ -41,8 +41,6 @@ TOP = {
     "curricula.__main__": "a command of cli.py",
     "baselines.__main__": "a command of cli.py",
     "baselines.methods.__main__": "a command of cli.py",
-    "baselines.benchmark": "composes agents as a run does",
-    "baselines.ladder": "measures as the benchmark of the environment does",
 }
 """Modules that stand above all floors, and why."""
 
@@ -68,7 +66,8 @@ KNOW_HYDRA = (
 
 DOORS = {
     "ctgraph_rl": "its names are imported when they are first used",
-    "ctgraph_rl.packages": "the only door to curricula and baselines",
+    "baselines": "former names of its modules",
+    "ctgraph_rl.packages": "the only door to curricula, baselines and benchmarks",
     "ctgraph_rl.board.relearn": "learners of others, in a process of their own",
     "ctgraph_rl.log.sources": "looks for modules of the user, and imports none",
     "ctgraph_rl.metrics": "all of its own modules, so that no metric is left out",
@@ -80,17 +79,17 @@ DOORS = {
 }
 """Modules that import by name, and why."""
 
-CATALOGUES = ("baselines", "baselines.detectors", "baselines.exchanges", "baselines.methods", "curricula")
-"""Folders of one file for each of many things of a kind."""
+CATALOGUES = ("baselines.methods", "curricula")
+"""Folders of one class or named sequence a file."""
 
 LONG_FILES: dict[str, str] = {}
 """Files of more than 500 lines, and why."""
 
 LONG_FUNCTIONS = [
-    "baselines.benchmark.main",
+    "benchmarks.agents.main",
+    "benchmarks.environments.main",
     "ctgraph_rl.batch.params._observation_params",
     "ctgraph_rl.batch.rows.__init__",
-    "ctgraph_rl.benchmark.main",
     "ctgraph_rl.board.rescore._of_the_log",
     "ctgraph_rl.report.figures.labels.draw_labels",
     "make._parser",

@@ -17,7 +17,7 @@ import torch
 from helpers.reference_files import SHIPPED_2023
 from helpers.stopped_runs import Slow, limited
 
-from baselines.catalogue import Entry, catalogue
+from baselines.parts.catalogue import Entry, catalogue
 from ctgraph_rl import (
     Block,
     CTGraph,

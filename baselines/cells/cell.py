@@ -87,7 +87,7 @@ class Cell(TakesNumbers, nn.Module):
         return torch.stack(outputs, dim=1)
 
     def tree(self, inputs: Tensor, branches: Branches, state: State) -> Tensor:
-        """Compute the outputs at the ends of different histories; see `baselines.distinct.histories`.
+        """Compute the outputs at the ends of different histories; see `baselines.parts.distinct.histories`.
 
         Args:
             inputs: [num_groups, num_inputs].

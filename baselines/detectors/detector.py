@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from baselines.detectors.seen import Seen, Verdict
-from baselines.methods.self_labelled import SelfLabelled
+from baselines.methods.parts.self_labelled import SelfLabelled
 from ctgraph_rl.checks import TakesNumbers, at_least_one, at_most, is_int, require
 
 if TYPE_CHECKING:
@@ -21,9 +21,9 @@ MOST_LABELS = 2**20
 class Detector(TakesNumbers):
     """Judges from what the learner sees whether the task is still that of the present label.
 
-    Labels are 0, 1, 2, ... in the order in which they are opened. `baselines.methods.self_labelled.SelfLabelled` calls
-    `observe` once with each batch, before the batch is learned from, and tells by `start_label` with which label it
-    acts next. Detectors draw nothing from torch's global generator.
+    Labels are 0, 1, 2, ... in the order in which they are opened. `baselines.methods.parts.self_labelled.SelfLabelled`
+    calls `observe` once with each batch, before the batch is learned from, and tells by `start_label` with which label
+    it acts next. Detectors draw nothing from torch's global generator.
 
     Args:
         max_labels: most labels; None, where a detector allows it: one for each task of the curriculum.

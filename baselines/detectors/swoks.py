@@ -17,7 +17,7 @@ from torch import Tensor
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
 from baselines.detectors.two_sample import MOST_VALUES, ks_greater
-from baselines.embedding import sliced_distances, unit_directions
+from baselines.parts.embedding import sliced_distances, unit_directions
 from ctgraph_rl.checks import at_least_one, fraction, is_int, positive, require
 
 WINDOWS_BEFORE = 3

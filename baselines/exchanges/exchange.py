@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from baselines.methods.masks import Masks
+from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, require
 from ctgraph_rl.learn.collective import Help

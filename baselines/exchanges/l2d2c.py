@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from baselines.exchanges.exchange import MaskExchange
-from baselines.methods.masks import CombinedMasks, Masks
+from baselines.methods.parts.masks import CombinedMasks, Masks
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all

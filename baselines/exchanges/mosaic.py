@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
-from baselines.embedding import linear_wasserstein, reference_points, transitions
 from baselines.exchanges.exchange import MaskExchange
 from baselines.methods.mask_shared import MaskShared
-from baselines.methods.masks import Masks
-from baselines.methods.weights import flat
+from baselines.methods.parts.masks import Masks
+from baselines.methods.parts.weights import flat
+from baselines.parts.embedding import linear_wasserstein, reference_points, transitions
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import LARGEST_INT, at_least_one, is_int, is_real, require, true_or_false
 from ctgraph_rl.learn.collective import Help
@@ -209,7 +209,7 @@ class Known:
             self.recent[key] = torch.cat([self.recent.get(key, new[:0]), new])[-most:].clone()
 
     def sample(self, number: int, num_actions: int, generator: torch.Generator) -> Tensor:
-        """Draw transitions without replacement, as points; see `baselines.embedding.transitions`."""
+        """Draw transitions without replacement, as points; see `baselines.parts.embedding.transitions`."""
         drawn = torch.randperm(len(self.recent["action"]), generator=generator, device="cpu")[:number]
         observation, action, reward = (self.recent[key][drawn] for key in ("observation", "action", "reward"))
         return transitions(observation, action, reward.squeeze(-1), num_actions)

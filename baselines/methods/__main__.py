@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from baselines.catalogue import Entry, catalogue
+from baselines.parts.catalogue import Entry, catalogue
 
 
 def needs_ids(method: Entry) -> str:

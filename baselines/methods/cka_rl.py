@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from baselines.learner import Learner
 from baselines.methods.method import TaskMethod
-from baselines.methods.weights import Weights, flat, head_names
+from baselines.methods.parts.weights import Weights, flat, head_names
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
 from ctgraph_rl.tasks.curriculum import Curriculum
 

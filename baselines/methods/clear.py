@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.learner import Learner
 from baselines.methods.method import Method
-from baselines.methods.weights import Weights
-from baselines.networks import Data, sequences_of
+from baselines.methods.parts.weights import Weights
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data, sequences_of
 from ctgraph_rl.checks import at_least_one, not_negative, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
 

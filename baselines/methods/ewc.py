@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.learner import Learner
-from baselines.methods.importance import SampledImportance, learnt_steps, num_learnt
-from baselines.methods.weights import flat
-from baselines.networks import Data
+from baselines.methods.parts.importance import SampledImportance, learnt_steps, num_learnt
+from baselines.methods.parts.weights import flat
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data
 from baselines.update.compiled import compiled
 from baselines.update.update import total_loss
 from ctgraph_rl.checks import fraction, one_of, require, true_or_false

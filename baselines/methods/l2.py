@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.methods.importance import Importance
+from baselines.methods.parts.importance import Importance
 
 
 class L2(Importance):

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from baselines.methods.importance import SampledImportance, learnt_steps
-from baselines.networks import Data
+from baselines.methods.parts.importance import SampledImportance, learnt_steps
+from baselines.parts.networks import Data
 
 
 class MAS(SampledImportance):

@@ -13,9 +13,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.learner import Learner
-from baselines.methods.selection import STREAM, SelectedMasks, own_generator
-from baselines.methods.weights import Weights
+from baselines.methods.parts.selection import STREAM, SelectedMasks, own_generator
+from baselines.methods.parts.weights import Weights
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
 from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.tasks.curriculum import Curriculum

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.methods.masks import CombinedMasks
+from baselines.methods.parts.masks import CombinedMasks
 
 
 class MaskBLC(CombinedMasks):

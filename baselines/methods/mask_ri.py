@@ -5,7 +5,7 @@ Ben-Iwhiwhu et al. 2023 (TMLR, arXiv 2212.11110), their Mask_RI.
 
 from __future__ import annotations
 
-from baselines.methods.masks import Masks
+from baselines.methods.parts.masks import Masks
 
 
 class MaskRI(Masks):

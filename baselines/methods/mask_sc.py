@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from baselines.learner import Learner
-from baselines.methods.selection import SelectedMasks
-from baselines.methods.weights import Weights
+from baselines.methods.parts.selection import SelectedMasks
+from baselines.methods.parts.weights import Weights
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, is_real, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from baselines.learner import Learner
-from baselines.methods.masks import Masks, combined
-from baselines.methods.weights import Weights, flat
+from baselines.methods.parts.masks import Masks, combined
+from baselines.methods.parts.weights import Weights, flat
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions

@@ -14,9 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.hooks import Hooks
-from baselines.learner import Learner
-from baselines.methods.weights import Weights
+from baselines.methods.parts.weights import Weights
+from baselines.parts.hooks import Hooks
+from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import TakesNumbers, require
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -89,7 +89,7 @@ class Method(TakesNumbers, Hooks):
         missing = [f"`{name}`" for name in self.agent_members if not hasattr(agent, name)]
         missing += ["`torch.nn.Module` as its base"] * (not isinstance(agent, nn.Module))
         message = f"{type(self).__name__} needs an agent with {', '.join(missing)}, got {type(agent).__name__}"
-        require((not missing, f"{message}: derive it from baselines.learner.Learner, or take method=finetune"))
+        require((not missing, f"{message}: derive it from baselines.parts.learner.Learner, or take method=finetune"))
         return AgentWithMethod(cast(Learner, agent), self, curriculum)
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:

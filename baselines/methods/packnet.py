@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.learner import Learner
-from baselines.methods.heads import Heads
 from baselines.methods.method import TaskMethod
-from baselines.methods.weights import Weights
+from baselines.methods.parts.heads import Heads
+from baselines.methods.parts.weights import Weights
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.learner import Learner
 from baselines.methods.method import TaskMethod
-from baselines.methods.weights import Weights
+from baselines.methods.parts.weights import Weights
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.learner import Learner
-from baselines.methods.importance import Importance
-from baselines.methods.weights import Weights, flat
+from baselines.methods.parts.importance import Importance
+from baselines.methods.parts.weights import Weights, flat
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 

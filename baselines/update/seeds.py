@@ -17,10 +17,10 @@ from torch import Tensor
 from torch._inductor import compile
 from torch.fx import GraphModule
 
-from baselines.hooks import Hooks
-from baselines.learner import Learner
 from baselines.methods.method import AgentWithMethod
-from baselines.networks import Data
+from baselines.parts.hooks import Hooks
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data
 from baselines.update.compiled import compiler_options
 from baselines.update.optimiser import has_parts
 from baselines.update.stack import Stack

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from baselines.learner import Learner
-from baselines.networks import Data
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data
 from baselines.update.optimiser import Parts, parts_of
 from baselines.update.update import State, over_seeds, stacked, unstacked
 

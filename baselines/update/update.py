@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, vmap
 
-from baselines.networks import Data
+from baselines.parts.networks import Data
 from baselines.update.optimiser import Parts, step
 
 if TYPE_CHECKING:
-    from baselines.learner import Learner
+    from baselines.parts.learner import Learner
 
 
 class State(NamedTuple):

@@ -9,9 +9,9 @@ from inspect import getdoc
 from results_of import agents_results, methods_results
 from yaml_settings import ALONE, base_of, escaped, first_comment, names_in, settings_of, table
 
-from baselines.catalogue import Entry, catalogue
 from baselines.cells.cell import Cell
 from baselines.methods.__main__ import needs_ids
+from baselines.parts.catalogue import Entry, catalogue
 
 DETECTABLE = "curriculum=dick2020_pair agent=ppo method=mask_ri "
 """A run in which every detector can work."""

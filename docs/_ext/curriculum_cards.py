@@ -10,7 +10,7 @@ from results_of import curriculum_results
 from yaml_settings import ALONE, CONF, escaped, settings_of, table
 
 import curricula
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import Curriculum, Task
 from ctgraph_rl.describe import Sheet, describe, to_markdown
 from ctgraph_rl.tasks.task import are_graphs

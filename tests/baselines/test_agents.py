@@ -20,7 +20,7 @@ from helpers.small_agents import (
 )
 from torchrl.envs.utils import set_exploration_type
 
-from baselines.networks import Encoder
+from baselines.parts.networks import Encoder
 from ctgraph_rl import Block, CTGraphEnv, Curriculum, learn_curriculum
 from ctgraph_rl.learn.collect import collect
 from curricula.paper import ct_su_b1

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from baselines.prioritized import PrioritySampler
+from baselines.parts.prioritized import PrioritySampler
 from baselines.qrdqn_lstm import QRDQNLSTM
 from ctgraph_rl import CTGraphEnv, evaluate
 from ctgraph_rl.core.dynamics import OUTCOME_GOAL

@@ -12,10 +12,10 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import nn
 
-from baselines.catalogue import catalogue
 from baselines.cells.cell import Cell
 from baselines.cells.scan import linear_scan, max_scan
-from baselines.networks import GROUP, EncoderModule, RecurrentModule
+from baselines.parts.catalogue import catalogue
+from baselines.parts.networks import GROUP, EncoderModule, RecurrentModule
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.packages import conf_dir

@@ -9,8 +9,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from baselines.embedding import linear_wasserstein, reference_points, sliced_wasserstein, transitions, unit_directions
-from baselines.transport import optimal_plan
+from baselines.parts.embedding import (
+    linear_wasserstein,
+    reference_points,
+    sliced_wasserstein,
+    transitions,
+    unit_directions,
+)
+from baselines.parts.transport import optimal_plan
 
 
 @pytest.fixture(autouse=True)

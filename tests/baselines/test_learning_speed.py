@@ -14,18 +14,18 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import LSTMModule, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss, ValueEstimators
 
-from baselines import benchmark
-from baselines._roofline import Products
-from baselines._startup import BARE, RUN, seconds
 from baselines.cells.lstm import packed_lstm
-from baselines.distinct import distinct
-from baselines.networks import GROUP
+from baselines.parts.distinct import distinct
+from baselines.parts.networks import GROUP
 from baselines.update import seeds as together
 from baselines.update.compiled import compiler_options
 from baselines.update.seeds import Group, why_not_together
 from baselines.update.update import update
+from benchmarks import agents as benchmark
+from benchmarks import environment_ladder as ladder_of_envs
+from benchmarks.roofline import Products
+from benchmarks.startup import BARE, RUN, seconds
 from ctgraph_rl import CTGraphEnv
-from ctgraph_rl.benchmark import ladder as ladder_of_envs
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
 

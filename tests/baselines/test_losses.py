@@ -9,7 +9,7 @@ import torch
 from helpers.small_agents import ONE_HOT_TASK, Tiny, batches, learnt_from
 from torch import nn
 
-from baselines.networks import Encoder
+from baselines.parts.networks import Encoder
 from baselines.update.optimiser import make_optimiser
 from baselines.update.seeds import sampled
 from baselines.update.stack import Stack

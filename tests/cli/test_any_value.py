@@ -15,7 +15,7 @@ from helpers.sweeping import command_line
 from omegaconf import DictConfig, OmegaConf
 
 import curricula
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.run import ERRORS
 from ctgraph_rl.runs import config

@@ -11,7 +11,7 @@ from importlib.metadata import version
 import pytest
 
 import ctgraph_rl
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import cli, run
 
 

@@ -13,7 +13,7 @@ from helpers.small_agents import AGENTS
 from helpers.sweeping import command_line
 
 from baselines.__main__ import main
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import RunLog, agent
 from curricula.paper import ct_su_b1
 

@@ -18,14 +18,14 @@ from helpers.sweeping import command_line
 from omegaconf import OmegaConf
 
 import curricula
-from baselines.catalogue import catalogue
-from baselines.hooks import Hooks
-from baselines.learner import Learner
 from baselines.methods.__main__ import main, needs_ids
 from baselines.methods.finetune import Finetune
 from baselines.methods.l2 import L2
 from baselines.methods.method import Method
-from baselines.methods.weights import flat
+from baselines.methods.parts.weights import flat
+from baselines.parts.catalogue import catalogue
+from baselines.parts.hooks import Hooks
+from baselines.parts.learner import Learner
 from ctgraph_rl import CTGraphEnv, Protocol, RunLog, cli, load
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs.config import target

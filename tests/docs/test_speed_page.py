@@ -10,8 +10,9 @@ import pytest
 import torch
 from helpers.paths import CHECKOUT
 
-from ctgraph_rl import CTGraphEnv, Rows, Steps, benchmark, rollout
-from ctgraph_rl.benchmark import ladder
+from benchmarks import environment_ladder as ladder
+from benchmarks import environments as benchmark
+from ctgraph_rl import CTGraphEnv, Rows, Steps, rollout
 from ctgraph_rl.core import reading
 from ctgraph_rl.core.dynamics import words_of
 from ctgraph_rl.tasks.configurations import ct_co_b1

@@ -21,7 +21,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import curricula
-from baselines import _stable
+from benchmarks import stable
 from ctgraph_rl.gym import CTGraphGymEnv, make_task
 from ctgraph_rl.sb3 import SB3VecEnv
 from ctgraph_rl.tasks import configurations as paper
@@ -194,9 +194,9 @@ def test_the_benchmark_counts_the_first_episode_of_each_row_and_no_later_one(mon
         def predict(self, observation, state, episode_start, deterministic):
             return np.zeros(100), None
 
-    agent = object.__new__(_stable.Stable)
+    agent = object.__new__(stable.Stable)
     agent.task, agent.model = None, Model()
-    monkeypatch.setattr(_stable, "batch", lambda task, num_rows: Envs())
+    monkeypatch.setattr(stable, "batch", lambda task, num_rows: Envs())
 
     assert agent.success() == 0.5
 

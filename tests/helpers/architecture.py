@@ -17,7 +17,7 @@ from pathlib import Path
 
 from helpers.paths import CHECKOUT
 
-PACKAGES = ("ctgraph_rl", "curricula", "baselines", "hydra_plugins")
+PACKAGES = ("ctgraph_rl", "curricula", "baselines", "benchmarks", "hydra_plugins")
 RESULTS = CHECKOUT / "docs" / "results"
 BY_NAME = ("import_module", "find_spec", "__import__")
 """Functions that import, or look for, a module by its name."""

@@ -15,12 +15,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 
-from baselines.catalogue import catalogue
-from baselines.learner import Learner
-from baselines.methods.importance import Importance
 from baselines.methods.method import AgentWithMethod, Method
-from baselines.policy_gradient import PolicyGradient
-from baselines.q_learning import QLearner
+from baselines.methods.parts.importance import Importance
+from baselines.parts.catalogue import catalogue
+from baselines.parts.learner import Learner
+from baselines.parts.policy_gradient import PolicyGradient
+from baselines.parts.q_learning import QLearner
 from ctgraph_rl import Block, CTGraph, CTGraphEnv, Curriculum, Evaluation, OneHot, Protocol, Task
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import conf_dir

@@ -18,14 +18,14 @@ from helpers.small_agents import POLICY_GRADIENTS, agent_of, others_slow, parame
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import baselines.learner
+import baselines.parts.learner
 import curricula
-from baselines.ladder import Seeds, built
-from baselines.learner import Learner
+from baselines.parts.learner import Learner
 from baselines.update.update import losses_of, total_loss
+from benchmarks.agent_ladder import Seeds, built
+from benchmarks.environments import configurations
 from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
 from ctgraph_rl.batch import rows
-from ctgraph_rl.benchmark import configurations
 from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn import collect
 from ctgraph_rl.learn.collect import CapturedAct, in_time_order, start_of_episodes
@@ -37,7 +37,7 @@ TINY = {"num_envs": 8, "num_steps": 4, "hidden_size": 8, "num_epochs": 1}
 @pytest.fixture
 def captured(monkeypatch) -> None:
     """Use regions on every device."""
-    for module in (collect, baselines.learner):
+    for module in (collect, baselines.parts.learner):
         monkeypatch.setattr(module, "captures", lambda device: True)
 
 

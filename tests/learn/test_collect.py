@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn.common import TensorDictModuleWrapper
 from torch import Tensor
 
-from baselines.networks import ActorCritic
+from baselines.parts.networks import ActorCritic
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect, take_step
 

@@ -10,10 +10,11 @@ import torch
 from helpers.oracles import confounding
 from helpers.small_agents import POLICY_GRADIENTS, agent_of
 
-import baselines.learner
+import baselines.parts.learner
 import curricula
+from benchmarks import environment_ladder as ladder
+from benchmarks.environments import configurations
 from ctgraph_rl import CTGraphEnv, Rows, Steps, learn_curriculum, make_agent, rollout
-from ctgraph_rl.benchmark import configurations, ladder
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.learn import collect
@@ -39,7 +40,7 @@ def eager(monkeypatch):
     """Take steps one by one."""
 
     def take() -> None:
-        for module in (collect, baselines.learner):
+        for module in (collect, baselines.parts.learner):
             monkeypatch.setattr(module, "captures", lambda device: False)
 
     return take

@@ -12,7 +12,7 @@ from helpers.paths import CHECKOUT
 
 import ctgraph_rl
 import curricula
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import cli, metrics
 
 EXTENSIONS = CHECKOUT / "docs" / "_ext"

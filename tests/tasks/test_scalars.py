@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import curricula
-from baselines.catalogue import catalogue
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import (
     Block,
     CTGraph,

@@ -19,8 +19,9 @@ from typing import Any
 
 import torch
 
-from baselines import ladder as learning
-from ctgraph_rl.benchmark import configurations, ladder, machine
+from benchmarks import agent_ladder as learning
+from benchmarks import environment_ladder as ladder
+from benchmarks.environments import configurations, machine
 from ctgraph_rl.log.provenance import versions
 from studies.raw import HERE
 

@@ -12,9 +12,9 @@ import torch
 from helpers.scripted import ONE, of
 from helpers.small_agents import MINIBATCHES, TINY, made
 
-from baselines.catalogue import catalogue
 from baselines.detectors.adwin import ADWIN, Returns, bound
 from baselines.detectors.seen import SUSPICION, Seen
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl import Block, RunLog, learn_curriculum
 from ctgraph_rl.runs.train import new_agent
 

@@ -10,9 +10,9 @@ import torch
 from torch.testing import assert_close
 
 import curricula
-from baselines.catalogue import catalogue
 from baselines.detectors.amd import AMD, Counts, chi_squared_tail, clusters, statistic
 from baselines.detectors.seen import Seen
+from baselines.parts.catalogue import catalogue
 from ctgraph_rl.learn.collect import collect, make_env
 
 DEFAULTS = next(entry.settings for entry in catalogue("detector") if entry.name == "amd")

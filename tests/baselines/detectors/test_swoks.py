@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from baselines.catalogue import catalogue
 from baselines.detectors.seen import SUSPICION, Seen
 from baselines.detectors.swoks import SWOKS, points_of
 from baselines.detectors.two_sample import ks_greater
-from baselines.embedding import sliced_distances, unit_directions
+from baselines.parts.catalogue import catalogue
+from baselines.parts.embedding import sliced_distances, unit_directions
 
 PUBLISHED = next(entry.settings for entry in catalogue("detector") if entry.name == "swoks")
 SMALL = {"window": 20, "num_windows": 40, "num_directions": 5, "num_tested": 8, "num_left_out": 10, "num_kept": 40}

@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from baselines.methods.cka_rl import CKARL, merged
 from baselines.methods.finetune import Finetune
 from baselines.methods.method import AgentWithMethod
-from baselines.methods.weights import flat
+from baselines.methods.parts.weights import flat
 
 
 def cka(**changes: Any) -> CKARL:

@@ -13,8 +13,8 @@ from helpers.kill_runs import equal
 from helpers.scripted import ONE, THREE, TWO, Scripted, of
 from helpers.small_agents import MINIBATCHES, REPLAY, TINY, made, others_slow, saved_and_loaded, weights_for
 
-from baselines.methods.importance import Samples
 from baselines.methods.method import Method, TaskMethod
+from baselines.methods.parts.importance import Samples
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.packages import conf_dir
 from ctgraph_rl.runs import job

@@ -30,11 +30,11 @@ from baselines.methods.cka_rl import CKARL
 from baselines.methods.mask_blc import MaskBLC
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
-from baselines.methods.masks import Masks
 from baselines.methods.method import AgentWithMethod
 from baselines.methods.packnet import PackNet
+from baselines.methods.parts.masks import Masks
+from baselines.methods.parts.weights import flat
 from baselines.methods.scratch import Scratch
-from baselines.methods.weights import flat
 
 MASKS = (MaskRI, MaskLC, MaskBLC)
 KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {

@@ -13,13 +13,13 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 import curricula
-from baselines.embedding import linear_wasserstein, reference_points, transitions
 from baselines.methods import mask_amsc
 from baselines.methods.mask_amsc import MaskAMSC, sparsemax
 from baselines.methods.mask_lc import MaskLC
 from baselines.methods.mask_ri import MaskRI
 from baselines.methods.mask_sc import MaskSC
 from baselines.methods.method import AgentWithMethod
+from baselines.parts.embedding import linear_wasserstein, reference_points, transitions
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.policies import OptimalPolicy, RandomPolicy

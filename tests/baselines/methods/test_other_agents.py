@@ -11,10 +11,10 @@ from helpers.scripted import ONE, TWO, of
 from helpers.small_agents import TINY, made
 from torch import nn
 
-from baselines.catalogue import catalogue
-from baselines.learner import Learner
 from baselines.methods.finetune import Finetune
 from baselines.methods.method import Method
+from baselines.parts.catalogue import catalogue
+from baselines.parts.learner import Learner
 from ctgraph_rl import Block, agent, learn_curriculum
 from ctgraph_rl.runs.train import new_agent
 

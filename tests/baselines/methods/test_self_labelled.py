@@ -16,8 +16,8 @@ from helpers.sweeping import command_line
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
-from baselines.methods.self_labelled import SelfLabelledAgent
-from baselines.networks import trunk_of
+from baselines.methods.parts.self_labelled import SelfLabelledAgent
+from baselines.parts.networks import trunk_of
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.runs.load import load

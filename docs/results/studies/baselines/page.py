@@ -37,7 +37,7 @@ def cell(lines: Raw, column: str, bounds: tuple[float, float] | Bounds = (0.0, 1
 
 def by_goal(raw: Raw, configuration: str, title: str = "") -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
-    from baselines.catalogue import catalogue
+    from baselines.parts.catalogue import catalogue
     from ctgraph_rl.tasks.values import open_loop_ceiling
 
     kinds = {agent.name: agent.kind for agent in catalogue("agent")}

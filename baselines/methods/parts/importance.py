@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.learner import Learner
-from baselines.methods.heads import Heads
 from baselines.methods.method import Method, multi_task_blocks
-from baselines.methods.weights import Weights, flat
-from baselines.networks import Data
+from baselines.methods.parts.heads import Heads
+from baselines.methods.parts.weights import Weights, flat
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data
 from ctgraph_rl.checks import at_least_one, one_of, positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 

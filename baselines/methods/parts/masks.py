@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from baselines.learner import Learner
 from baselines.methods.method import TaskMethod
-from baselines.methods.weights import Weights, flat
+from baselines.methods.parts.weights import Weights, flat
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import LARGEST_INT, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from baselines.networks import Data
+from baselines.parts.networks import Data
 
 
 class Hooks(nn.Module):

@@ -11,7 +11,7 @@ import yaml
 
 from ctgraph_rl.packages import class_named, conf_dir
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Entry(NamedTuple):

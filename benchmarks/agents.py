@@ -8,8 +8,8 @@ it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations 
 core. ``--cells`` measures LSTM-PPO with each cell in place of the LSTM, alone. Ctrl-C ends a measurement, and what was
 measured until then is printed.
 
-``--device cuda`` measures `baselines.ladder` instead, ``--startup`` how long a run takes to its first step, beside the
-bare imports of torch and torchrl; ``--roofline`` how fast the matrix products of learning are alone, which bounds it.
+``--device cuda`` measures `benchmarks.agent_ladder` instead, ``--startup`` how long a run takes to its first step,
+beside the bare imports of torch and torchrl; ``--roofline`` how fast its matrix products are, which bound it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from baselines import _roofline, _startup, ladder
-from baselines.catalogue import Entry, catalogue
+from baselines.parts.catalogue import Entry, catalogue
+from benchmarks import agent_ladder, roofline, startup
+from benchmarks.environment_ladder import climbed, found, until
+from benchmarks.environment_ladder import table as ladder_table
+from benchmarks.environments import machine
 from ctgraph_rl import CTGraphEnv, Task, evaluate
-from ctgraph_rl.benchmark import machine
-from ctgraph_rl.benchmark.ladder import climbed, found, until
-from ctgraph_rl.benchmark.ladder import table as ladder_table
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
@@ -160,7 +160,7 @@ def contenders(agents: list[str]) -> Iterator[Contender]:
         task = TASKS[label]
         yield Contender(name, label, "ours", partial(Ours, name, task))
         if find_spec("sb3_contrib"):
-            from baselines._stable import Stable, ways  # needs Stable-Baselines3, which is optional
+            from benchmarks.stable import Stable, ways  # needs Stable-Baselines3, which is optional
 
             for who, way in ways().items():
                 yield Contender(name, label, who, partial(Stable, name, settings(name), task, way))
@@ -198,17 +198,17 @@ def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
 
 
 def on_device(device: torch.device, options: argparse.Namespace) -> str:
-    """Measure `baselines.ladder` on a device, with the agents of the options; return the table."""
+    """Measure `benchmarks.agent_ladder` on a device, with the agents of the options; return the table."""
     rungs = [
         rung
-        for rung in ladder.rungs(device, options.rows, options.together)
-        if rung.name == ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents
+        for rung in agent_ladder.rungs(device, options.rows, options.together)
+        if rung.name == agent_ladder.ENVIRONMENT or rung.name.partition(",")[0] in options.agents
     ]
-    rows = found(climbed(rungs, options, device), ladder.ENVIRONMENT)
-    return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, ladder.ENVIRONMENT)}"
+    rows = found(climbed(rungs, options, device), agent_ladder.ENVIRONMENT)
+    return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, agent_ladder.ENVIRONMENT)}"
 
 
-def roofline(agents: list[str], rounds: int) -> str:
+def beside_products(agents: list[str], rounds: int) -> str:
     """Format how fast agents learn, LSTM-PPO also with pixel noise, beside their matrix products alone."""
     task = ct_su_b1(GOAL)
     noisy = replace(task, observations=replace(task.observations, read_noise=10))
@@ -216,7 +216,7 @@ def roofline(agents: list[str], rounds: int) -> str:
     learners = [(name, label, Ours(name, task, 0).learn) for name, label, task in pairs if name in agents]
     for *_, learn in learners:
         learn()
-    return _roofline.table(learners, rounds)
+    return roofline.table(learners, rounds)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -247,12 +247,12 @@ def main(arguments: list[str] | None = None) -> None:
         *positive(seconds=options.seconds, limit=options.limit),
     )
     if options.startup:
-        print(f"{machine()}; medians of {options.rounds} rounds\n\n{_startup.table(options.rounds)}")
+        print(f"{machine()}; medians of {options.rounds} rounds\n\n{startup.table(options.rounds)}")
         return
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     if options.roofline:
-        print(f"{machine()}; medians of {options.rounds} rounds\n\n{roofline(options.agents, options.rounds)}")
+        print(f"{machine()}; medians of {options.rounds} rounds\n\n{beside_products(options.agents, options.rounds)}")
         return
     if options.device:
         print(on_device(checked_device(options.device), options))

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
 from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, linear_layer, reset
-from baselines.distinct import distinct, histories, renumbered
+from baselines.parts.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION

@@ -12,8 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.hooks import Hooks
-from baselines.networks import Data, Place, places
+from baselines.parts.hooks import Hooks
+from baselines.parts.networks import Data, Place, places
 from baselines.update.compiled import compiled
 from baselines.update.optimiser import parts_of
 from baselines.update.update import State, Update, update

@@ -19,8 +19,8 @@ from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
-from baselines.networks import Data, copied_action, num_actions_of, recurrent, require_weights
-from baselines.q_learning import QLearner, require_replay
+from baselines.parts.networks import Data, copied_action, num_actions_of, recurrent, require_weights
+from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
 

@@ -14,8 +14,8 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate, 
 
 from baselines.cells.cell import MakeCell
 from baselines.cells.lstm import LSTM
-from baselines.learner import Learner
-from baselines.networks import (
+from baselines.parts.learner import Learner
+from baselines.parts.networks import (
     GROUP,
     ActorCritic,
     Data,

@@ -16,12 +16,12 @@ import yaml
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from baselines.networks import draw
-from baselines.policy_gradient import PolicyGradient, generalized_advantages
+from baselines.parts.networks import draw
+from baselines.parts.policy_gradient import PolicyGradient, generalized_advantages
 from baselines.update.stack import Stack
 from baselines.update.update import update
+from benchmarks.environment_ladder import WAYS, Run, Rung
 from ctgraph_rl.batch.specs import specs_of
-from ctgraph_rl.benchmark.ladder import WAYS, Run, Rung
 from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import collect

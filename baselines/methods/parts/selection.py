@@ -10,11 +10,17 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from baselines.embedding import linear_wasserstein, reference_points, sliced_wasserstein, transitions, unit_directions
-from baselines.learner import Learner
 from baselines.methods.mask_lc import MaskLC
-from baselines.methods.masks import combined
-from baselines.methods.weights import Weights
+from baselines.methods.parts.masks import combined
+from baselines.methods.parts.weights import Weights
+from baselines.parts.embedding import (
+    linear_wasserstein,
+    reference_points,
+    sliced_wasserstein,
+    transitions,
+    unit_directions,
+)
+from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions

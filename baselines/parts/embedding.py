@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-from baselines.transport import optimal_plan
+from baselines.parts.transport import optimal_plan
 
 REFERENCE_SEED = 98
 """Of reference points and directions: embeddings are comparable if they share these."""

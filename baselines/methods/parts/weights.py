@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.networks import places
+from baselines.parts.networks import places
 from ctgraph_rl.checks import require
 
 

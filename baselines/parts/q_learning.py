@@ -18,9 +18,9 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from baselines.learner import MOST_PASSES, Learner
-from baselines.networks import Data, guided
-from baselines.prioritized import PrioritySampler
+from baselines.parts.learner import MOST_PASSES, Learner
+from baselines.parts.networks import Data, guided
+from baselines.parts.prioritized import PrioritySampler
 from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
 from ctgraph_rl.core.device import torchs_defaults

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
-from baselines.networks import sequences_of, trunk_of
+from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, Method
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum

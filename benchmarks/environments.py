@@ -1,0 +1,334 @@
+"""How fast the environment runs, with ``--device cuda`` on a GPU, and with ``--sizes`` what reading costs.
+
+Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
+table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of
+as many bytes as the observations have, and a native TorchRL environment that does nothing but count, where some rows
+end at every step, as in any batch of episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+
+import gymnasium
+import torch
+from rich.console import Console
+from rich.progress import track
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from benchmarks import environment_ladder as ladder
+from benchmarks import sizes
+from ctgraph_rl.batch.rollout import Steps, rollout
+from ctgraph_rl.batch.rows import Rows
+from ctgraph_rl.checks import at_least_one, positive, require
+from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
+from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
+from ctgraph_rl.tasks.task import Task
+
+MEMCPY, TRIVIAL, LEAN = "memcpy", "trivial environment: ", ", info=False"
+MAX_BUFFER = 2**26
+"""Bytes of observations in the buffers: beyond the caches."""
+
+
+NOISE_BANK = 4096
+SUFFIX = {"off": "", "required": ", kernel"}
+"""What the table says of the ways by the values of ``kernel``."""
+
+
+def configurations() -> dict[str, Task]:
+    """The tasks that are measured: SU is CT-SU-B1, CO is CT-CO-B1 with p = 0.5 and up to ten degrees of rotation."""
+    confounding = ct_co_b1()
+    confounding = replace(
+        confounding,
+        graph=replace(confounding.graph, wait_prob=0.5),
+        observations=replace(confounding.observations, read_rotation=10),
+    )
+    tasks = {"SU": ct_su_b1(), "CO": confounding}
+    noisy = {f"{name}, noise 10": _with_noise(task) for name, task in tasks.items()}
+    return tasks | noisy
+
+
+def _with_noise(task: Task) -> Task:
+    return replace(task, observations=replace(task.observations, read_noise=10))
+
+
+@dataclass
+class Contender:
+    """One way to step."""
+
+    name: str
+    configuration: str
+    num_rows: int
+    run: Callable[[], int]  # runs for a while and says how many observations there were
+    speeds: list[float]
+
+    def measure(self, seconds: float) -> None:
+        """Observations a second over at least so many seconds."""
+        count, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            count += self.run()
+        self.speeds.append(count / (time.perf_counter() - start))
+
+
+class Counter(EnvBase):
+    """The trivial environment: it counts to four and starts again.
+
+    A batch starts at 0, 1, 2, 3, 0, ...: rows end at every step, so that TorchRL merges a reset at every step.
+    """
+
+    batch_locked = True
+
+    def __init__(self, num_rows: int) -> None:
+        super().__init__(batch_size=torch.Size([num_rows]))
+        count = Unbounded((num_rows, 1), dtype=torch.int64, device="cpu")
+        self.observation_spec = Composite(observation=count, shape=(num_rows,), device="cpu")
+        self.action_spec = Categorical(3, shape=(num_rows,), dtype=torch.int64, device="cpu")
+        self.reward_spec = Unbounded((num_rows, 1), dtype=torch.float32, device="cpu")
+        self.first = torch.arange(num_rows, device="cpu").unsqueeze(-1) % 4
+        self.count = self.first
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        self.count = self.first if mask is None else self.count.masked_fill(mask, 0)
+        return TensorDict({"observation": self.count}, self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self.count = self.count + 1
+        return TensorDict(
+            {"observation": self.count, "reward": self.count.float(), "done": self.count >= 4}, self.batch_size
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def _num_steps(num_rows: int, size: int = 144) -> int:
+    """Steps in a buffer of observations."""
+    return max(4, min(512, MAX_BUFFER // (num_rows * size)))
+
+
+def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
+    steps = _num_steps(num_rows)
+    target = torch.empty(steps, num_rows, 1, 12, 12, dtype=torch.uint8, device="cpu")
+    source = torch.randint(0, 255, target.shape, dtype=torch.uint8, device="cpu")
+
+    def run(write: Callable[[Tensor, int], object]) -> int:
+        for t in range(steps):
+            write(target[t], t)
+        return steps * num_rows
+
+    yield "memset", partial(run, lambda row, t: row.zero_())
+    yield MEMCPY, partial(run, lambda row, t: row.copy_(source[t]))
+
+
+def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
+    rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
+    steps = Steps.empty(rows, _num_steps(num_rows))
+    actions = torch.randint(0, 3, steps.action.shape, device="cpu")
+
+    def run(rows: Rows, kernel: str) -> int:
+        rollout(rows, actions, steps, kernel)
+        return steps.action.numel()
+
+    def core(rows: Rows) -> int:
+        for action in actions[:16]:
+            rows.restart(rows.act(action)[1])
+        return min(16, len(actions)) * num_rows
+
+    for kernel in ways:
+        own = Rows([task] * num_rows, kernel=kernel)
+        yield f"core, observations of the step and of the reset{SUFFIX[kernel]}", partial(core, own)
+        yield f"fast rollout{SUFFIX[kernel]}", partial(run, rows, kernel)
+        if task.observations.read_noise:
+            yield f"fast rollout, noise bank{SUFFIX[kernel]}", partial(run, banked, kernel)
+
+
+def _torchrl(
+    make: Callable[[], EnvBase], prefix: str = "", suffix: str = ""
+) -> Iterator[tuple[str, Callable[[], int]]]:
+    env, collected = make(), make()
+    n = env.batch_size[0]
+    steps = max(4, min(64, 2**25 // (n * 300)))
+    policy = _Random(n)
+    collector = Collector(
+        collected,
+        policy,
+        frames_per_batch=n * steps,
+        total_frames=-1,
+        trust_policy=True,
+        use_buffers=False,
+        track_traj_ids=False,
+        return_same_td=True,  # without buffers: the batch itself, a new one each time, instead of a copy
+        auto_register_policy_transforms=True,
+    )
+    batches = iter(collector)
+
+    def run() -> int:
+        env.rollout(steps, policy, break_when_any_done=False)
+        return steps * n
+
+    yield f"{prefix}TorchRL rollout{suffix}", torch.no_grad()(run)
+    yield f"{prefix}TorchRL Collector{suffix}", lambda: next(batches).numel()
+
+
+class _Random(TensorDictModuleBase):
+    """Uniform actions of three."""
+
+    in_keys: tuple[str, ...] = ("observation",)
+    out_keys: tuple[str, ...] = ("action",)
+
+    def __init__(self, num_rows: int) -> None:
+        super().__init__()
+        self.num_rows = num_rows
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", torch.randint(0, 3, (self.num_rows,), device="cpu"))
+
+
+def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
+    envs = CTGraphVectorEnv(num_rows, task, kernel=kernel)
+    envs.reset(seed=0)
+    actions = torch.randint(0, 3, (16, num_rows), device="cpu").numpy()
+
+    def run_batch() -> int:
+        for action in actions:
+            envs.step(action)
+        return actions.size
+
+    yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run_batch
+    if num_rows == 1:
+        yield f"Gymnasium Env{SUFFIX[kernel]}", _single(CTGraphGymEnv(task, kernel=kernel))
+
+
+def _single(env: gymnasium.Env) -> Callable[[], int]:
+    """Steps of any Gymnasium environment with random actions."""
+    actions = torch.randint(0, 3, (256,), device="cpu").tolist()
+    env.reset(seed=0)
+
+    def run() -> int:
+        for action in actions:
+            if env.step(action)[2]:
+                env.reset()
+        return len(actions)
+
+    return run
+
+
+def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
+    """The authors' environment, where the user has installed it; its own default configuration."""
+    if find_spec("gym_CTgraph") is None:
+        return
+    import gym_CTgraph  # type: ignore[import-not-found]  # noqa: F401
+
+    yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
+
+
+def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Contender]:
+    """Everything that is measured, in the order of the table."""
+    found: list[Contender] = []
+
+    def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
+        found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
+
+    tasks, ways = configurations(), tuple(SUFFIX)[: 1 + with_kernel]
+    for n in num_rows:
+        add("", n, _memory(n))
+        add("", n, _torchrl(partial(Counter, n), TRIVIAL))
+        for name in names:
+            task = tasks[name]
+            add(name, n, _fast(task, n, ways))
+            for kernel in ways:
+                for info, suffix in ((True, ""), (False, LEAN)):
+                    make = partial(CTGraphEnv, [task] * n, check_actions=False, kernel=kernel, info=info)
+                    add(name, n, _torchrl(make, suffix=suffix + SUFFIX[kernel]))
+                add(name, n, _gymnasium(task, n, kernel))
+    add("", 1, _authors())
+    return found
+
+
+def table(measured: list[Contender]) -> str:
+    """Medians in Markdown, with their spread over the rounds and their ratios to the yardsticks of the same rows."""
+    lines = ["| rows | task | way | M obs/s | spread | / memcpy | / trivial |", "|---|---|---|---|---|---|---|"]
+    median = {(one.num_rows, one.configuration, one.name): statistics.median(one.speeds) for one in measured}
+    for one in measured:
+        speed = statistics.median(one.speeds)
+        spread = (max(one.speeds) - min(one.speeds)) / speed / 2
+        yardstick = median.get((one.num_rows, "", MEMCPY))
+        trivial = median.get((one.num_rows, "", TRIVIAL + one.name.removesuffix(SUFFIX["required"]).removesuffix(LEAN)))
+        cells = [
+            f"{one.num_rows:,}",
+            one.configuration,
+            one.name,
+            f"{speed / 1e6:.3g}",
+            f"±{100 * spread:.0f} %",
+            f"{speed / yardstick:.2g}" if yardstick else "",
+            f"{speed / trivial:.2f}" if trivial else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def machine(device: torch.device | None = None) -> str:
+    """Return what was measured on."""
+    if device is not None and device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}, torch {torch.__version__}"
+    threads, capability = torch.get_num_threads(), torch.backends.cpu.get_cpu_capability()
+    return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
+    names = list(configurations())
+    parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.benchmark", description=__doc__)
+    parser.add_argument("--rows", type=int, nargs="+", help="batch sizes")
+    parser.add_argument("--tasks", nargs="+", default=names, choices=names, help="what is measured")
+    parser.add_argument("--rounds", type=int, default=5, help="how often each is measured")
+    parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
+    parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
+    parser.add_argument("--threads", type=int, default=None, help="threads of torch")
+    parser.add_argument("--sizes", type=int, nargs="*", help="instead: readers of curricula and logs, by tasks")
+    parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds after which no measurement begins")
+    options = parser.parse_args(arguments)
+    if options.sizes is not None:
+        require(*at_least_one(**{f"sizes[{i}]": n for i, n in enumerate(options.sizes)}))
+        print(f"{machine()}\n\n{sizes.table(sizes.measured(options.sizes or sizes.SIZES))}")
+        return
+    options.rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
+    require(
+        *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
+        *positive(seconds=options.seconds, limit=options.limit),
+    )
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    if options.device:
+        device = checked_device(options.device)
+        tasks = {name: configurations()[name] for name in options.tasks}
+        measured_there = ladder.climbed(ladder.rungs(device, options.rows, tasks), options, device)
+        print(f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder.table(ladder.found(measured_there))}")
+        return
+    measured = contenders(options.rows, options.tasks, not options.skip_kernel)
+    console = Console(stderr=True)
+    with suppress(KeyboardInterrupt):
+        for one in track(measured, "filling caches", console=console):
+            one.run()
+        rounds = track(measured * options.rounds, "measuring", console=console)
+        for one in ladder.until(options.limit, rounds):
+            one.measure(options.seconds)
+    found = [one for one in measured if one.speeds]
+    print(f"{machine()}; medians of {options.rounds} rounds\n\n{table(found)}")
