@@ -40,5 +40,6 @@ def sentences(text: str) -> list[str]:
 
 
 def readings(page: str) -> list[str]:
-    """The texts of a page from "What came out." to the next figure."""
-    return re.findall(r"\*\*What came out\.\*\* (.*?)\n!\[", page, re.DOTALL)
+    """The texts of a page from "Findings." to the next figure, without the marks of their lists."""
+    found = re.findall(r"\*\*Findings\.\*\*(.*?)\n!\[", page, re.DOTALL)
+    return [re.sub(r"^- ", "", text, flags=re.MULTILINE) for text in found]

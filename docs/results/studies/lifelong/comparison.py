@@ -16,7 +16,7 @@ from ctgraph_rl.metrics.bounds import Known
 from ctgraph_rl.report import statistics
 from studies.lifelong.experiments import MASKS, expected, missing
 from studies.lifelong.runs import EXPERT
-from studies.raw import Raw, groups, mean_of, read, share_of, shown, table
+from studies.raw import Raw, groups, mean_of, read, shown, table
 
 SOLVED = 0.9
 LEAST_ROOM = Fraction(1, 20)
@@ -90,16 +90,6 @@ def transfer(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> 
     }
 
 
-def resampled(runs: np.ndarray, experts: np.ndarray, left_out: Sequence[int]) -> str:
-    """The middle 95 % of forward transfer where the seeds of both sides are drawn again."""
-    kept = [task for task in range(runs.shape[1]) if task + 1 not in left_out]
-    rng = np.random.default_rng(0)
-    draws = [side[rng.integers(len(side), size=(10_000, len(side)))].mean(1)[:, kept] for side in (runs, experts)]
-    found = forward_transfer(*draws)
-    low, high = np.quantile(found, 0.025, method="lower"), np.quantile(found, 0.975, method="higher")
-    return f"[{low:.2f}, {high:.2f}]"
-
-
 OF_A_RUN = {
     "average performance": "continual_world_performance",
     "forgetting": "continual_world_forgetting",
@@ -126,18 +116,16 @@ def summary(name: str) -> str:
     if not of:
         return f"Nothing was run yet: `ctgraph-rl -m experiment={name}`."
     experts = [lines for (who, _), lines in of.items() if who == EXPERT]
-    alone, left_out, rows, drawn = expert_areas(experts), full(experts), [], []
+    alone, left_out, rows = expert_areas(experts), full(experts), []
     for method in dict.fromkeys(expected(name)["method"]):
         runs = [lines for (who, _), lines in of.items() if who == method]
         found, own = [scores(lines) for lines in runs], areas(runs)
         values = transfer(own, alone, left_out)
         values |= {column: mean_of([each[column] for each in found], bounds(column, runs[0])) for column in OF_A_RUN}
         rows.append([f"`{method}`", str(len(found)), *(values[column] for column in COLUMNS)])
-        drawn.append(f"`{method}` {resampled(own, alone, left_out)}")
     tasks = f"task {', '.join(map(str, left_out))}" if left_out else "none"
     said = f"Experts: {len(experts)} seeds of each. Left out of forward transfer: {tasks}. {missing(name)}"
-    again = f"Forward transfer where seeds of runs and experts are only drawn again: {', '.join(drawn)}."
-    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said} {again}"
+    return f"{table(['method', 'seeds', *COLUMNS], rows)}\n\n{said}"
 
 
 def bounds(column: str, lines: Raw) -> tuple[float, float]:
@@ -155,7 +143,7 @@ def learned(name: str) -> str:
     for method in (*dict.fromkeys(expected(name)["method"]), EXPERT):
         runs = [_solved(curves(lines), method) for lines in groups(of.get((method,), []), "seed").values()]
         if runs:
-            rows.append([f"`{method}`", *map(share_of, torch.stack(runs).T.tolist())])
+            rows.append([f"`{method}`", *map(str, torch.stack(runs).sum(0).tolist())])
     if not rows:
         return ""
     return table(["", *(f"task {task}" for task in range(1, len(rows[0])))], rows)

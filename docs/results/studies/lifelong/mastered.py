@@ -57,27 +57,9 @@ class Table:
         """float64 [seeds, tasks]: over the experts' mean."""
         return self.areas(method) - self.alone
 
-    def early_shares(self, method: str) -> list[float]:
-        """The share of each run's TPOT that it has in tasks which have not begun."""
-        shares = []
-        for run in self.curves[method]:
-            begun = torch.tensor(run.blocks)[:, None] > torch.arange(len(self.alone))
-            shares.append(((run.performance * ~begun).sum() / run.performance.sum()).item())
-        return shares
-
     def names(self, mastered: torch.Tensor) -> list[set[str]]:
         """The goals that are mastered, for each seed."""
         return [{goal for goal, known in zip(self.goals, seed, strict=True) if known} for seed in mastered.tolist()]
-
-    def since_success(self, *methods: str) -> torch.Tensor:
-        """bool [N]: whether a task is mastered, at all evaluations that follow the first success in its block."""
-        stages = torch.cat([self.stages(method).flatten(0, 1) for method in methods])
-        return torch.cat([stage[int(stage.double().argmax()) + 1 :] for stage in stages >= MASTERED if stage.any()])
-
-    def transfer_of_mask_lc(self) -> tuple[float, float]:
-        """Its forward transfer on CT8 multi-depth: as in the table, and with the first task."""
-        transfer = (self.gain("mask_lc") / (1 - self.alone)).mean(0)
-        return transfer[2:].mean().item(), transfer[[0, 2, 3, 4, 5, 6, 7]].mean().item()
 
     def mean_areas(self) -> dict[str, float]:
         """The mean return of each method over all blocks."""
@@ -94,11 +76,6 @@ class Table:
     def p_value(first: torch.Tensor, second: torch.Tensor) -> float | None:
         """The p-value of the paired test of two methods, a number for each seed."""
         return statistics.compare(first.tolist(), second.tolist()).p_value
-
-    def blocks_of_depth_3(self) -> list[tuple[str, set[str]]]:
-        """The goal of each block of depth 3 of fine-tuning on CT12, and all goals that it has at the end of it."""
-        places = [place for place, goal in enumerate(self.goals) if len(goal) == 3]
-        return [(self.goals[j], known) for j in places for known in self.names(self.ends("finetune")[:, j])]
 
 
 class ByAgent:

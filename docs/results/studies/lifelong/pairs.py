@@ -70,6 +70,23 @@ def against_finetuning(agents: Collection[str]) -> dict[str, Comparison]:
     return found
 
 
+def differences() -> str:
+    """A line for each curriculum and method: its difference from fine-tuning with PPO and with the other agents."""
+    more_seeds = MORE_SEEDS["methods"]
+    others = [agent for agent in expected("methods")["agent"] if agent not in more_seeds]
+    by_ppo = _with_p_values(against_finetuning(more_seeds))
+    by_others = _with_p_values(against_finetuning(others))
+    lines = [[name, said, by_others[name]] for name, said in by_ppo.items()]
+    return table(["", "PPO", "other agents"], lines)
+
+
+def _with_p_values(found: Mapping[str, Comparison]) -> dict[str, str]:
+    """Each difference with its p-value, corrected for all of them."""
+    corrected = statistics.holm([each.p_value for each in found.values()])
+    named = zip(found.items(), corrected, strict=True)
+    return {name: f"{shown(each.difference)}, p {_p(p)}" for (name, each), p in named}
+
+
 def of_pairs(measured: Mapping[tuple[str, ...], float], first: str, second: str) -> Comparison:
     """Compare two methods over all pairs that both have."""
     pairs = [
@@ -102,10 +119,4 @@ def _p(value: float | None) -> str:
 
 def tables() -> dict[str, str]:
     """What the template of the page names."""
-    alone = MORE_SEEDS["methods"]
-    others = [agent for agent in expected("methods")["agent"] if agent not in alone]
-    return {
-        "claims": rows(claims()),
-        "against_finetuning": rows(against_finetuning(alone)),
-        "against_finetuning_others": rows(against_finetuning(others)),
-    }
+    return {"claims": rows(claims()), "against_finetuning": differences()}
