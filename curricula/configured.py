@@ -64,8 +64,8 @@ def from_axes(
     """Tasks that differ in goal, images, depth and wait probability, in a chosen order.
 
     Lists are combined: the goals vary fastest, then depths, then wait probabilities, then image seeds. All tasks share
-    rewards and the rules of what is observed. The ``protocol`` and ``evaluation`` of a run set what the learner knows of
-    tasks and how it is evaluated, for any curriculum.
+    rewards and the rules of what is observed. The ``protocol`` and ``evaluation`` of a run say what the learner knows
+    and how it is evaluated, for any curriculum.
 
     Args:
         configuration: where the rest comes from: fo_b1, fo_b2, su_b1, co_b1 or posr_b1.

@@ -16,6 +16,7 @@ from typing import Any
 PAGES = {
     "baselines": "studies.baselines.page",
     "board": "studies.board",
+    "claims": "studies.claims",
     "collectives": "studies.collectives.page",
     "lifelong": "studies.lifelong.page",
     "memory": "studies.memory.page",
