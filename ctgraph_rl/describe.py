@@ -168,7 +168,8 @@ def evaluation_in_words(evaluation: Evaluation) -> str:
     ]
     held_out = f" and {len(evaluation.held_out)} held out" if evaluation.held_out else ""
     which = {"all": "all tasks", "seen": "the tasks seen so far"}[evaluation.tasks]
-    episodes = f"{evaluation.num_episodes} {how} episodes{in_row}"
+    adapts = f", after {evaluation.adapt_episodes} to adapt" if evaluation.adapt_episodes else ""
+    episodes = f"{evaluation.num_episodes} {how} episodes{in_row}{adapts}"
     return f"{episodes} on each of {which}{held_out}: {', '.join(moments)}."
 
 

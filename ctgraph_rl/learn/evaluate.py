@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from inspect import Parameter, signature
 from typing import Any
 
@@ -24,10 +25,12 @@ from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, act, make_env, start_of_episodes
 from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.metrics.adaptation import exact_search
 from ctgraph_rl.policies import RandomPolicy
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, require_tasks
 from ctgraph_rl.tasks.protocol import Evaluation
+from ctgraph_rl.tasks.task import Task
 
 
 @torch.no_grad()
@@ -230,6 +233,27 @@ def episode_means(ends: TensorDictBase) -> dict[str, Any]:
     }
 
 
+def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[dict[str, Any]]:
+    """Yield the means over rows of their first episodes, of their second ones, and so on.
+
+    ``found_rate`` is the share of rows that have reached the goal by then, and ``exact_rate`` the success rate of the
+    best search for a goal that is drawn uniformly; NaN for tasks other than CT-graphs.
+
+    Args:
+        rows: the data of the last step of each episode, [rows, episodes of a row].
+        task: what is played.
+    """
+    num_rows, num_steps = rows.shape
+    exact = found = torch.full([num_steps], math.nan, dtype=torch.float64, device="cpu")
+    if isinstance(task, Task):
+        exact = exact_search(task.graph.num_end_states, num_steps)
+        reached = (rows["outcome"] == OUTCOME_GOAL).view(num_rows, num_steps)
+        found = reached.cummax(dim=1).values.double().mean(dim=0)
+    for step, episodes in enumerate(rows.unbind(1)):
+        rates = {"found_rate": found[step].item(), "exact_rate": exact[step].item()}
+        yield {"step": step + 1, **episode_means(episodes), **rates}
+
+
 def derive_seed(seed: int, *purpose: str | int) -> int:
     """Return a seed in [0, 2**63) for a purpose, unrelated to the run's own and to other purposes'."""
     text = "/".join(map(str, (seed, *purpose)))
@@ -262,28 +286,32 @@ class Evaluator:
         if not tasks:
             return
         how = curriculum.evaluation
+        num_rows = how.num_episodes // how.episodes_per_row
         result = evaluate(
             policy,
             list(tasks),
-            how.num_episodes,
+            num_rows * how.row_episodes,
             seed=derive_seed(self.seed, "evaluation", frames),
             greedy=how.greedy,
-            episodes_per_row=how.episodes_per_row,
+            episodes_per_row=how.row_episodes,
             initial_state=initial_state,
             device=self.device,
             curriculum=curriculum,
         )
-        for (number, label), episodes in zip(tasks.values(), result, strict=True):
-            self.log.append(
-                "evaluation",
+        for (task, (number, label)), episodes in zip(tasks.items(), result, strict=True):
+            append = partial(
+                self.log.append,
                 moment=moment,
                 block=curriculum.block_at(frames),
                 frames=frames,
                 task=number,
                 label=label,
                 held_out=number > len(curriculum.tasks),
-                **episode_means(episodes),
             )
+            rows = episodes.view(num_rows, how.row_episodes)
+            append("evaluation", **episode_means(rows[:, how.adapt_episodes :].reshape(-1)))
+            for measured in adaptation(rows, task) if how.adapt_episodes else ():
+                append("adaptation", **measured)
 
     def tasks_at(self, frames: int) -> dict[TaskLike, tuple[int, str]]:
         """Return the tasks that are evaluated after ``frames`` frames, with their numbers and labels."""

@@ -12,6 +12,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
+from ctgraph_rl.tasks.protocol import Block
 from ctgraph_rl.tasks.task import Task
 
 
@@ -60,6 +61,32 @@ def check_ids(curriculum: Curriculum, agent: Agent) -> None:
     shows = curriculum.protocol.task_id == "one_hot"
     message = f"{type(agent).__name__} reads task ids, which {curriculum.name} does not show"
     require((shows or not reads, f"{message}; give it a curriculum with protocol.task_id=one_hot, or make a new agent"))
+
+
+def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
+    """Refuse an agent that adapts where a curriculum has nothing to adapt to, or too few episodes for it.
+
+    Args:
+        curriculum: what is learned.
+        agent: one with a member ``adapt_episodes`` adapts to a row's task after so many of its episodes.
+    """
+    needed = getattr(agent, "adapt_episodes", 0)
+    if not needed:
+        return
+    name = type(agent).__name__
+    how = curriculum.evaluation
+    row = f"rows of an evaluation have {how.row_episodes} episodes, and {name} adapts after {needed}"
+    without = [str(number) for number, block in enumerate(curriculum.blocks, 1) if not _has_distribution(block)]
+    one = f"{name} learns to adapt to tasks that are drawn, and block {', '.join(without)} has one task"
+    require(
+        (not without, f"{one}: give a block all goals, as nm_uniform_goals does, or its task a goal_change"),
+        (how.row_episodes > needed, f"{row}: set evaluation.adapt_episodes={needed}"),
+    )
+
+
+def _has_distribution(block: Block) -> bool:
+    """Return whether a block has several tasks, or a task with several goals."""
+    return len(set(block.tasks)) > 1 or getattr(block.tasks[0], "goal_change", None) is not None
 
 
 def notes(curriculum: Curriculum) -> Iterator[str]:

@@ -69,18 +69,22 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a list of objects with a task and, where seeds were trained together, the list of those",
     ),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
-    "task": (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}"),
+    **dict.fromkeys(("task", "step"), (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}")),
     "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),
     "held_out": (lambda value: isinstance(value, bool), "true or false"),
     **dict.fromkeys(("moment", "label"), (_is_text, "a text")),
     **dict.fromkeys(
-        ("seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"),
+        ("found_rate", "exact_rate", "seconds", "episodes", "return_mean", "success_rate", "end_rate", "length_mean"),
         (_is_number, f"a number of at most {LARGEST:g}"),
     ),
 }
 """Rules for the fields of a measurement."""
 
-NEEDED = {"training": ("block", "frames"), "evaluation": ("block", "frames", "task", "return_mean")}
+NEEDED = {
+    "training": ("block", "frames"),
+    "evaluation": ("block", "frames", "task", "return_mean"),
+    "adaptation": ("block", "frames", "task", "step", "return_mean"),
+}
 """Fields of the kinds that tables are made of."""
 
 
@@ -137,7 +141,7 @@ def _without_place(expert: Any) -> Any:
 
 
 def _numbers(measurement: Mapping[str, Any]) -> Iterator[int]:
-    """Yield the numbers of blocks and tasks."""
-    yield from (measurement[name] for name in ("block", "task") if name in measurement)
+    """Yield the numbers of blocks, tasks and episodes of a row."""
+    yield from (measurement[name] for name in ("block", "task", "step") if name in measurement)
     for block in measurement.get("trained", ()):
         yield from block

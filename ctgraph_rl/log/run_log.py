@@ -11,6 +11,9 @@ Every line is one JSON object with a ``kind``. Schema 1:
 - ``evaluation``: means over the evaluation episodes of one task. ``moment`` says when: ``before`` any training (block
   0), ``during`` a block, or ``after`` it. ``task`` counts the curriculum's tasks from 1; held-out tasks, marked
   ``held_out``, count on from there.
+- ``adaptation``: where rows adapt before an evaluation, means over the rows' episodes number ``step``, from 1, and
+  ``found_rate``, the share of rows that have reached the goal by then; ``exact_rate``, the success rate of the best
+  search; else as ``evaluation``.
 
 What is not finite, such as a mean over no episodes, is null. ``seconds`` is the time since the start of the run, and
 the only field that differs between two equal runs. A reader in three lines, for what `RunLog.read` does not give::
@@ -39,6 +42,7 @@ from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.metrics import Column, Curves, Regime, RegimeTable
+from ctgraph_rl.metrics.adaptation import Adaptation
 
 MOST_CELLS = 10**7
 """Largest table that is made of a log."""
@@ -267,6 +271,28 @@ class RunLog:
             num_tasks: see `performance`.
         """
         return self._matrix([{m["task"]: m.get(name) for m in self._evaluations(during=False)}], num_tasks)[0]
+
+    def adaptation(self, held_out: bool = False) -> Adaptation | None:
+        """Return the last evaluation with adaptation; None where there is none.
+
+        Args:
+            held_out: of held-out tasks, else of trained ones.
+
+        Raises:
+            ValueError: if tasks differ in the number of episodes.
+        """
+        rows: dict[tuple[int, int], list[dict[str, Any]]] = {}
+        for m in self.of_kind("adaptation"):
+            if bool(m.get("held_out")) == held_out:
+                rows.setdefault((m["frames"], m["task"]), []).append(m)
+        if not rows:
+            return None
+        frames, _ = next(reversed(rows))
+        last = [row for (when, _), row in rows.items() if when == frames]
+        lengths = {len(row) for row in last}
+        require((len(lengths) == 1, f"tasks must adapt in as many episodes, the log has {lengths}: restore the log"))
+        names = ("return_mean", "success_rate", "found_rate", "exact_rate")
+        return Adaptation(*(torch.stack([_row([m.get(name) for m in row]) for row in last]) for name in names))
 
     def curves(self, trained: Sequence[Sequence[int]] | None = None) -> Curves:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.

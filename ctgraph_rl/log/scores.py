@@ -14,6 +14,7 @@ from ctgraph_rl import metrics
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
+from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.metrics.labels import SEVERAL, Labelling
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
@@ -78,6 +79,8 @@ def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | N
         "interval_best": _interval_best(log, curriculum, best),
         **_first_blocks(log, curriculum),
         **_of_graphs(log, tasks),
+        "adaptation": _adaptation(log, held_out=False),
+        "held_out_adaptation": _adaptation(log, held_out=True),
         **_regimes(log, curriculum, best, experts),
         **_areas(curves, best, experts, trapezoids=False),
         **_areas(curves, best, experts, trapezoids=True),
@@ -103,6 +106,13 @@ def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> dict[str, Any]:
         "random_frames": [random_frames_to_goal(task) for task in tasks],
         "search_episodes": [task.graph.expected_search_episodes for task in tasks],
     }
+
+
+def _adaptation(log: RunLog, held_out: bool) -> Adaptation | Undefined:
+    """Return the curves of the last evaluation with adaptation, or why there are none."""
+    found = log.adaptation(held_out)
+    which = "held-out" if held_out else "trained"
+    return found or Undefined(f"no {which} task was evaluated with evaluation.adapt_episodes > 0")
 
 
 def _kind(tasks: Sequence[TaskLike]) -> str:

@@ -25,6 +25,8 @@ INPUTS = {
     "first_success_rates": "for each task, share of them that reached the goal",
     "random_frames": "for each task, mean frames of the random policy until it first reaches the goal",
     "search_episodes": "for each task, E[kappa], the mean episodes of a search without repetition",
+    "adaptation": "the last evaluation with adaptation on trained tasks, `Adaptation`",
+    "held_out_adaptation": "the same on held-out tasks",
     "regimes": "stays on one task, each a `Regime`, on the scale 1..101",
     "experts": "for each task, the training curves of its experts, on that scale",
     "areas": "each task's area under its curve over its own block, float64 [tasks]",

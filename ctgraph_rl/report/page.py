@@ -12,6 +12,7 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
 from ctgraph_rl.log.escape import markdown_text, terminal_text
 from ctgraph_rl.report import formats, results
+from ctgraph_rl.report.figures.adaptation import adaptation_curves
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
@@ -28,7 +29,7 @@ from ctgraph_rl.runs.settings import flat
 
 OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
     *(mean_curves, learning_curves),
-    *(training_curves, label_strips),
+    *(training_curves, adaptation_curves, label_strips),
 )
 """Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
 

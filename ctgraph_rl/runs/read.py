@@ -22,6 +22,7 @@ from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, 
 from ctgraph_rl.log.measurement import check, parsed
 from ctgraph_rl.log.run_log import MOST_BYTES, SCHEMA, RunLog, label_of
 from ctgraph_rl.log.sources import is_ours, targets
+from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.runs.experts import EXPERT
 from ctgraph_rl.runs.settings import as_before, flat
 from ctgraph_rl.strict import files_below, one_line_of, too_deep
@@ -55,6 +56,7 @@ class History(NamedTuple):
     evaluations: Mapping[str, Curve]  # by label
     training: Mapping[int, Curve]  # by block, of finished episodes
     spans: tuple[Span, ...]  # of labels that the learner gave tasks itself
+    adaptation: Mapping[str, Adaptation]  # the last one, of ``trained`` and ``held-out`` tasks as far as there is one
     seconds: float
     experts_together: tuple[bool, ...]  # for each single-task expert of the log, whether a group of seeds trained it
 
@@ -262,6 +264,7 @@ def _history(log: RunLog) -> History:
     for m in log.of_kind("training"):
         if m["return_mean"] is not None:
             training.setdefault(m["block"], []).append((m["frames"], m["return_mean"]))
+    adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
     seconds = log.measurements[-1].get("seconds", 0.0)
     return History(
         labels=_labels(log, own, len(performance[0])),
@@ -271,6 +274,7 @@ def _history(log: RunLog) -> History:
         evaluations=evaluations,
         training=training,
         spans=label_spans(log),
+        adaptation={name: found for name, found in adapted.items() if found is not None},
         seconds=seconds,
         experts_together=tuple("together" in each for line in log.of_kind("experts") for each in line["experts"]),
     )

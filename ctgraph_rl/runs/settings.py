@@ -35,7 +35,7 @@ WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
 POLICY_GRADIENT = ("a2c.A2C", "reinforce.Reinforce", "ppo.PPO", "ppo_count.PPOCount", "ppo_rnd.PPORND", *WITH_CELL[:2])
 
 ADDED: dict[str, dict[str, Any]] = {
-    "run": {"portable": False, "protocol.guide_frames": None},
+    "run": {"portable": False, "protocol.guide_frames": None, "evaluation.adapt_episodes": None},
     **{f"baselines.{agent}": {"deduplicate": False} for agent in POLICY_GRADIENT},
     **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL[2:]},
     **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False} for agent in WITH_CELL[:2]},

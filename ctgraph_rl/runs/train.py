@@ -24,7 +24,7 @@ from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.learn.loop import Group
 from ctgraph_rl.learn.progress import ProgressBar
-from ctgraph_rl.learn.rules import check_ids, check_rows
+from ctgraph_rl.learn.rules import check_adaptation, check_ids, check_rows
 from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text
@@ -73,6 +73,7 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     require_memory(batch, 2 * frames * specs.observation["observation"].shape.numel(), "of either")
     agent = agent.to(device)
     check_rows(curriculum, agent.num_envs)
+    check_adaptation(curriculum, agent)
     return agent
 
 

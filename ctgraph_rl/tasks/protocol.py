@@ -105,6 +105,8 @@ class Evaluation:
         at_block_ends: evaluate at the end of every block.
         tasks: ``all`` tasks of the curriculum, or those ``seen`` so far, the present block's included.
         held_out: further tasks that are evaluated each time and never trained.
+        adapt_episodes: episodes that a row plays before its ``episodes_per_row``, in which the agent may adapt to the
+            row's task. Means are over the episodes after them; the log also has the means of each episode of a row.
 
     Raises:
         ValueError: for values out of range.
@@ -118,6 +120,7 @@ class Evaluation:
     at_block_ends: bool = True
     tasks: str = "all"
     held_out: tuple[TaskLike, ...] = ()
+    adapt_episodes: int = field(default=0, metadata={"added": True})
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
@@ -128,6 +131,7 @@ class Evaluation:
             *at_least_one(num_episodes=n, episodes_per_row=per_row),
             *true_or_false(greedy=self.greedy, before=self.before, at_block_ends=self.at_block_ends),
             (is_int(self.every, 0), f"every must be an integer >= 0, got {self.every!r}"),
+            (is_int(self.adapt_episodes, 0), f"adapt_episodes must be an integer >= 0, got {self.adapt_episodes!r}"),
             *one_of(EVALUATED, tasks=self.tasks),
             *are_tasks("held_out must be tasks", held_out),
         )
@@ -135,6 +139,11 @@ class Evaluation:
             (n % per_row == 0, f"num_episodes={n} must be a multiple of episodes_per_row={per_row}"),
             (len(set(self.held_out)) == len(self.held_out), "held_out tasks must differ"),
         )
+
+    @property
+    def row_episodes(self) -> int:
+        """All episodes that a row plays one after the other."""
+        return self.adapt_episodes + self.episodes_per_row
 
     def every_rule(self, num_envs: int) -> tuple[bool, str]:
         """Return the rule for ``num_envs`` rows: evaluations fall between steps of all rows."""
@@ -146,14 +155,21 @@ class Evaluation:
         """Refuse to measure changing goals by first episodes, which all have the first goal.
 
         Raises:
-            ValueError: for one episode a row and a task with ``goal_change``.
+            ValueError: for one episode a row and a task with ``goal_change``, and a goal that changes while a row
+                adapts.
         """
         tasks = tuple(tasks)
-        changing = self.episodes_per_row == 1 and any(getattr(task, "goal_change", None) for task in tasks)
+        found = [getattr(task, "goal_change", None) for task in tasks]
+        changes = [change[0] for change in found if change]
+        changing = self.row_episodes == 1 and bool(changes)
+        stays = min(changes, default=self.row_episodes)
+        lasts = not self.adapt_episodes or self.row_episodes <= stays
+        row = f"adapt_episodes={self.adapt_episodes} + episodes_per_row={self.episodes_per_row}"
         rows = len(tasks) * self.num_episodes // self.episodes_per_row
         many = f"num_episodes={self.num_episodes} of {len(tasks)} tasks are {rows:,} rows at once, the limit is"
         require(
             (not changing, "tasks with goal_change need episodes_per_row > 1: a row's first goal is the task's own"),
+            (lasts, f"{row} must be at most {stays}, after which the goal of a row may change; use fewer"),
             (rows <= MOST_ROWS, f"{many} {MOST_ROWS:,}; use fewer, or more episodes_per_row"),
         )
 

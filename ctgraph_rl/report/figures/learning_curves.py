@@ -198,10 +198,11 @@ def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
         frames_axis(axes)
     figure.supxlabel("frames", fontsize=8)
     shown = section.results[:MOST_AGENTS]
-    marks = [Line2D([], [], label=_named(result), **agent_style(i)) for i, result in enumerate(shown)]
+    marks = [Line2D([], [], label=named(result), **agent_style(i)) for i, result in enumerate(shown)]
     figure.legend(handles=marks, loc="outside upper left", ncols=min(3, len(marks)))
 
 
-def _named(result: Result) -> str:
+def named(result: Result) -> str:
+    """Return the name of an agent in a legend, with its number of seeds."""
     agent = terminal_text(result.agent)
     return figure_text(f"{agent if len(agent) <= 60 else agent[:59] + '…'} (n = {result.n})")

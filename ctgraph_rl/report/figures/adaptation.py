@@ -1,0 +1,63 @@
+"""Success while rows of an evaluation adapt, episode by episode, over the curve of the best search."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ctgraph_rl.metrics.adaptation import Adaptation
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.figures.learning_curves import named
+from ctgraph_rl.report.sections import Result, Section
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure
+
+KINDS = ("trained", "held-out")
+
+
+def adaptation_curves(section: Section) -> CaptionedFigure | None:
+    """Return the curves of all agents in the last evaluation with adaptation; None without one."""
+    shown = section.results[:MOST_AGENTS]
+    kinds = [kind for kind in KINDS if any(_of_seeds(result, kind) for result in shown)]
+    if not kinds:
+        return None
+    caption = (
+        "Share of rows that reach the goal in each of their episodes, in the last evaluation: means over the tasks, "
+        "trained and held-out ones apart; thin lines: single seeds, thick ones: their means. Dashed: the best search "
+        f"for a goal that is drawn uniformly.{left_out(len(section.results), MOST_AGENTS, 'agents')}"
+    )
+    return CaptionedFigure("adaptation", "Adaptation", caption, draw_adaptation(section, kinds))
+
+
+def draw_adaptation(section: Section, kinds: list[str]) -> Any:
+    """Draw a panel for trained tasks, and one for held-out ones."""
+    figure = new_figure(WIDTH * len(kinds) / len(KINDS), 2.6)
+    panels = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
+    shown = section.results[:MOST_AGENTS]
+    for axes, kind in zip(panels, kinds, strict=True):
+        for position, result in enumerate(shown):
+            look = agent_style(position)
+            seeds = [adaptation.success.mean(dim=0) for adaptation in _of_seeds(result, kind)]
+            for success in seeds:
+                axes.plot(_episodes(success), success, color=look["color"], linewidth=0.4, marker="", linestyle="-")
+            if seeds:
+                mean = torch.stack(seeds).mean(dim=0)
+                axes.plot(_episodes(mean), mean, label=named(result), markevery=1 + len(mean) // 8, **look)
+        exact = next(adaptation.exact.mean(dim=0) for result in shown for adaptation in _of_seeds(result, kind))
+        axes.plot(_episodes(exact), exact, "k--", marker="", linewidth=1, label="best search")
+        axes.set(title=f"{kind} tasks", xlabel="episode of a row", ylim=(-0.05, 1.05))
+    panels[0].set_ylabel("share at the goal")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=min(3, len(labels)))
+    return figure
+
+
+def _of_seeds(result: Result, kind: str) -> list[Adaptation]:
+    """Return what the finished runs of an agent measured on trained or held-out tasks."""
+    histories = [run.history for run in result.finished if run.history is not None]
+    return [history.adaptation[kind] for history in histories if kind in history.adaptation]
+
+
+def _episodes(curve: Tensor) -> range:
+    return range(1, len(curve) + 1)
