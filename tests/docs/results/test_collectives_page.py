@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import statistics
 from collections import defaultdict
 
@@ -135,7 +136,10 @@ def test_what_the_text_says_of_sharing_holds():
     assert f"with 4 members and {alone / shared[1]:.2f} [" in PAGE
     assert f"More than {alone / 1280:.1f} times is not possible" in PAGE
     assert 3_000 < alone < 3_700 and l2d2c(1) == [12_800] * 5  # about a quarter of the frames, and none at all
-    assert "mean return of {:.2f} alone, {:.2f} with 4 members and {:.2f} with 16".format(*map(mean, returns)) in PAGE
+    assert (
+        "mean return of {:.2f} with one learner, {:.2f} with 4 members and {:.2f} with 16".format(*map(mean, returns))
+        in PAGE
+    )
     assert max(returns[0]) < min(returns[1]) and max(returns[1]) < min(returns[2])
     shares = [f"{mean(l2d2c(members, column='share_learned')):.0%}".replace("%", " %") for members in (4, 16)]
     assert f"one does in {shares[0]} of blocks, after {mean(l2d2c(4)):,.0f} frames on average" in PAGE
@@ -180,7 +184,7 @@ def test_what_the_text_says_of_eight_epochs_holds():
         for name in ("final_return", "reported_return", "obtained_return")
     }
 
-    assert "return is {} alone, {} with 4 members and {} with 16".format(*numbers["final_return"]) in PAGE
+    assert "return is {} with one learner, {} with 4 members and {} with 16".format(*numbers["final_return"]) in PAGE
     assert f"from {mean(of_block[2]):.2f} in the second to {mean(of_block[16]):.2f} in the last" in PAGE
     assert "had a reported return of {} with 4 members and {} with 16".format(*numbers["reported_return"]) in PAGE
     assert "the next batch with them one of {} and {}".format(*numbers["obtained_return"]) in PAGE
@@ -245,6 +249,15 @@ def test_a_sum_of_returns_is_that_of_all_members_and_differs_from_the_published_
             [error] = [(top - bottom) / 2 for bottom, top in [map(float, difference[0].split("[")[1][:-1].split(", "))]]
             assert float(difference[0].split(" [")[0]) == pytest.approx(mean(found) - value, abs=0.06)
             assert low * math.sqrt(ours + theirs) - 0.06 <= error <= high * math.sqrt(ours + theirs) + 0.06
+
+
+def test_the_first_verdicts_on_mosaic_are_those_of_its_intervals():
+    found = dict(re.findall(r"- ([^,]+), 5 seeds: the interval of the difference (\w+) 0,", PAGE))
+
+    assert found == {"isolated": "includes", "MOSAIC": "excludes", "MOSAIC without similarity": "excludes"}
+    assert (
+        "isolated members agrees with the published one; those of MOSAIC, with and without similarity, do not" in PAGE
+    )
 
 
 def test_goals_that_are_learned_in_no_seed_are_named():

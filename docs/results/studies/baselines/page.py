@@ -8,7 +8,7 @@ from string import Template
 from typing import TYPE_CHECKING
 
 from studies.baselines import main_job, search, swap
-from studies.baselines.instances import INSTANCES, MEMORY, instances_change
+from studies.baselines.instances import MEMORY, instances_change
 from studies.baselines.runs import AGENTS, BY_FIVES, EPISODES, REWARDS_MET
 from studies.raw import HERE, TEMPLATES, Raw, groups, machines, mean_of, read, share_of, table
 
@@ -35,7 +35,7 @@ def cell(lines: Raw, column: str, bounds: tuple[float, float] | Bounds = (0.0, 1
     return mean_of([None if line.get("failed") else float(line[column]) for line in lines], bounds)
 
 
-def by_goal(raw: Raw, configuration: str, title: str = "") -> str:
+def by_goal(raw: Raw, configuration: str) -> str:
     """A line for each agent, a column for each goal, greedy and sampled; the ceilings of agents without memory."""
     from baselines.parts.catalogue import catalogue
     from ctgraph_rl.tasks.values import open_loop_ceiling
@@ -53,7 +53,7 @@ def by_goal(raw: Raw, configuration: str, title: str = "") -> str:
             rows.append(["*ceiling without memory*", *(f"*{values}*" for values in exact)])
             blind = (open_loop_ceiling(task_of(configuration, goal)) for goal in goals)
             rows.append(["*ceiling without observations*", *(f"*{value:.2f}*" for value in blind)])
-    return table([title or configuration, *(f"goal {goal}" for goal in goals)], rows)
+    return table([configuration, *(f"goal {goal}" for goal in goals)], rows)
 
 
 def remembering() -> Raw:
@@ -183,8 +183,6 @@ def page() -> str:
     on_depths, on_co_b1 = map(read, RND)
     small = read("baselines_b1") + on_co_b1
     tables = {name: by_goal(small, name) for name in SMALL}
-    instances = read(INSTANCES)
-    tables |= {f"{name}_instances": by_goal(instances, name, f"{name}, instances") for name in SMALL}
     tables |= {"memory": memory_tables(), "observability": search.observability_table()}
     tables |= {f"search_{depth}": search.search_table(depth) for depth in (2, 3)}
     tables |= {
