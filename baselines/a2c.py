@@ -39,7 +39,8 @@ class A2C(PolicyGradient):
     ) -> None:
         require(*not_negative(entropy_coeff=entropy_coeff, critic_coeff=critic_coeff))
         super().__init__(observation_spec, action_spec, **settings)
-        self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
+        self.entropy_coeff = entropy_coeff
+        self.critic_coeff = critic_coeff
 
     def loss(self, batch: Data) -> dict[str, Tensor]:
         """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""

@@ -66,7 +66,9 @@ class DQN(QLearner):
         )
         require_weights(observation_spec, hidden_size, 2, num_actions_of(action_spec))
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
-        self.priority_alpha, self.priority_beta, self.gamma = priority_alpha, priority_beta, gamma
+        self.priority_alpha = priority_alpha
+        self.priority_beta = priority_beta
+        self.gamma = gamma
         super().__init__(gamma=gamma, **settings)
         layers = [
             linear_layer(hidden_size, hidden_size),
@@ -105,7 +107,8 @@ class DQN(QLearner):
             running = (~batch["next", "terminated"]).int()
             target = (batch["next", "reward"] + gamma * running * later.gather(-1, best)).squeeze(-1)
             squared = (predicted - target).square()
-        loss, weight = (predicted - target).square(), batch.get("priority_weight")
+        loss = (predicted - target).square()
+        weight = batch.get("priority_weight")
         mean = loss.mean() if weight is None else (loss * weight).sum() / weight.sum()
         return {"loss_value": mean, "td_error": squared}
 

@@ -58,7 +58,8 @@ class Projected(nn.Module):
 
     def __init__(self, encoder: nn.Module, num_inputs: int, num_features: int) -> None:
         super().__init__()
-        self.encoder, self.linear = encoder, linear_layer(num_inputs, num_features)
+        self.encoder = encoder
+        self.linear = linear_layer(num_inputs, num_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map the encoder's inputs to float32 [..., num_features]."""
@@ -91,8 +92,11 @@ class HebbianHead(nn.Module):
         reward_baseline: float,
     ) -> None:
         super().__init__()
-        self.decay, self.share = math.exp(-1 / eligibility_steps), hebbian_share
-        self.change, self.fall, self.reward_baseline = hebbian_change, hebbian_decay, reward_baseline
+        self.decay = math.exp(-1 / eligibility_steps)
+        self.share = hebbian_share
+        self.change = hebbian_change
+        self.fall = hebbian_decay
+        self.reward_baseline = reward_baseline
         self.register_buffer("weights", torch.zeros(num_actions, num_features, dtype=torch.float32, device="cpu"))
 
     def forward(self, y: Tensor) -> Tensor:
@@ -103,7 +107,8 @@ class HebbianHead(nn.Module):
         """Return the eligibility after an action, [n, num_actions, num_features]; y is [n, num_features]."""
         number = (self.share * y.count_nonzero(dim=-1).to(y.dtype)).ceil().unsqueeze(-1)
         place = y.argsort(dim=-1).argsort(dim=-1)
-        largest, smallest = place >= y.shape[-1] - number, place < number
+        largest = place >= y.shape[-1] - number
+        smallest = place < number
         row = self.change * (largest.to(y.dtype) - smallest.to(y.dtype)) - self.fall * (~(largest | smallest)).to(
             y.dtype
         )
@@ -146,14 +151,19 @@ class ModulatedGreedy(TensorDictModuleBase):
         noise_share: float,
     ) -> None:
         super().__init__()
-        self.greedy, self.hebbian, self.exploration = TensorDictSequential(trunk, head), hebbian, exploration
-        self.average_decay, self.noise_std, self.noise_share = average_decay, noise_std, noise_share
+        self.greedy = TensorDictSequential(trunk, head)
+        self.hebbian = hebbian
+        self.exploration = exploration
+        self.average_decay = average_decay
+        self.noise_std = noise_std
+        self.noise_share = noise_share
         self.in_keys = [*trunk.in_keys, "is_init", *STATE]
         self.out_keys = ["action", *(("next", key) for key in STATE)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and the next state."""
-        features, average = self.features(tensordict), tensordict["average"]
+        features = self.features(tensordict)
+        average = tensordict["average"]
         y = (features + self._noise(features) - average).tanh()
         tensordict.set("action", (self.head(features) + self.hebbian(y)).argmax(dim=-1))
         tensordict = self.exploration(tensordict)
@@ -192,7 +202,8 @@ class Target(LossModule):
     def __init__(self, network: TensorDictSequential) -> None:
         super().__init__()
         self.convert_to_functional(network, "value_network", create_target_params=True)
-        self.in_keys, self.out_keys = network.in_keys, ["features", "action_value"]
+        self.in_keys = network.in_keys
+        self.out_keys = ["features", "action_value"]
 
     def outputs(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute phi and q with the target network's weights."""
@@ -263,7 +274,8 @@ class MOHQA(QLearner):
         require_weights(observation_spec, hidden_size, 1, num_features)
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"], 2 * num_features)
         super().__init__(gamma=gamma, **settings)
-        self.gamma, self.predict_sum = gamma, predict_sum
+        self.gamma = gamma
+        self.predict_sum = predict_sum
         inner = encoder(observation_spec, hidden_size)
         projected = Projected(inner.module, hidden_size, num_features)
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
@@ -290,7 +302,8 @@ class MOHQA(QLearner):
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return no eligibility, and the mean average of the environments."""
-        weights, average = self.hebbian.weights, self.average.expand(num_envs, -1)
+        weights = self.hebbian.weights
+        average = self.average.expand(num_envs, -1)
         state = {"eligibility": weights.new_zeros(num_envs, *weights.shape), "average": average.clone()}
         return TensorDict({**state, "trial": weights.new_zeros(num_envs, 1)}, batch_size=[num_envs])
 

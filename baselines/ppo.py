@@ -53,8 +53,10 @@ class PPO(PolicyGradient):
         )
         super().__init__(observation_spec, action_spec, **settings)
         require(self._split_rule(num_minibatches))
-        self.num_epochs, self.num_minibatches = num_epochs, num_minibatches
-        self.entropy_coeff, self.critic_coeff = entropy_coeff, critic_coeff
+        self.num_epochs = num_epochs
+        self.num_minibatches = num_minibatches
+        self.entropy_coeff = entropy_coeff
+        self.critic_coeff = critic_coeff
         self.clip_range = (
             torch.tensor([-clip_epsilon, clip_epsilon], dtype=torch.float32, device="cpu").log1p().tolist()
         )

@@ -32,7 +32,8 @@ class SimHashCounts(nn.Module):
 
     def __init__(self, num_inputs: int, high: float, num_bits: int) -> None:
         super().__init__()
-        self.num_inputs, self.scale = num_inputs, 2 / high
+        self.num_inputs = num_inputs
+        self.scale = 2 / high
         self.register_buffer("projection", torch.randn(num_inputs, num_bits, dtype=torch.float32, device="cpu"))
         self.register_buffer("counts", torch.zeros(2**num_bits, dtype=torch.int64, device="cpu"))
 

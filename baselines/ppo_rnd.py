@@ -92,7 +92,9 @@ class Novelty(nn.Module):
         self, num_inputs: int, hidden_size: int, num_features: int, high: float, num_envs: int, gamma: float
     ) -> None:
         super().__init__()
-        self.num_inputs, self.scale, self.gamma = num_inputs, 1 / high, gamma
+        self.num_inputs = num_inputs
+        self.scale = 1 / high
+        self.gamma = gamma
         self.target, self.predictor = (
             nn.Sequential(
                 linear_layer(num_inputs, hidden_size),
@@ -102,7 +104,8 @@ class Novelty(nn.Module):
             for _ in range(2)
         )
         self.target.requires_grad_(False)
-        self.of_observations, self.of_returns = Moments(num_inputs), Moments(1)
+        self.of_observations = Moments(num_inputs)
+        self.of_returns = Moments(1)
         self.register_buffer("returns", torch.zeros(num_envs, dtype=torch.float32, device="cpu"))
 
     def reset(self) -> None:
@@ -174,10 +177,13 @@ class PPORND(PPO):
             *at_least_one(num_features=num_features),
         )
         super().__init__(observation_spec, action_spec, **settings)
-        spec, width = observation_spec["observation"], settings["hidden_size"]
+        spec = observation_spec["observation"]
+        width = settings["hidden_size"]
         size = width * (spec.shape.numel() + num_features)
         require_memory(f"weights of num_features={num_features}", 20 * size, "or smaller layers")
-        self.bonus_coeff, self.bonus_gamma, self.predictor_share = bonus_coeff, bonus_gamma, predictor_share
+        self.bonus_coeff = bonus_coeff
+        self.bonus_gamma = bonus_gamma
+        self.predictor_share = predictor_share
         high = highest(spec)
         shape = (spec.shape.numel(), width, num_features)
         self.novelty = Novelty(*shape, high=high, num_envs=self.num_envs, gamma=bonus_gamma)

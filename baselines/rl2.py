@@ -38,7 +38,9 @@ class TrialTrunk(TensorDictModuleBase):
 
     def __init__(self, trunk: RecurrentModule, num_actions: int, trial_episodes: int) -> None:
         super().__init__()
-        self.trunk, self.num_actions, self.trial_episodes = trunk, num_actions, trial_episodes
+        self.trunk = trunk
+        self.num_actions = num_actions
+        self.trial_episodes = trial_episodes
         self.in_keys = [*(key for key in trunk.in_keys if key != "previous"), *OWN_KEYS]
         self.out_keys = [*trunk.out_keys, ("next", "trial")]
 
@@ -114,7 +116,8 @@ class RL2(PPO):
         The loop must carry a state with the key ``trial`` over the ends of episodes as it does from step to step; the
         trunk resets it.
         """
-        state, device = self.trunk.trunk.zero_state(num_envs), next(self.parameters()).device
+        state = self.trunk.trunk.zero_state(num_envs)
+        device = next(self.parameters()).device
         state["trial"] = torch.zeros(num_envs, 1, dtype=torch.int64, device=device)
         state["previous_action"] = torch.zeros(num_envs, dtype=torch.int64, device=device)
         return state.set("reward", torch.zeros(num_envs, 1, device=device, dtype=torch.float32))

@@ -81,14 +81,18 @@ class Contender:
 
     def measure(self, learning: Learning, seconds: float) -> None:
         """Measure frames per second over at least so many seconds."""
-        frames, start = 0, time.process_time()
+        frames = 0
+        start = time.process_time()
         while time.process_time() - start < seconds:
             frames += learning.learn()
         self.speeds.append(frames / (time.process_time() - start))
 
     def solve(self, seed: int, max_frames: int) -> None:
         """Learn until the task is solved, and note frames and seconds; None if ``max_frames`` are not enough."""
-        learning, frames, seconds, checked = self.make(seed), 0, 0.0, 0
+        learning = self.make(seed)
+        frames = 0
+        seconds = 0.0
+        checked = 0
         while frames < max_frames:
             start = time.process_time()
             frames += learning.learn()
@@ -266,7 +270,8 @@ def main(arguments: list[str] | None = None) -> None:
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]
     for learner in learners:
         learner.learn()
-    start, pairs = time.perf_counter(), list(zip(measured, learners, strict=True))
+    start = time.perf_counter()
+    pairs = list(zip(measured, learners, strict=True))
     with suppress(KeyboardInterrupt):
         for contender, learner in until(options.limit, track(pairs * options.rounds, "measuring", console=console)):
             contender.measure(learner, options.seconds)

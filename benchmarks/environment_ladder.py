@@ -55,7 +55,8 @@ class Rung:
 
 def rungs(device: torch.device, num_rows: Sequence[int], tasks: Mapping[str, Task]) -> list[Rung]:
     """Return what is measured, in the order of the table."""
-    size, measured = next(iter(tasks.values())).images.shape, []
+    size = next(iter(tasks.values())).images.shape
+    measured = []
     for n in num_rows:
         measured.append(Rung(COPY, "", n, partial(_copy, n, size, device)))
         for name, task in tasks.items():
@@ -116,7 +117,8 @@ def _fused(tasks: Sequence[Task], device: torch.device) -> Run:
 
     @torch.no_grad()
     def taken(given: dict[Any, Tensor]) -> dict[Any, Tensor]:
-        state, words = tuple(given.values()), draws(given["tick"], params, rows.uses)
+        state = tuple(given.values())
+        words = draws(given["tick"], params, rows.uses)
         for t in range(NUM_STEPS):
             outputs = (observation[t + 1], steps.reward[t], steps.done[t], steps.outcome[t])
             state, words = step(outputs, state, actions[t], words, params=params, uses=rows.uses)
@@ -132,8 +134,11 @@ def in_words(rows: Rows, steps: Steps) -> tuple[RowParams, Tensor]:
         The tasks, with a bank of int64 [views, bytes / 8], and the buffer, int64 [steps + 1, N, bytes / 8]; both as
         they are for images with noise, late rotation or a reward cue, and for those that are not whole words.
     """
-    params, uses, observation = rows.params, rows.uses, steps.observation
-    bank, buffer = params.bank.flatten(1), observation.flatten(2)
+    params = rows.params
+    uses = rows.uses
+    observation = steps.observation
+    bank = params.bank.flatten(1)
+    buffer = observation.flatten(2)
     if uses.pixel_noise or uses.reward_cue or params.x.taps is not None or bank.shape[1] % 8:
         return params, observation
     return params._replace(bank=bank.view(torch.int64)), buffer.view(torch.int64)
@@ -158,7 +163,8 @@ def write_step(
         The next states, and their draws.
     """
     after = dynamics.advance(RowState(*state), action, words, params, uses, absorbing=False)
-    done, reward = is_done(after, params.tree), after.reward
+    done = is_done(after, params.tree)
+    reward = after.reward
     outcome = dynamics.arrivals(after, done, params)[0]
     after = dynamics.begin(after, done, params, uses)
     words = dynamics.words_of(after.tick, params, uses)
@@ -225,7 +231,8 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
 
 def _speed(run: Run, at_once: int, seconds: float, device: torch.device) -> float:
     """Return observations a second; the device is waited for after so many runs at once."""
-    count, start = 0, finished(device)
+    count = 0
+    start = finished(device)
     while (now := finished(device)) - start < seconds:
         count += sum(run() for _ in range(at_once))
     return count / (now - start)
@@ -279,7 +286,9 @@ def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
     for row in rows:
         numbers = [row.get("failure", ""), "", ""]
         if "per_second" in row:
-            speed, ratio, goal = row["per_second"], row["ratio"], row["goal"]
+            speed = row["per_second"]
+            ratio = row["ratio"]
+            goal = row["goal"]
             share = "" if goal is None else f"{speed / goal:.2g} of {goal / 1e6:,.3g}M"
             numbers = [f"{speed / 1e6:.4g}", "" if ratio is None else f"{ratio:.2g}", share]
         lines.append(f"| {row['rows']:,} | {row['task']} | {row['way']} | {' | '.join(numbers)} |")

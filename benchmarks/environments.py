@@ -40,7 +40,9 @@ from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
 from ctgraph_rl.tasks.task import Task
 
-MEMCPY, TRIVIAL, LEAN = "memcpy", "trivial environment: ", ", info=False"
+MEMCPY = "memcpy"
+TRIVIAL = "trivial environment: "
+LEAN = ", info=False"
 MAX_BUFFER = 2**26
 """Bytes of observations in the buffers: beyond the caches."""
 
@@ -79,7 +81,8 @@ class Contender:
 
     def measure(self, seconds: float) -> None:
         """Observations a second over at least so many seconds."""
-        count, start = 0, time.perf_counter()
+        count = 0
+        start = time.perf_counter()
         while time.perf_counter() - start < seconds:
             count += self.run()
         self.speeds.append(count / (time.perf_counter() - start))
@@ -161,7 +164,8 @@ def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[st
 def _torchrl(
     make: Callable[[], EnvBase], prefix: str = "", suffix: str = ""
 ) -> Iterator[tuple[str, Callable[[], int]]]:
-    env, collected = make(), make()
+    env = make()
+    collected = make()
     n = env.batch_size[0]
     steps = max(4, min(64, 2**25 // (n * 300)))
     policy = _Random(n)
@@ -245,7 +249,8 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
         found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
 
-    tasks, ways = configurations(), tuple(SUFFIX)[: 1 + with_kernel]
+    tasks = configurations()
+    ways = tuple(SUFFIX)[: 1 + with_kernel]
     for n in num_rows:
         add("", n, _memory(n))
         add("", n, _torchrl(partial(Counter, n), TRIVIAL))
@@ -287,7 +292,8 @@ def machine(device: torch.device | None = None) -> str:
     """Return what was measured on."""
     if device is not None and device.type == "cuda":
         return f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}, torch {torch.__version__}"
-    threads, capability = torch.get_num_threads(), torch.backends.cpu.get_cpu_capability()
+    threads = torch.get_num_threads()
+    capability = torch.backends.cpu.get_cpu_capability()
     return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
 
 

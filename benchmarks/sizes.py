@@ -35,7 +35,8 @@ from ctgraph_rl.tasks.task import ct_graphs
 SIZES = (50, 100, 200)
 """Numbers of tasks."""
 
-OF_A_CURRICULUM, OF_A_LOG = "tasks", "lines"
+OF_A_CURRICULUM = "tasks"
+OF_A_LOG = "lines"
 
 
 @dataclass
@@ -85,7 +86,8 @@ def sized_curriculum(num_tasks: int) -> Curriculum:
 
 def write_sized_log(curriculum: Curriculum, path: Path) -> None:
     """Write the log of a run that evaluates all tasks before training and after every block; returns are drawn."""
-    draw, log = torch.Generator(device="cpu").manual_seed(0), RunLog(path)
+    draw = torch.Generator(device="cpu").manual_seed(0)
+    log = RunLog(path)
     trained = [[number + 1 for number in block] for block in curriculum.trained]
     config = {"seed": 0, "agent": "none"}
     about = {"curriculum": curriculum.name, "fingerprint": curriculum.fingerprint, "config": config}
@@ -106,7 +108,8 @@ def _means(value: float) -> dict[str, float]:
 
 def readers_of_curricula(curriculum: Curriculum) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield everything that reads a curriculum, by name; each works on a new one, which remembers nothing."""
-    content, tasks = curriculum.to_json(), ct_graphs(curriculum.tasks, "this benchmark")
+    content = curriculum.to_json()
+    tasks = ct_graphs(curriculum.tasks, "this benchmark")
     yield "`Curriculum.from_json`", lambda: Curriculum.from_json(content)
     yield "`Curriculum.to_json`", lambda: replace(curriculum).to_json()
     yield "`Curriculum.fingerprint`", lambda: replace(curriculum).fingerprint

@@ -62,7 +62,8 @@ class Stable:
 
     def __init__(self, name: str, given: Mapping[str, Any], task: Task, way: tuple[MakeEnv, bool], seed: int) -> None:
         make_env, like_ours = way
-        self.task, self.name = task, name
+        self.task = task
+        self.name = name
         num_rows = given["num_envs"] if like_ours else DEFAULT_ROWS
         policy = "MlpLstmPolicy" if name == "lstm_ppo" else "MlpPolicy"
         more = translated(name, given) if like_ours else {}
@@ -73,7 +74,9 @@ class Stable:
 
     def _exploration(self, given: Mapping[str, Any]) -> Callable[[float], float]:
         """Return exploration that falls with the frames, not with their share of a call to ``learn``."""
-        first, last, frames = given["eps_init"], given["eps_end"], given["annealing_num_steps"]
+        first = given["eps_init"]
+        last = given["eps_end"]
+        frames = given["annealing_num_steps"]
         return lambda _: max(last, first - (first - last) * self.model.num_timesteps / frames)
 
     def learn(self) -> int:
@@ -85,8 +88,11 @@ class Stable:
     def success(self) -> float:
         """Return the share of 100 greedy episodes that reach the goal."""
         envs = batch(self.task, 100)
-        observation, state = envs.reset(), None
-        starts, open_, outcomes = np.ones(100, dtype=bool), np.ones(100, dtype=bool), np.zeros(100)
+        observation = envs.reset()
+        state = None
+        starts = np.ones(100, dtype=bool)
+        open_ = np.ones(100, dtype=bool)
+        outcomes = np.zeros(100)
         while open_.any():
             action, state = self.model.predict(observation, state=state, episode_start=starts, deterministic=True)
             observation, _, starts, infos = envs.step(action)
@@ -99,7 +105,9 @@ class Stable:
 def translated(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Translate our hyperparameters to Stable-Baselines3's."""
     same = {"learning_rate": given["learning_rate"], "gamma": given["gamma"], "max_grad_norm": given["max_grad_norm"]}
-    width, rows, steps = given["hidden_size"], given["num_envs"], given["num_steps"]
+    width = given["hidden_size"]
+    rows = given["num_envs"]
+    steps = given["num_steps"]
     network: dict[str, Any] = {"activation_fn": nn.ReLU, "optimizer_class": torch.optim.Adam}
     network["net_arch"] = [] if name == "lstm_ppo" else [width, width]
     if name == "dqn":

@@ -29,7 +29,8 @@ BOUND = 1e-4
 EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
 """Exit codes."""
 
-TOGETHER, EXPERTS_TOGETHER = "seeds trained together", "seeds of experts trained together"
+TOGETHER = "seeds trained together"
+EXPERTS_TOGETHER = "seeds of experts trained together"
 
 PARTS = {
     "curriculum": ("curriculum", "version", "fingerprint", "source", "tasks", "trained"),
@@ -65,7 +66,8 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     code, verdict = _verdict(found, bound)
     weights = _weights(one, other)
     if code == EQUAL and weights.startswith("different"):
-        code, verdict = DIFFERENT, "different: all measurements are equal, the agents' weights are not"
+        code = DIFFERENT
+        verdict = "different: all measurements are equal, the agents' weights are not"
     torn = [path for path, log in zip((one, other), logs, strict=True) if log.torn_lines]
     notes = [f"note: the last line of {path / LOG} is torn and not compared" for path in torn]
     return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *_groups_of_experts(*logs), *notes])

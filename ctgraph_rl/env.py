@@ -100,7 +100,8 @@ class CTGraphEnv(EnvBase):
         self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
         device = None if device is None else checked_device(device)
         super().__init__(device=device, batch_size=torch.Size([len(tasks)]))
-        self.check_actions, self.info = check_actions, info
+        self.check_actions = check_actions
+        self.info = info
         self.rows = Rows(
             tasks, seed, first_row, task_pool=task_pool, device=self.device, noise_bank=noise_bank, kernel=kernel
         )
@@ -113,7 +114,8 @@ class CTGraphEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        n, device = self.batch_size[0], self.device
+        n = self.batch_size[0]
+        device = self.device
         specs = specs_of(self.rows.pool, (n,), self.num_task_ids, self.info)
         self.observation_spec, self.action_spec = (spec.to(device) for spec in specs)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32, device=device)
@@ -214,8 +216,10 @@ class CTGraphEnv(EnvBase):
         require((complete, "set_state=True needs the rows' state under 'state', as get_state() gives it"))
         present = self.rows.state
         state = RowState(*(given[field].to(like.dtype) for field, like in zip(RowState._fields, present, strict=True)))
-        nodes, leaves = self.first_leaf + self.num_end_states, self.num_end_states
-        kind, is_leaf = state.state_type, state.node >= self.first_leaf
+        nodes = self.first_leaf + self.num_end_states
+        leaves = self.num_end_states
+        kind = state.state_type
+        is_leaf = state.node >= self.first_leaf
         running = (kind >= 0) & ~is_done(state, self.rows.params.tree)
         misplaced = ((kind == StateType.DECISION) & is_leaf) | ((kind == StateType.END) & ~is_leaf)
         misplaced = misplaced | ((kind == StateType.HOME) & (state.node != 0))
@@ -261,7 +265,8 @@ class CTGraphEnv(EnvBase):
         if row_major or kwargs.get("return_contiguous", False) is not False:
             return super().rollout(*args, **kwargs)
         steps: list[TensorDictBase] = []
-        outer, self._steps = self._steps, steps
+        outer = self._steps
+        self._steps = steps
         try:
             stacked = super().rollout(*args, **kwargs)
         finally:
@@ -299,17 +304,20 @@ class CTGraphEnv(EnvBase):
         if self.check_actions:
             self.rows.check_actions(action, mask)
         shown = self.rows.step(action, mask)  # type: ignore[arg-type]
-        done, reward = shown.done.unsqueeze(-1), self.rows.reward
+        done = shown.done.unsqueeze(-1)
+        reward = self.rows.reward
         is_init = torch.zeros_like(done)
         if mask is not None:
-            is_init, reward = (~mask & (self.rows.step_count == 0)).unsqueeze(-1), reward * mask
+            is_init = (~mask & (self.rows.step_count == 0)).unsqueeze(-1)
+            reward = reward * mask
         data = self._data(shown.observation, done, is_init, shown)
         data["reward"] = reward.unsqueeze(-1)
         return data
 
     def step_and_restart_data(self, action: Tensor | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what `step_data` returns, and then `restart_data` for the rows that are done; on CPUs in one call."""
-        rows, stepped = self.rows, None
+        rows = self.rows
+        stepped = None
         if rows.uses_kernel and not rows.tasks_change:
             most = rows.max_branching if self.check_actions else -1
             stepped = rows.native.step_and_restart(rows.state, action, most)
@@ -319,7 +327,8 @@ class CTGraphEnv(EnvBase):
         rows.state, shown = stepped
         if not self._running:  # shared by all steps
             self._running = self._not_done()
-        done, rewards = shown.done.unsqueeze(-1), shown.reward.unsqueeze(-1)
+        done = shown.done.unsqueeze(-1)
+        rewards = shown.reward.unsqueeze(-1)
         after = {**self._data(shown.observation, done, self._running["done"], shown), "reward": rewards}
         return after, self._restarted(shown.following, done, self._running)
 

@@ -86,7 +86,8 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         self.observation_space, self._ids = with_task_ids(images, self.task_pool, task_ids, num_task_ids)
         self._number = self._next_number = self.task_pool.index(task)
         self._num_actions = self.rows.max_branching + 1
-        self._is_seeded, self._is_over = False, True
+        self._is_seeded = False
+        self._is_over = True
 
     def set_task(self, task: Task) -> None:
         """Change to another task of the pool at the next reset."""
@@ -129,7 +130,9 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
                 (not self._is_over, "no episode is running: reset first"),
             )
         observation, done = self.rows.act(_as_tensor(number))
-        self._is_over, outcome, leaf = bool(done.item()), OUTCOME_RUNNING, NO_LEAF
+        self._is_over = bool(done.item())
+        outcome = OUTCOME_RUNNING
+        leaf = NO_LEAF
         if self._is_over:
             outcome, leaf = (int(value.item()) for value in self.rows.result(done))
         shown = with_id(observation.numpy()[0], self._ids, self._number)
@@ -238,14 +241,16 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
         Raises:
             ValueError: for other actions, before the first reset, and for rows that are done without autoreset.
         """
-        action, over = self._checked(actions), self._is_over
+        action = self._checked(actions)
+        over = self._is_over
         if over.any() or self.rows.uses_kernel:
             self._change_tasks(over)
             shown = self.rows.step_or_reset(action, torch.from_numpy(over))
         else:
             images, ends = self.rows.act(action)
             shown = Shown(images, *self.rows.result(ends), ends)
-        rewards, done = self.rows.reward.numpy().astype(np.float64), shown.done.numpy()
+        rewards = self.rows.reward.numpy().astype(np.float64)
+        done = shown.done.numpy()
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             shown, infos = self._restart(done, shown)
         else:
@@ -275,7 +280,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
 
     def _checked(self, actions: NDArray[np.int64]) -> Tensor:
         """A copy of actions as the rows want them."""
-        action, last = np.asarray(actions), self.rows.max_branching
+        action = np.asarray(actions)
+        last = self.rows.max_branching
         fits = action.shape == (self.num_envs,) and action.dtype.kind in "iu"
         if not fits or action.min() < 0 or action.max() > last:
             got = action[(action < 0) | (action > last)][:5].tolist() if fits else f"{action.dtype} {action.shape}"
@@ -304,7 +310,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
         if start.any():
             drawn = self.np_random.integers(2**63 - 1, size=self.num_envs) if not given[start].all() else self._seeds
             chosen = np.array([draw if one is None else one for one, draw in zip(seeds, drawn, strict=True)])
-            self._seeds, self._is_seeded = np.where(start, chosen, self._seeds), True
+            self._seeds = np.where(start, chosen, self._seeds)
+            self._is_seeded = True
             row = torch.zeros(self.num_envs, dtype=torch.int64, device="cpu")
             self._only(start, lambda: self.rows.set_streams(torch.from_numpy(self._seeds), row))
 
@@ -385,7 +392,8 @@ def _frames(env: CTGraphGymEnv | CTGraphVectorEnv) -> tuple[Frame, ...] | None:
     if env.render_mode is None:
         logger.warn("render() needs a render_mode, as in gymnasium.make(id, render_mode='rgb_array')")
         return None
-    rows, observation = env.rows, env.rows.show().observation
+    rows = env.rows
+    observation = env.rows.show().observation
     if env.render_mode == "rgb_array":
         return tuple(render(rows.tasks, rows.state_type, rows.node, rows.goal_leaf, observation).numpy())
     return as_text(rows.tasks, rows.state, observation, rows.white)

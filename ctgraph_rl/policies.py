@@ -68,8 +68,11 @@ class OptimalPolicy(NavigationPolicy):
 
     def _towards(self, leaf: Tensor) -> Tensor:
         """The decision on the way from each row's node to an end state; 1 where the node is not on the way."""
-        b, node = self.env.branching_factor, self.env.node
-        child, decision, swap = self.env.first_leaf + leaf, torch.ones_like(node), self.env.swap
+        b = self.env.branching_factor
+        node = self.env.node
+        child = self.env.first_leaf + leaf
+        decision = torch.ones_like(node)
+        swap = self.env.swap
         for _ in range(self.env.max_depth):
             parent = (child - 1) // b
             decision = torch.where(parent == node, branch_of(node, child - b * parent, swap), decision)

@@ -77,7 +77,8 @@ def check_portable() -> None:
     Raises:
         ValueError: for a CPU that lacks instructions, and for variables that are not set; names them.
     """
-    lacking, variables = _lacking(), " ".join(f"{name}={value}" for name, value in VARIABLES.items())
+    lacking = _lacking()
+    variables = " ".join(f"{name}={value}" for name, value in VARIABLES.items())
     require((not lacking, f"portable=true needs an x86-64 CPU with AVX2 and FMA, this one lacks {', '.join(lacking)}"))
     require((_has_variables(), f"portable=true needs these variables before torch is imported: {variables}; set them"))
 

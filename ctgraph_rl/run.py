@@ -99,7 +99,8 @@ class Stop(BaseException):
 
     def __init__(self, error: Exception, message: str) -> None:
         super().__init__(message)
-        self.error, self.message = error, message
+        self.error = error
+        self.message = message
 
 
 @of_hydra(hydra.main)(config_path=conf_dir(), config_name="config")
@@ -136,7 +137,8 @@ def remove_empty(run_dir: Path) -> None:
 
 def main() -> None:
     """Entry point: a user's error is one message and exit code 1; HYDRA_FULL_ERROR=1 shows where it came from."""
-    environment, arguments = dict(os.environ), sys.argv[1:]
+    environment = dict(os.environ)
+    arguments = sys.argv[1:]
     full_error = os.environ.setdefault("HYDRA_FULL_ERROR", "0") not in ("", "0")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then leaves errors to us
     sys.path.append(os.getcwd())  # where a user's own agent may be, for the console script too

@@ -77,7 +77,8 @@ class SB3VecEnv(VecEnv):
         infos = _by_row(batch, **{"TimeLimit.truncated": False})
         ended = done.nonzero()[0].tolist()
         if ended:
-            begun, final = _by_row(batch), _by_row(batch["final_info"])
+            begun = _by_row(batch)
+            final = _by_row(batch["final_info"])
             for i in ended:
                 self.reset_infos[i] = begun[i]
                 last = self._shown(batch["final_obs"][i], final[i]["task"])

@@ -313,7 +313,8 @@ def files_below(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], li
         folder: need not exist.
         names: of the files; empty for all.
     """
-    files, deep = [], []
+    files = []
+    deep = []
     waiting = [(folder, 0)]
     while waiting:
         where, depth = waiting.pop()

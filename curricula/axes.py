@@ -70,7 +70,8 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
     """
 
     def vary(task: Task) -> Iterable[Task]:
-        b, d = task.graph.branching_factor, task.graph.depth
+        b = task.graph.branching_factor
+        d = task.graph.depth
         require((is_int(num_decisions, 0, d), f"num_decisions must be in 0..{d}, the depth, got {num_decisions!r}"))
         _check_number(b ** (d - num_decisions))
         ends = itertools.product(range(1, b + 1), repeat=d - num_decisions)
@@ -90,7 +91,8 @@ def random_goals(tasks: OneOrMore, num_goals: int, seed: int) -> Tasks:
     """
 
     def vary(task: Task) -> list[Task]:
-        graph, source = task.graph, generator(seed)
+        graph = task.graph
+        source = generator(seed)
         _check_draws("num_goals", num_goals, graph.num_end_states)
         return different(num_goals, lambda: replace(task, goal=_random_goal(graph, source)))
 
@@ -130,7 +132,8 @@ def shifted_ids(tasks: OneOrMore, shifts: Iterable[int], kinds: Sequence[str] = 
         shifts: how far ids move; 0 is the task itself.
         kinds: which states: some of home, fail, wait, decision and end.
     """
-    listed, moved = require_all(int, "shifts", shifts), require_all(str, "kinds", kinds)
+    listed = require_all(int, "shifts", shifts)
+    moved = require_all(str, "kinds", kinds)
     unknown = [kind for kind in moved if kind not in MOVABLE]
     require((not unknown, f"kinds must be some of {', '.join(MOVABLE)}, got {', '.join(unknown)}"))
 
@@ -157,7 +160,8 @@ def new_images(tasks: OneOrMore, num_sets: int, kinds: Sequence[str] = ("decisio
 
     def vary(task: Task) -> Tasks:
         ranges = [task.observations.ids(StateType[kind.upper()]) for kind in kinds if kind in MOVABLE]
-        first, last = min(ranges, default=(0, 0))[0], max((last for _, last in ranges), default=0)
+        first = min(ranges, default=(0, 0))[0]
+        last = max((last for _, last in ranges), default=0)
         start = task.observations.last_id + 1 - first
         shifts = (0, *(start + i * (last - first + 1) for i in range(num_sets - 1)))
         return shifted_ids(task, shifts, kinds)

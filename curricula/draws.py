@@ -28,7 +28,8 @@ def below(source: random.Random, count: int) -> int:
 
 def shuffled(items: Iterable[Item], seed: int) -> list[Item]:
     """Return the items in an order drawn uniformly from a seed."""
-    order, source = list(items), generator(seed)
+    order = list(items)
+    source = generator(seed)
     for i in range(len(order) - 1, 0, -1):
         j = below(source, i + 1)
         order[i], order[j] = order[j], order[i]

@@ -67,7 +67,8 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
         tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
-        source, protocol = f"meta-JSON file {file.name}", _labels(meta, tasks, numbers)
+        source = f"meta-JSON file {file.name}"
+        protocol = _labels(meta, tasks, numbers)
         return sequence(name or file.stem, tasks, num_frames, version=1, source=source, protocol=protocol)
 
 
@@ -128,7 +129,8 @@ def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
 
 
 def _labels(meta: dict[str, Any], tasks: Tasks, numbers: list[int]) -> Protocol:
-    labels, length = _label_of_each(meta, numbers), meta["label_dim"]
+    labels = _label_of_each(meta, numbers)
+    length = meta["label_dim"]
     require(
         (len(labels) == len(tasks), f"task_label_ids must be one for each of {len(tasks)} tasks, got {len(labels)}"),
         (max(labels) < length, f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}"),
@@ -198,7 +200,9 @@ def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
 
 
 def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
-    paths, order, by_place = meta["config_paths"], meta["task_order"], meta.get("label_by_curriculum_index", False)
+    paths = meta["config_paths"]
+    order = meta["task_order"]
+    by_place = meta.get("label_by_curriculum_index", False)
     mode = meta.get("task_label_mode", LABEL_MODES[0])
     random_order = "; random is drawn from a global generator, so it cannot be reproduced" if order == "random" else ""
     only_paths = isinstance(paths, list) and 1 <= len(paths) <= MOST_CONFIGS and all(isinstance(p, str) for p in paths)

@@ -82,7 +82,8 @@ def goal_of(path: str) -> tuple[int, ...]:
 
 def one_wait_image(path: str, image_seed: int) -> Task:
     """A task of the labs' ``pomdp_wait`` environments: one image for all wait states, one for each other state."""
-    depth, n = len(path), 2 ** len(path)
+    depth = len(path)
+    n = 2 ** len(path)
     unique = (True, False)
     config = environment(depth, (2, 2), (3, n + 1), (n + 2, 2 * n + 1), image_seed, unique=unique)
     return Task.from_json(config, goal_of(path))
@@ -90,7 +91,8 @@ def one_wait_image(path: str, image_seed: int) -> Task:
 
 def full_mdp(path: str, image_seed: int, fail_reward: float = 0.0, one_hot: bool = False) -> Task:
     """A task of the labs' fully observable environments: an image, or a vector, for each state."""
-    depth, n = len(path), 2 ** len(path)
+    depth = len(path)
+    n = 2 ** len(path)
     ids = (2, 2 * n), (2 * n + 1, 3 * n - 1), (3 * n, 4 * n - 1)
     return Task.from_json(environment(depth, *ids, image_seed, fail_reward, one_hot=one_hot), goal_of(path))
 

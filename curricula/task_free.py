@@ -60,7 +60,8 @@ def task_free_gradual(
         num_rows: environments of the agent, for the number of episodes of a change.
     """
     require(*at_least_one(num_frames=num_frames, num_rows=num_rows))
-    tasks, drift = _tasks(differ, image_seed), Drift(max(num_frames // (num_rows * LONGEST_EPISODE), 1))
+    tasks = _tasks(differ, image_seed)
+    drift = Drift(max(num_frames // (num_rows * LONGEST_EPISODE), 1))
     blocks = [Block((tasks[0],), num_frames)]
     for pair in pairwise(tasks):
         blocks += [Block(pair, num_frames, drift), Block(pair[1:], num_frames)]
@@ -86,7 +87,8 @@ def _curriculum(name: str, tasks: list[Task], num_frames: int) -> Curriculum:
 def _tasks(differ: str, image_seed: int) -> list[Task]:
     """Return the four tasks."""
     require(*one_of(DIFFER, differ=differ))
-    task, seeds = ct_fo_b1(image_seed=image_seed), [image_seed + number for number in range(4)]
+    task = ct_fo_b1(image_seed=image_seed)
+    seeds = [image_seed + number for number in range(4)]
     goals = list(all_goals(task))
     if differ == "goals":
         return goals

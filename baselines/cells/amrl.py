@@ -50,7 +50,8 @@ class AMRL(Cell):
         )
         self.inner = LSTM(num_features, num_outputs, num_actions, **reads)
         self.linear = linear_layer(num_outputs, num_outputs)
-        self.is_max, self.straight_through = aggregator == "max", straight_through
+        self.is_max = aggregator == "max"
+        self.straight_through = straight_through
         own = ("recurrent_state_max",) if self.is_max else ("recurrent_state_sum", "recurrent_state_count")
         self.state_keys = (*LSTM.state_keys, *own)
 
@@ -78,7 +79,8 @@ class AMRL(Cell):
             largest = max_scan(torch.cat([first, x[:, 1:].relu()], dim=1), starts)
             straight = _sums(x, starts, state[0]) if self.straight_through else largest
             return _with_gradient_of(straight, largest), (largest[:, -1],)
-        sums, counts = _sums(x, starts, state[0]), _sums(torch.ones_like(x[..., :1]), starts, state[1])
+        sums = _sums(x, starts, state[0])
+        counts = _sums(torch.ones_like(x[..., :1]), starts, state[1])
         mean = sums / counts
         return _with_gradient_of(sums if self.straight_through else mean, mean), (sums[:, -1], counts[:, -1])
 

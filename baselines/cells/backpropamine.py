@@ -100,7 +100,8 @@ class Backpropamine(Cell):
         before, hebb, *trace = state
         fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))
         units = (given + before @ self.recurrent + fast).tanh()
-        eta, column = self._eta(units), before.unsqueeze(2)
+        eta = self._eta(units)
+        column = before.unsqueeze(2)
         change = (trace[0], eta.unsqueeze(1)) if trace else (column, (eta * units).unsqueeze(1))
         following = torch.addcmul(hebb, *change).clamp_(-LARGEST_FAST_WEIGHT, LARGEST_FAST_WEIGHT)
         return units, (units, following, *(each.lerp(column * units.unsqueeze(1), self.rate) for each in trace))

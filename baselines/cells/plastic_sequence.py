@@ -67,9 +67,13 @@ class PlasticSequence(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, steps: Steps, given: Tensor, *tensors: Tensor) -> Tensor:
         """See `PlasticSequence`."""
-        weights, state = tensors[: len(Plastic._fields)], tensors[len(Plastic._fields) :]
+        weights = tensors[: len(Plastic._fields)]
+        state = tensors[len(Plastic._fields) :]
         ctx.save_for_backward(*weights)
-        ctx.bound, ctx.resets, ctx.states, units = steps.bound, steps.resets, [], []
+        ctx.bound = steps.bound
+        ctx.resets = steps.resets
+        ctx.states = []
+        units = []
         product = torch.empty_like(state[1])
         for values, rows in zip(given, steps.resets, strict=True):
             if len(rows):
@@ -105,13 +109,18 @@ class PlasticGradient:
     """
 
     def __init__(self, weights: Plastic, bound: float, units: Tensor, state: State) -> None:
-        self._weights, self._bound, self._units, self._slope = weights, bound, units, 1 - units.square()
+        self._weights = weights
+        self._bound = bound
+        self._units = units
+        self._slope = 1 - units.square()
         self.given = torch.empty_like(units)
         """The gradient by the inputs times their weights, at the steps that were taken."""
         self.state = [torch.zeros_like(value) for value in state]
         """The gradient by the state before the last step that was taken."""
-        self._plasticity, self._product = torch.zeros_like(state[1]), torch.empty_like(state[1])
-        self._rate, self._by_eta = units.new_zeros(()), torch.empty_like(units)
+        self._plasticity = torch.zeros_like(state[1])
+        self._product = torch.empty_like(state[1])
+        self._rate = units.new_zeros(())
+        self._by_eta = torch.empty_like(units)
         self._modulation: Tensor | None = None
         if weights.modulator is None:
             self._eta = weights.rate.expand(len(units), 1)
@@ -153,14 +162,19 @@ class PlasticGradient:
 
     def _through_change(self, t: int, by_units: Tensor, state: State) -> tuple[Tensor, Tensor]:
         """Go back through the change of the fast weights; return the gradient by the units after and before it."""
-        before, units, eta = state[0], self._units[t], self._eta[t]
+        before = state[0]
+        units = self._units[t]
+        eta = self._eta[t]
         if len(state) == 2:
-            by_hebb, rate = self.state[1], eta
-            columns, across = columns_times(before, by_hebb), rows_times(by_hebb, eta * units)
+            by_hebb = self.state[1]
+            rate = eta
+            columns = columns_times(before, by_hebb)
+            across = rows_times(by_hebb, eta * units)
             torch.mul(columns, units, out=self._by_eta[t])
         else:
             trace, (by_hebb, by_trace), rate = state[2], self.state[1:], self._weights.rate
-            columns, across = columns_times(before, by_trace), rate * rows_times(by_trace, units)
+            columns = columns_times(before, by_trace)
+            across = rate * rows_times(by_trace, units)
             self._rate.add_((columns * units).sum() - (by_trace * trace).sum())
             torch.sum(by_hebb * trace, dim=1, out=self._by_eta[t])
             by_trace.mul_(1 - rate).addcmul_(by_hebb, eta.unsqueeze(1))

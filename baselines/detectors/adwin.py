@@ -74,7 +74,8 @@ class ADWIN(Detector):
                 f"grace_period must be an integer in [0, 2**63), got {grace_period!r}",
             ),
         )
-        self.delta, self.num_trial_episodes = delta, num_trial_episodes
+        self.delta = delta
+        self.num_trial_episodes = num_trial_episodes
         self._new_window = partial(
             _river_adwin(),
             delta=delta,
@@ -98,7 +99,8 @@ class ADWIN(Detector):
 
     def start_label(self, label: int, trial: bool) -> None:
         """Start with an empty window."""
-        self.label, self.is_trial = label, trial
+        self.label = label
+        self.is_trial = trial
         self.window = self._new_window()
         self.returns: list[float] = []
         """In the window, or of the trial."""
@@ -120,7 +122,8 @@ class ADWIN(Detector):
         if not self.window.drift_detected:
             return False
         newest = int(self.window.width)
-        before, after = returns_of(self.returns[:-newest]), returns_of(self.returns[-newest:])
+        before = returns_of(self.returns[:-newest])
+        after = returns_of(self.returns[-newest:])
         self.returns = []  # River starts an empty window at the next return
         if after.mean < before.mean:
             self.kept[self.label] = before
@@ -128,7 +131,8 @@ class ADWIN(Detector):
 
     def _accepted(self) -> Verdict:
         """Return the label on trial if its returns are those that were kept."""
-        kept, seen = self.kept.get(self.label), returns_of(self.returns)
+        kept = self.kept.get(self.label)
+        seen = returns_of(self.returns)
         if kept is None or seen.number < self.num_trial_episodes:
             return None
         return self.label if abs(seen.mean - kept.mean) <= bound(kept, seen, self.delta) else None
@@ -144,7 +148,8 @@ class ADWIN(Detector):
         """Restore what `state_dict` returned; the window is made again of its returns."""
         self.start_label(state["label"], state["is_trial"])
         self.kept = {label: Returns(*each) for label, each in state["kept"].items()}
-        self.returns, self.is_whole = state["returns"].tolist(), state.get("is_whole")
+        self.returns = state["returns"].tolist()
+        self.is_whole = state.get("is_whole")
         for each in () if self.is_trial else self.returns:
             self.window.update(each)
 
@@ -163,7 +168,8 @@ def bound(first: Returns, second: Returns, delta: float) -> float:
     total = first.number + second.number
     mean = (first.number * first.mean + second.number * second.mean) / total
     variance = sum(each.number * (each.variance + (each.mean - mean) ** 2) for each in (first, second)) / total
-    inverse, log = 1 / first.number + 1 / second.number, math.log(2 * math.log(total) / delta)
+    inverse = 1 / first.number + 1 / second.number
+    log = math.log(2 * math.log(total) / delta)
     return math.sqrt(2 * variance * log * inverse) + 2 / 3 * log * inverse
 
 

@@ -79,9 +79,14 @@ class AMD(Detector):
             *true_or_false(keeps_fitting=keeps_fitting),
             (is_int(num_untested, 0), f"num_untested must be an integer >= 0, got {num_untested!r}"),
         )
-        self.window, self.order, self.smoothing = window, order, smoothing
-        self.radius, self.min_neighbours = radius, min_neighbours
-        self.threshold, self.degrees, self.keeps_fitting = threshold, degrees, keeps_fitting
+        self.window = window
+        self.order = order
+        self.smoothing = smoothing
+        self.radius = radius
+        self.min_neighbours = min_neighbours
+        self.threshold = threshold
+        self.degrees = degrees
+        self.keeps_fitting = keeps_fitting
         self.num_untested = num_untested
         self.label = 0
         self.is_doubted = False
@@ -95,7 +100,8 @@ class AMD(Detector):
         """
         message = "AMD needs one-hot observations, and these are images: take one-hot tasks, or another detector"
         require((num_observations is not None, message))
-        self.num_actions, self.num_observations = num_actions, num_observations or 0
+        self.num_actions = num_actions
+        self.num_observations = num_observations or 0
         self.num_outcomes = num_actions * self.num_observations
         longest = int(63 / math.log2(self.num_outcomes + 1)) - 1
         rule = f"order must be at most {longest} with {num_actions} actions and {num_observations} observations"
@@ -125,12 +131,15 @@ class AMD(Detector):
         elif self.is_doubted:
             return label
         else:
-            self.is_doubted, self.pending = True, self.pending[:0]
+            self.is_doubted = True
+            self.pending = self.pending[:0]
         return None
 
     def start_label(self, label: int, trial: bool) -> None:
         """Begin a model where the label is new, and forget the steps that are in no window yet."""
-        self.label, self.is_doubted, self.pending = label, False, self.pending[:0]
+        self.label = label
+        self.is_doubted = False
+        self.pending = self.pending[:0]
         self.models.setdefault(label, Counts())
 
     def triples(self, seen: Seen) -> Tensor:
@@ -169,7 +178,8 @@ class AMD(Detector):
 
     def _label_for(self, p_values: list[float]) -> int:
         """Return the label that fits, by the p-values of all."""
-        present, best = p_values[self.label], max(p_values)
+        present = p_values[self.label]
+        best = max(p_values)
         if present == best or (self.keeps_fitting and present >= self.threshold):
             return self.label if present >= self.threshold or self._is_full else len(p_values)
         return p_values.index(best) if best >= self.threshold or self._is_full else len(p_values)
@@ -200,8 +210,11 @@ class AMD(Detector):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.label, self.is_doubted, self.pending = state["label"], state["is_doubted"], state["pending"]
-        self.recent, self.last_action = state["recent"], state["last_action"]
+        self.label = state["label"]
+        self.is_doubted = state["is_doubted"]
+        self.pending = state["pending"]
+        self.recent = state["recent"]
+        self.last_action = state["last_action"]
         self.models = {label: Counts(*model) for label, model in state["models"].items()}
 
 
@@ -215,7 +228,8 @@ class Counts:
 
     def __init__(self, keys: Tensor | None = None, counts: Tensor | None = None) -> None:
         empty = torch.zeros(0, dtype=torch.int64, device="cpu")
-        self.keys, self.counts = empty if keys is None else keys, empty if counts is None else counts
+        self.keys = empty if keys is None else keys
+        self.counts = empty if counts is None else counts
 
     @property
     def total(self) -> int:

@@ -49,7 +49,9 @@ class Detector(TakesNumbers):
             *at_least_one(patience=patience),
             *(() if snapshot_every is None else at_least_one(snapshot_every=snapshot_every)),
         )
-        self.max_labels, self.patience, self.snapshot_every = max_labels, patience, snapshot_every
+        self.max_labels = max_labels
+        self.patience = patience
+        self.snapshot_every = snapshot_every
 
     def labelling(self, method: Method) -> SelfLabelled:
         """Return a method that labels tasks by this detector; see `ctgraph_rl.agent.Detector`."""

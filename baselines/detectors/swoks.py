@@ -91,11 +91,19 @@ class SWOKS(Detector):
             *fraction(alpha=alpha, accept=accept),
             *positive(adjustment=adjustment),
         )
-        self.window, self.num_windows, self.num_directions = window, num_windows, num_directions
-        self.num_tested, self.num_kept, self.num_left_out = num_tested, num_kept, num_left_out
-        self.alpha, self.accept, self.adjustment = alpha, accept, adjustment
-        self.stable_phase, self.num_fresh = stable_phase, num_fresh
-        self.label, self.is_trial = 0, False
+        self.window = window
+        self.num_windows = num_windows
+        self.num_directions = num_directions
+        self.num_tested = num_tested
+        self.num_kept = num_kept
+        self.num_left_out = num_left_out
+        self.alpha = alpha
+        self.accept = accept
+        self.adjustment = adjustment
+        self.stable_phase = stable_phase
+        self.num_fresh = num_fresh
+        self.label = 0
+        self.is_trial = False
         self.num_points = 0
         """In windows since the label was started."""
 
@@ -125,8 +133,11 @@ class SWOKS(Detector):
 
     def start_label(self, label: int, trial: bool) -> None:
         """Forget the points that are in no window yet, and the history."""
-        self.label, self.is_trial = label, trial
-        self.num_points, self.history, self.pending = 0, [], torch.zeros(0, dtype=torch.float32, device="cpu")
+        self.label = label
+        self.is_trial = trial
+        self.num_points = 0
+        self.history = []
+        self.pending = torch.zeros(0, dtype=torch.float32, device="cpu")
         if not trial:
             self.references.pop(label, None)
             self.distances[label] = []
@@ -153,7 +164,8 @@ class SWOKS(Detector):
 
     def _accepted(self) -> Verdict:
         """Return the label on trial if it is accepted."""
-        earlier, newest = self.earlier[self.label], self.distances[self.label][-self.num_tested :]
+        earlier = self.earlier[self.label]
+        newest = self.distances[self.label][-self.num_tested :]
         enough = len(newest) == self.num_tested and self.num_points >= self.num_fresh * self.window
         return self.label if enough and self._p_value(earlier, newest) > self.accept else None
 
@@ -164,7 +176,8 @@ class SWOKS(Detector):
             return None
         if self._p_value(distances[: -self.num_tested], distances[-self.num_tested :]) >= self.alpha:
             return None
-        self.references[self.label], self.earlier[self.label] = self.history[0], distances[: -self.num_left_out]
+        self.references[self.label] = self.history[0]
+        self.earlier[self.label] = distances[: -self.num_left_out]
         return SUSPICION
 
     def _p_value(self, earlier: Sequence[float], newest: Sequence[float]) -> float:

@@ -26,7 +26,8 @@ def ks_greater(first: ArrayLike, second: ArrayLike) -> float:
     """
     x, y = np.sort(np.asarray(first, dtype=np.float64)), np.sort(np.asarray(second, dtype=np.float64))
     both = np.concatenate([x, y])
-    below_x, below_y = np.searchsorted(x, both, side="right"), np.searchsorted(y, both, side="right")
+    below_x = np.searchsorted(x, both, side="right")
+    below_y = np.searchsorted(y, both, side="right")
     return _exact(len(x), len(y), int((below_x * len(y) - below_y * len(x)).max()))
 
 

@@ -34,8 +34,10 @@ class Exchange(TakesNumbers):
             *at_least_one(num_members=num_members, every=every),
             *fraction(drop_prob=drop_prob, delay_prob=delay_prob),
         )
-        self.num_members, self.every = num_members, every
-        self.drop_prob, self.delay_prob = drop_prob, delay_prob
+        self.num_members = num_members
+        self.every = every
+        self.drop_prob = drop_prob
+        self.delay_prob = delay_prob
         self.kinds: Mapping[str, Fields] = {}
 
     def settings_of(self, member: int) -> Mapping[str, Any]:
@@ -81,7 +83,8 @@ class MaskExchange(Exchange):
         """
         methods = [getattr(agent, "method", None) for agent in agents]
         known = [isinstance(method, Masks) and self.takes(method) for method in methods]
-        name, fix = type(self).__name__, f"take method={self.method}"
+        name = type(self).__name__
+        fix = f"take method={self.method}"
         lack = [number for number, good in enumerate(known) if not good]
         one = f"member {lack[0]} has {type(methods[lack[0]]).__name__}" if lack else ""
         require((not lack, f"{name} needs masks, which {len(lack)} of {len(methods)} members lack; {one}: {fix}"))

@@ -55,7 +55,8 @@ class L2D2C(MaskExchange):
         """Replace the scores of the present task."""
         helps = []
         for mask in self._best(member, received):
-            task, reward = mask.content["task"], mask.content["reward"]
+            task = mask.content["task"]
+            reward = mask.content["reward"]
             self.methods[member].take_scores(mask.content["scores"])
             values = {"task_id": task, "return_of_sender": reward, "return_before": self.return_of(member, task)}
             helps.append(Help(mask.sender, member, values))

@@ -81,9 +81,14 @@ class Mosaic(MaskExchange):
             *at_least_one(top_n=top_n, num_samples=num_samples, buffer_size=buffer_size, num_references=num_references),
             *true_or_false(use_similarity=use_similarity, use_return=use_return),
         )
-        self.threshold, self.top_n, self.own_share = threshold, top_n, own_share
-        self.num_samples, self.buffer_size, self.num_references = num_samples, buffer_size, num_references
-        self.use_similarity, self.use_return = use_similarity, use_return
+        self.threshold = threshold
+        self.top_n = top_n
+        self.own_share = own_share
+        self.num_samples = num_samples
+        self.buffer_size = buffer_size
+        self.num_references = num_references
+        self.use_similarity = use_similarity
+        self.use_return = use_return
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
 
     def takes(self, method: Masks) -> bool:
@@ -113,7 +118,8 @@ class Mosaic(MaskExchange):
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:
         """Keep the batch's last transitions and its mean return, and update the embedding."""
         super().observe(member, batch, episode_return)
-        task, known = self.task_of(member), self.known[member]
+        task = self.task_of(member)
+        known = self.known[member]
         if known.task != task:
             known = self.known[member] = Known(task)
         known.see(batch, self.buffer_size)
@@ -142,7 +148,8 @@ class Mosaic(MaskExchange):
 
     def receive(self, member: int, received: Sequence[Message]) -> Sequence[Help]:
         """Combine the masks with the member's own."""
-        best, own = self._best(member, received), self._own_return(member)
+        best = self._best(member, received)
+        own = self._own_return(member)
         if not best:
             return []
         share = 0.5 + 0.5 * min(max(own, 0.0), LARGEST_RETURN) if self.own_share is None else self.own_share
@@ -163,7 +170,8 @@ class Mosaic(MaskExchange):
 
     def _offers(self, member: int, query: Message) -> list[Message]:
         """Return an offer to who asked, if the tasks are similar and the member's return is higher."""
-        embedding, own = self.known[member].embedding, self._own_return(member)
+        embedding = self.known[member].embedding
+        own = self._own_return(member)
         if embedding is None or (self.use_return and own <= query.content["reward"]):
             return []
         similarity = cosine_similarity(embedding, query.content["embedding"], dim=0).item()

@@ -58,8 +58,11 @@ class CKARL(TaskMethod):
             *positive(scale=scale, alpha_rate=alpha_rate),
             *true_or_false(random_alpha=random_alpha),
         )
-        self.scope, self.pool_size, self.random_alpha = scope, pool_size, random_alpha
-        self.alpha_rate, self.factor = alpha_rate, scale * alpha_rate
+        self.scope = scope
+        self.pool_size = pool_size
+        self.random_alpha = random_alpha
+        self.alpha_rate = alpha_rate
+        self.factor = scale * alpha_rate
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`; the optimiser now trains w_base + v_k and alpha."""
@@ -81,7 +84,8 @@ class CKARL(TaskMethod):
     @property
     def trainable(self) -> list[nn.Parameter]:
         """The optimiser's parameters: the weights, those in scope by w_base + v_k, and alpha."""
-        own, weights = iter(self.own), zip(self.weights.parameters, self.inside, strict=True)
+        own = iter(self.own)
+        weights = zip(self.weights.parameters, self.inside, strict=True)
         return [*(next(own) if inside else parameter for parameter, inside in weights), self.alpha]
 
     @property
@@ -131,7 +135,8 @@ class CKARL(TaskMethod):
     def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the gradients of the weights, and that of alpha."""
         in_scope = flat([each for each, inside in zip(gradients, self.inside, strict=True) if inside])
-        shares, along = self.shares.detach(), self.pool[: self.num_combined] @ in_scope
+        shares = self.shares.detach()
+        along = self.pool[: self.num_combined] @ in_scope
         of_alpha = self.factor * shares * (along - shares @ along)
         return [*gradients, torch.cat([of_alpha, torch.zeros_like(self.alpha[self.num_combined :])])]
 
@@ -170,7 +175,8 @@ class CKARL(TaskMethod):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
-        self.ended, self.num_pooled = state["ended"], state["num_pooled"]
+        self.ended = state["ended"]
+        self.num_pooled = state["num_pooled"]
 
 
 def merged(vectors: Tensor) -> Tensor:

@@ -31,7 +31,8 @@ class Reservoir:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.capacity, self.offered = capacity, 0
+        self.capacity = capacity
+        self.offered = 0
         self.items: dict[Any, Tensor] = {}
 
     def __len__(self) -> int:
@@ -86,7 +87,9 @@ class CLEAR(Method):
             *at_least_one(buffer_size=buffer_size),
             *not_negative(policy_coeff=policy_coeff, value_coeff=value_coeff),
         )
-        self.buffer_size, self.policy_coeff, self.value_coeff = buffer_size, policy_coeff, value_coeff
+        self.buffer_size = buffer_size
+        self.policy_coeff = policy_coeff
+        self.value_coeff = value_coeff
 
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
@@ -123,7 +126,8 @@ class CLEAR(Method):
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
         if not replayed:
             return {}
-        now, losses = self.agent.outputs(replayed), {}
+        now = self.agent.outputs(replayed)
+        losses = {}
         for key in self.agent.output_keys:
             if key == "log_probs":
                 then = replayed[key]

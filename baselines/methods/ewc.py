@@ -44,7 +44,9 @@ class EWC(SampledImportance):
     def __init__(self, coeff: float, online: bool, alpha: float, fisher: str, **settings: Any) -> None:
         require(*true_or_false(online=online), *fraction(alpha=alpha), *one_of(("policy", "loss"), fisher=fisher))
         super().__init__(coeff=coeff, **settings)
-        self.online, self.alpha, self.fisher = online, alpha, fisher
+        self.online = online
+        self.alpha = alpha
+        self.fisher = fisher
         self.coeff = coeff / 2
         if fisher == "policy":
             self.agent_members += ("outputs",)
@@ -70,7 +72,8 @@ class EWC(SampledImportance):
                 yield log_prob.exp().detach() * self.gradient(log_prob).square()
 
     def _of_losses(self) -> Tensor:
-        squares, compiles = torch.zeros_like(self.importance), getattr(self.agent, "compiled_step", None) is not None
+        squares = torch.zeros_like(self.importance)
+        compiles = getattr(self.agent, "compiled_step", None) is not None
         for minibatch in self.samples.minibatches:
             usual = compiles and len(minibatch["action"]) == self.agent.minibatch_size
             add = compiled(add_squared_gradients) if usual else add_squared_gradients

@@ -63,8 +63,11 @@ class MaskAMSC(SelectedMasks):
             *positive(temperature=temperature),
             *at_least_one(competence_batches=competence_batches),
         )
-        self.distance, self.z_score, self.temperature = distance, z_score, temperature
-        self.episodes, self.shuffled = competence, shuffled
+        self.distance = distance
+        self.z_score = z_score
+        self.temperature = temperature
+        self.episodes = competence
+        self.shuffled = shuffled
         self.reads_tasks = "evaluations of the task that ends" if competence == "evaluation" else ""
         self.competence: dict[int, float] = {}
         """Of the tasks that have ended, by slot."""
@@ -102,7 +105,8 @@ class MaskAMSC(SelectedMasks):
 
     def _evaluated(self) -> float:
         """Return the mean return of an evaluation as the curriculum has them."""
-        how, agent = self.curriculum.evaluation, self.agent
+        how = self.curriculum.evaluation
+        agent = self.agent
         given: dict[str, Any] = {"greedy": how.greedy, "episodes_per_row": how.episodes_per_row, "seed": self.slot}
         given |= {"initial_state": agent.initial_state, "device": self.weights.device, "curriculum": self.curriculum}
         played = evaluate(agent.policy, [self.task_in(self.slot)], how.num_episodes, **given)

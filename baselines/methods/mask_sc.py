@@ -45,7 +45,9 @@ class MaskSC(SelectedMasks):
         super().__init__(**settings)
         rule = f"threshold must be a number in [-1, 1], got {threshold!r}"
         require(*one_of(SELECTIONS, selection=selection), *at_least_one(top_k=top_k), (is_real(threshold, -1, 1), rule))
-        self.selection, self.threshold, self.top_k = selection, threshold, top_k
+        self.selection = selection
+        self.threshold = threshold
+        self.top_k = top_k
         self.compares = selection == "similarity"
         self.reads_tasks = "the tasks' goals and images" if selection in ORACLES else ""
 

@@ -98,7 +98,8 @@ class MaskShared(Masks):
 
     def _keep(self, scores: Tensor) -> None:
         """Keep received scores, [c, P]; for compiled steps, made for each number, zeros fill up to 1, 2, 4, 8 ..."""
-        count, device = len(scores), scores.device
+        count = len(scores)
+        device = scores.device
         room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
         excluded = room - count
         self.num_received = count

@@ -57,7 +57,9 @@ class Method(TakesNumbers, Hooks):
         Raises:
             ValueError: if the curriculum's protocol hides what the method needs.
         """
-        protocol, name, several = curriculum.protocol, type(self).__name__, multi_task_blocks(curriculum)
+        protocol = curriculum.protocol
+        name = type(self).__name__
+        several = multi_task_blocks(curriculum)
         or_detector = "" if self.reads_tasks else ", or add a detector, such as detector=swoks"
         require(
             (
@@ -187,7 +189,8 @@ class TaskMethod(Method):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
-        self.started, self.slot = list(state["begun"]), state["place"]
+        self.started = list(state["begun"])
+        self.slot = state["place"]
 
 
 class AgentWithMethod(nn.Module):
@@ -207,7 +210,8 @@ class AgentWithMethod(nn.Module):
         self.agent: Learner = agent
         method.setup(agent, Weights(agent.policy, agent.weights), curriculum)
         agent.method = method
-        self.num_envs, self.num_steps = agent.num_envs, agent.num_steps
+        self.num_envs = agent.num_envs
+        self.num_steps = agent.num_steps
         self.policy: TensorDictModuleBase = agent.policy
         self._copies: dict[int, TensorDictModuleBase] = {}
 

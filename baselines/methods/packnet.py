@@ -73,7 +73,8 @@ class PackNet(TaskMethod):
         new = task not in self.started
         super().start_task(task)
         self.heads.start_task(task)
-        self.block, self.frames = self.block + 1, 0
+        self.block = self.block + 1
+        self.frames = 0
         first = new and self.slot == 0
         free = (self.owner == FREE) & new & (self._on_device(self.in_matrices) | first)
         self.live.copy_(free | self._on_device(self.in_heads))
@@ -121,7 +122,8 @@ class PackNet(TaskMethod):
         trained = self.live & ~self._on_device(self.in_heads) & (self.owner == FREE)
         if not trained.any():
             return
-        weights, kept = self.weights.vector(), torch.zeros_like(self.live)
+        weights = self.weights.vector()
+        kept = torch.zeros_like(self.live)
         share = 1 / (self.num_tasks - self.slot)
         parts = zip(*(self.weights.split(each) for each in (weights, trained, kept)), strict=True)
         for parameter, (values, free, keep) in zip(self.weights.parameters, parts, strict=True):
@@ -151,4 +153,5 @@ class PackNet(TaskMethod):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
-        self.block, self.frames = state["block"], state["frames"]
+        self.block = state["block"]
+        self.frames = state["frames"]

@@ -33,7 +33,8 @@ class Scratch(TaskMethod):
 
     def start_task(self, task: int | None) -> None:
         """Load the task's network; the first task takes that of the new agent."""
-        first, known = not self.started, task in self.started
+        first = not self.started
+        known = task in self.started
         super().start_task(task)
         if known:
             self.weights.write(self.kept[self.slot])

@@ -67,7 +67,8 @@ def linear_wasserstein(points: Tensor, reference: Tensor) -> Tensor:
         float32 [M * n].
     """
     distinct, counts = points.cpu().double().unique(dim=0, return_counts=True)
-    targets, number = reference.cpu().double(), len(reference)
+    targets = reference.cpu().double()
+    number = len(reference)
     cost = (targets.square().sum(1, keepdim=True) - 2 * targets @ distinct.T + distinct.square().sum(1)).numpy()
     plan = optimal_plan(cost, np.full(number, len(points)), (number * counts).numpy())
     means = torch.from_numpy(plan).double() @ distinct / len(points)

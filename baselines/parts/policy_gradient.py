@@ -117,7 +117,9 @@ class PolicyGradient(Learner):
         self.cell = LSTM if cell is None else cell
         self.deduplicate = deduplicate
         require_weights(observation_spec, hidden_size, num_layers, num_actions_of(action_spec) + 1, self.memory)
-        self.gamma, self.gae_lambda, self.normalize_advantage = gamma, gae_lambda, normalize_advantage
+        self.gamma = gamma
+        self.gae_lambda = gae_lambda
+        self.normalize_advantage = normalize_advantage
         self.trunk = self.make_trunk(observation_spec, action_spec, hidden_size, num_layers)
         self.features = "memory" if self.memory else "features"
         self.actor = actor(self.features, hidden_size, action_spec)
@@ -232,7 +234,8 @@ class PolicyGradient(Learner):
         There is none after the last step of the batch and where an episode was truncated. Where one has terminated,
         the value is not used.
         """
-        values, after = batch["state_value"], batch["next"]
+        values = batch["state_value"]
+        after = batch["next"]
         cut = (after["done"] & ~after["terminated"]).squeeze(-1)
         cut[:, -1] = True
         next_values = values.roll(-1, dims=1)

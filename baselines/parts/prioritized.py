@@ -32,7 +32,8 @@ class PrioritySampler(Sampler):
     """
 
     def __init__(self, num_items: int, alpha: float, beta: float) -> None:
-        self.alpha, self.beta = alpha, beta
+        self.alpha = alpha
+        self.beta = beta
         self.priorities = torch.zeros(num_items, dtype=torch.float32, device="cpu")
         self.most = torch.ones((), dtype=torch.float32, device="cpu")
 

@@ -147,7 +147,8 @@ class QLearner(Learner):
             *one_of(("clear", "keep"), replay_on_task_change=replay_on_task_change),
         )
         require((eps_end <= eps_init, f"eps_end must be <= eps_init={eps_init!r}, got {eps_end!r}"))
-        self.minibatch_size, self.num_updates = batch_size, num_updates
+        self.minibatch_size = batch_size
+        self.num_updates = num_updates
         self.replay_on_task_change = replay_on_task_change
         self.eps_range = float(eps_init), float(eps_end)
         self.annealing_batches = max(1, annealing_num_steps // (num_envs * num_steps))
@@ -266,7 +267,8 @@ class QLearner(Learner):
 
     def _sample(self) -> tuple[Tensor, dict[Any, Tensor]]:
         """Return indices of replayed items and the items, as ``replay.sample()`` does, in plain tensors."""
-        storage, device = self.replay.storage, next(self.parameters()).device
+        storage = self.replay.storage
+        device = next(self.parameters()).device
         index, more = self.replay.sampler.sample(storage, self.minibatch_size)
         stored = storage._storage.items(True, True)
         items = {key: value.index_select(0, index).to(device) for key, value in stored}  # the buffer stays on the CPU

@@ -113,7 +113,8 @@ class RecurrentQ(QLearner):
         cell: MakeCell = LSTM,
         **settings: Any,
     ) -> None:
-        num_steps, buffer_size = settings["num_steps"], settings["buffer_size"]
+        num_steps = settings["num_steps"]
+        buffer_size = settings["buffer_size"]
         holds_one = is_int(buffer_size) and (not is_int(num_steps, 1) or buffer_size >= num_steps)
         require(
             *at_least_one(hidden_size=hidden_size, num_quantiles=self.num_quantiles, num_steps=num_steps),
@@ -135,7 +136,8 @@ class RecurrentQ(QLearner):
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec
         )
         self.targets = RecurrentTargets(self.greedy)
-        state, copied = self.trunk.out_keys[1:], copied_action(self.trunk.in_keys)
+        state = self.trunk.out_keys[1:]
+        copied = copied_action(self.trunk.in_keys)
         self.set_networks(self.greedy, self.targets, action_spec, learning_rate, *state, copied=copied)
 
     def values(self, data: Data) -> Tensor:

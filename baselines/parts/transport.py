@@ -29,7 +29,8 @@ def optimal_plan(cost: Floats, supply: Ints, demand: Ints) -> Ints:
     Raises:
         ValueError: if the sums of supply and demand differ.
     """
-    offered, wanted = int(supply.sum()), int(demand.sum())
+    offered = int(supply.sum())
+    wanted = int(demand.sum())
     require((offered == wanted, f"supply and demand must have equal sums, got {offered} and {wanted}"))
     transport = _Transport(cost, demand)
     for row, units in enumerate(supply.tolist()):
@@ -47,7 +48,8 @@ class _Transport:
     """
 
     def __init__(self, cost: Floats, demand: Ints) -> None:
-        self.plan, self.left = np.zeros(cost.shape, dtype=np.int64), demand.copy()
+        self.plan = np.zeros(cost.shape, dtype=np.int64)
+        self.left = demand.copy()
         self.reduced = cost - cost.min(axis=0)
         self.reduced -= self.reduced.min(axis=1, keepdims=True)
         self.columns = np.arange(cost.shape[1])
@@ -69,19 +71,24 @@ class _Transport:
     def _shortest_path(self, source: int) -> tuple[int, Arcs, Arcs]:
         """Return the nearest column that needs more, and the arcs of the path to it, forward and backward."""
         rows, columns = self.reduced.shape
-        distance, came_from = self.reduced[source].copy(), np.full(columns, source)
-        row_distance, came_by = np.full(rows, np.inf), np.zeros(rows, dtype=np.int64)
+        distance = self.reduced[source].copy()
+        came_from = np.full(columns, source)
+        row_distance = np.full(rows, np.inf)
+        came_by = np.zeros(rows, dtype=np.int64)
         row_distance[source] = 0.0
-        ahead, done = distance.copy(), np.zeros(columns, dtype=bool)
+        ahead = distance.copy()
+        done = np.zeros(columns, dtype=bool)
         while True:  # Dijkstra's algorithm
             column = int(ahead.argmin())
             least = distance[column]
-            ahead[column], done[column] = np.inf, True
+            ahead[column] = np.inf
+            done[column] = True
             if self.left[column]:
                 break
             new = np.flatnonzero((self.plan[:, column] > 0) & (row_distance == np.inf))
             if len(new):
-                row_distance[new], came_by[new] = least, column
+                row_distance[new] = least
+                came_by[new] = column
                 onwards = least + self.reduced[new]
                 best = onwards.argmin(axis=0)
                 through = onwards[best, self.columns]
@@ -101,7 +108,8 @@ class _Transport:
 def _arcs(source: int, column: int, came_from: Ints, came_by: Ints) -> tuple[Arcs, Arcs]:
     """Trace a path back from its last column to its first row."""
     row = int(came_from[column])
-    forward, backward = [(row, column)], []
+    forward = [(row, column)]
+    backward = []
     while row != source:
         column = int(came_by[row])
         backward.append((row, column))

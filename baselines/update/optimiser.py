@@ -74,7 +74,8 @@ def step(optimiser: Parts | torch.optim.Optimizer, gradients: Sequence[Tensor]) 
             parameter.grad = gradient
         optimiser.step()
         return
-    how, parameters = optimiser.settings, optimiser.parameters
+    how = optimiser.settings
+    parameters = optimiser.parameters
     state = {key: [each[key] for each in optimiser.state] for key in optimiser.state[0]}
     traced = torch.compiler.is_compiling()  # a compiler fuses the operations of each parameter by itself
     foreach = False if traced else how["foreach"]

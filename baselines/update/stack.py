@@ -36,7 +36,8 @@ class Stack:
     """
 
     def __init__(self, learners: Sequence[Learner]) -> None:
-        self.learners, first = learners, learners[0]
+        self.learners = learners
+        first = learners[0]
         of_first = named_tensors(first)
         names = {id(tensor): name for name, tensor in reversed(of_first.items())}
         self.weights = [names[id(tensor)] for tensor in first.weights]

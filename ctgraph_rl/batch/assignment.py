@@ -37,7 +37,8 @@ def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:
     Raises:
         ValueError: for a task that is not in the pool.
     """
-    tasks, number = require_all(Task, "tasks", tasks), {task: i for i, task in enumerate(pool)}
+    tasks = require_all(Task, "tasks", tasks)
+    number = {task: i for i, task in enumerate(pool)}
     unknown = [task for task in dict.fromkeys(tasks) if task not in number]
     require((not unknown, f"tasks must be in task_pool, got {unknown[:3]}; name them at construction"))
     return [number[task] for task in tasks]
@@ -49,7 +50,8 @@ def goal_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[i
     Raises:
         ValueError: if there is not one goal per row, or a goal is no end state of its row's tree.
     """
-    goals, n = list(goals), len(tasks)
+    goals = list(goals)
+    n = len(tasks)
     require((len(goals) == n, f"set_goals needs one goal per row, {n} in all, got {len(goals)}"))
     flat = [goal for goal in goals if not isinstance(as_tuple(goal), tuple)]
     require((not flat, f"a goal must be its decisions, such as (1, 1), got {flat[:3]}; give one for each row"))
@@ -105,7 +107,8 @@ class Assignment(NamedTuple):
             seed, row, tick = place
             place = seed[:1], row[:1], tick.amax(0, keepdim=True)
         else:
-            clock, past = episodes - 1, self.episodes - 1
+            clock = episodes - 1
+            past = self.episodes - 1
         words = philox.draw(*place, philox.STREAM_TASK)
         following = switch.next_task(self.choice, clock.clamp_min(1), len(self.choices), words)
         return torch.where((clock > past) & (clock > 0), following, self.choice)

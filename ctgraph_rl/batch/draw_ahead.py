@@ -26,7 +26,8 @@ class Draws:
     """
 
     def __init__(self, params: RowParams, uses: Uses) -> None:
-        self._params, self._uses = params, uses
+        self._params = params
+        self._uses = uses
         self._num_ticks = min(MAX_WORDS // len(params.row), MAX_TICKS)
         self._draws_ahead = self._num_ticks > 1 and (uses.draws or uses.reward_noise)
         self._left = 0
@@ -39,7 +40,8 @@ class Draws:
 
     def move(self, tick: Tensor, words: Words) -> None:
         """Advance to ticks, int64 [N], at most one ahead, with their draws."""
-        self._tick, self._now = tick, words
+        self._tick = tick
+        self._now = words
 
     def now(self, tick: Tensor) -> Words:
         """Return the draws of the ticks that the rows are at."""
@@ -51,7 +53,8 @@ class Draws:
     def then(self, tick: Tensor, ahead: Tensor | int) -> Words:
         """Return the draws of ticks that are ahead, by 0 or 1, of those that the rows are at."""
         if tick is not self._tick:
-            self._tick, self._left = None, 0
+            self._tick = None
+            self._left = 0
         return self._at(tick + ahead, tick)
 
     def _at(self, tick: Tensor, present: Tensor) -> Words:
@@ -69,7 +72,8 @@ class Draws:
         """Make the draws of many ticks from the first ones on."""
         uses = self._uses
         ticks = first + torch.arange(self._num_ticks, device=first.device).unsqueeze(-1)
-        self._first, self._left = first, self._num_ticks - 1  # each call is at most one tick ahead of the last
+        self._first = first
+        self._left = self._num_ticks - 1  # each call is at most one tick ahead of the last
         self._place = torch.arange(len(first), device=first.device)
         self._words = [word.flatten() for word in dynamics.words_of(ticks, self._params, uses)]
         self._used = (uses.waits, uses.waits, uses.drawn_ids, uses.views, uses.reward_noise)

@@ -127,7 +127,8 @@ class GymEnv(EnvBase):
     def _place(self, rows: Iterable[int]) -> None:
         """Put the environments of the rows' tasks in their places; each is made once."""
         for row in rows:
-            made, task = self._made[row], self.tasks[row]
+            made = self._made[row]
+            task = self.tasks[row]
             if task not in made:
                 made[task] = task.make()
             self._rows.envs[row] = made[task]
@@ -175,7 +176,8 @@ class GymEnv(EnvBase):
 
     def _observed(self, observations: Any) -> dict[str, Tensor]:
         """Return what rows show of their observations and tasks."""
-        shape, space = self.pool[0].observation_shape, spaces_of(self.pool[0])[0]
+        shape = self.pool[0].observation_shape
+        space = spaces_of(self.pool[0])[0]
         seen = torch.from_numpy(np.array(observations)).to(self.device)
         if hasattr(space, "n"):
             seen = one_hot(seen.long() - int(space.start), shape[0]).to(torch.uint8)
@@ -272,7 +274,8 @@ def _repeats_rule(task: GymTask) -> tuple[bool, str]:
     """Return the rule that an episode repeats with its seed: in one environment, and in another."""
     if not task.repeats:
         return True, ""
-    first, other = task.make(), task.make()
+    first = task.make()
+    other = task.make()
     same = _episode_of(first) == _episode_of(first) == _episode_of(other)
     return same, f"an episode of {task.id} must repeat with its seed and actions, and it does not: {FIX}"
 

@@ -37,7 +37,8 @@ def require_kernel(reward_fns: Iterable[RewardFn], device: torch.device) -> None
         ValueError: saying which.
     """
     other = _unknown(reward_fns)
-    names, fix = ", ".join(reward.__name__ for reward in KERNEL_REWARDS), 'use kernel="auto" or kernel="off"'
+    names = ", ".join(reward.__name__ for reward in KERNEL_REWARDS)
+    fix = 'use kernel="auto" or kernel="off"'
     require(
         (not other, f'kernel="required" knows the rewards {names}, got {other[:3]}; {fix}'),
         (device.type == "cpu", f'kernel="required" runs on a CPU, got {device}; {fix}'),
@@ -73,7 +74,8 @@ class Native:
 
     def bind(self, params: RowParams, tables: Tables) -> None:
         """Take the rows' parameters and those of their tasks."""
-        self.params, self.tables = params, tables
+        self.params = params
+        self.tables = tables
         self._call: _Call | None = None
         self._state: RowState | None = None
         self._shapes: Stepped | None = None
@@ -132,7 +134,8 @@ class Native:
 
     def _show(self, state: RowState, **arrays: Any) -> tuple[RowState, Shown]:
         """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
-        n, device = len(self.tables.entry), self.params.row.device
+        n = len(self.tables.entry)
+        device = self.params.row.device
         made = Shown(
             torch.empty(n, *self.params.bank.shape[1:], dtype=torch.uint8, device=device),
             torch.empty(n, dtype=torch.uint8, device=device),
@@ -175,10 +178,13 @@ class Native:
         if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call
-        n, before = call.num_rows, self._own(state, call)
+        n = call.num_rows
+        before = self._own(state, call)
         after = RowState(*map(torch.empty_like, before))
         call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
-        call.num_steps, call.restarts, call.most_action = num_steps, restarts, most_action
+        call.num_steps = num_steps
+        call.restarts = restarts
+        call.most_action = most_action
         call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
         names = _ARRAYS if made is None else _READ
         kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in names]
@@ -204,7 +210,10 @@ class Native:
 
     def _prepare(self) -> _Call:
         """Return a call with all that stays the same between two changes of parameters."""
-        params, uses, x, n = self.params, self.tables.uses, self.tables.x, len(self.tables.entry)
+        params = self.params
+        uses = self.tables.uses
+        x = self.tables.x
+        n = len(self.tables.entry)
         require_kernel(uses.reward_fns, params.row.device)
         streams = len(params.seed) in (1, n) and params.row.shape == (n,)
         require((streams, f"rows need a seed and a number each, got {len(params.seed)} and {len(params.row)} for {n}"))
@@ -254,7 +263,9 @@ def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor
 
 def _packed(tables: Tables) -> Tensor:
     """Return the different tasks as int64 [U, fields], in the order of ``Task`` in `kernel.c`; floats by their bits."""
-    tree, x, g = tables.tree, tables.x, tables.g
+    tree = tables.tree
+    x = tables.x
+    g = tables.g
     count = len(tree.first_leaf)
     extra = torch.zeros_like(tree.first_leaf) if tree.extra_end_step is None else tree.extra_end_step
     reward_fn = torch.tensor(

@@ -85,7 +85,8 @@ def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
 
 
 def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
-    graphs, extra = [task.graph for task in tasks], [task.extra_end_step for task in tasks]
+    graphs = [task.graph for task in tasks]
+    extra = [task.extra_end_step for task in tasks]
     return tree_params(
         branching_factor=each([graph.branching_factor for graph in graphs]),
         first_leaf=each([graph.num_decision_states for graph in graphs]),
@@ -104,7 +105,8 @@ def _swap(tasks: tuple[Task, ...], each: MakeTensor) -> Swap:
 def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -> ObservationParams:
     observations = [task.observations for task in tasks]
     by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
-    views, starts = [_num_views(task) for task in tasks], [bank.start[bank_key(task)] for task in tasks]
+    views = [_num_views(task) for task in tasks]
+    starts = [bank.start[bank_key(task)] for task in tasks]
 
     def first_view(i: int, kind: StateType) -> int:
         skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
@@ -116,7 +118,8 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
     def table(values: list[list[int]]) -> Tensor:
         return torch.tensor(values, device=bank_start.device, dtype=torch.int64).flatten()
 
-    bank_start, angles = each(starts), max(map(_num_angles, tasks))
+    bank_start = each(starts)
+    angles = max(map(_num_angles, tasks))
     taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
     return ObservationParams(
         first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
@@ -220,7 +223,9 @@ def shared_bank(pool: tuple[Task, ...], num_rows: int, num_noises: int) -> Bank:
     """
     shape = observation_shape(pool, num_rows)
     levels = tuple(dict.fromkeys(task.observations.read_noise for task in pool))
-    banks, starts, rows = [], {}, 0
+    banks = []
+    starts = {}
+    rows = 0
     for key in dict.fromkeys(map(bank_key, pool)):
         bank = make_bank(key)
         if len(shape) == 1:

@@ -33,11 +33,14 @@ STATE_COLOURS: dict[StateType, tuple[int, int, int]] = {
 BACKGROUND, EDGE, GOAL, OUTLINE, WAY = range(5, 10)
 EXTRA_COLOURS = (255, 255, 255), (176, 176, 176), (204, 121, 167), (0, 0, 0), (0, 0, 0)
 PALETTE = np.array([*STATE_COLOURS.values(), *EXTRA_COLOURS], np.uint16)  # a state type's number is its value
-PANEL_GREY, OFF_GREY = 208, 64  # around an observation, and where a one-hot vector is 0
-MIN_SIZE, SCALE = 48, 2  # of a picture in pixels, and of its canvas relative to it
+PANEL_GREY = 208
+OFF_GREY = 64  # around an observation, and where a one-hot vector is 0
+MIN_SIZE = 48
+SCALE = 2  # of a picture in pixels, and of its canvas relative to it
 LEAF_WIDTH = 6  # a tree with more than size // LEAF_WIDTH end states is drawn as a summary
 MAX_STUBS = 9  # most branches that a summary draws at one decision state
-HOME_KEY, FAIL_KEY = -1, -2  # home and fail among the nodes; home is (node - 1) // b of the root
+HOME_KEY = -1
+FAIL_KEY = -2  # home and fail among the nodes; home is (node - 1) // b of the root
 
 
 class Mark(NamedTuple):
@@ -79,7 +82,8 @@ def render(
     Raises:
         ValueError: for no rows, rows of different numbers, and a wrong shape or size.
     """
-    n, lengths = len(tasks), [len(tensor) for tensor in (state_type, node, goal_leaf, observation)]
+    n = len(tasks)
+    lengths = [len(tensor) for tensor in (state_type, node, goal_leaf, observation)]
     require(
         (n > 0 and all(length == n for length in lengths), f"render needs N >= 1 rows of each, got {n} and {lengths}"),
         (observation.ndim in (2, 4), f"observation must be [N, 1, r, r] or [N, K], got {list(observation.shape)}"),
@@ -95,9 +99,11 @@ def render(
 
 def _show(panels: Pixels, observation: Pixels) -> None:
     """Put grey images in the middle of [N, size, size, 3]; cells are repeated, or shrunk by their maximum."""
-    one_hot, size = observation.ndim == 2, panels.shape[1]
+    one_hot = observation.ndim == 2
+    size = panels.shape[1]
     images = _grid(observation) if one_hot else observation[:, 0]
-    room, longest = size - 2 * (size // 16), max(images.shape[1:])
+    room = size - 2 * (size // 16)
+    longest = max(images.shape[1:])
     for axis, length in enumerate(images.shape[1:], 1):
         if longest > room:
             images = np.maximum.reduceat(images, np.arange(length * room // longest) * longest // room, axis)
@@ -119,11 +125,15 @@ def _grid(vectors: Pixels) -> Pixels:
 
 def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pixels:
     """The right half of a row's picture in palette numbers."""
-    graph, unit, swapped = task.graph, size / 192, task.swapped_node
+    graph = task.graph
+    unit = size / 192
+    swapped = task.swapped_node
     first_leaf = graph.num_decision_states
-    goal, whole = first_leaf + goal_leaf, graph.num_end_states <= size // LEAF_WIDTH
+    goal = first_leaf + goal_leaf
+    whole = graph.num_end_states <= size // LEAF_WIDTH
     base, marks, waits = _picture(graph, size, () if whole else (node, goal))
-    canvas, failed = base.copy(), kind == StateType.FAIL
+    canvas = base.copy()
+    failed = kind == StateType.FAIL
     at_wait = kind == StateType.WAIT or (failed and node >= first_leaf)
     place = waits[node] if at_wait else marks[HOME_KEY if kind == StateType.HOME else node]
     way = [marks[key] for key in (HOME_KEY, *graph.nodes_to(node)[:-1])]
@@ -142,7 +152,8 @@ def _draw_row(task: Task, kind: int, node: int, goal_leaf: int, size: int) -> Pi
 def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels, Places, Places]:
     """The canvas of the whole tree or of the paths to two nodes, the places of all but wait states, and of those."""
     gap = 0.785 * size / (graph.depth + 1)
-    home, fail = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap)), Mark(size * 0.925, size * 0.075, size / 25)
+    home = Mark(size / 2, size / 14, min(size / 32, 0.5 * gap))
+    fail = Mark(size * 0.925, size * 0.075, size / 25)
     marks = {HOME_KEY: home, FAIL_KEY: fail}
     stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
     edges = {node: (marks[graph.parent(node)], mark) for node, mark in marks.items() if node >= 0}
@@ -162,7 +173,9 @@ def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Lin
     """Add every node of a small tree, each level spread over the width. No branch is a stub."""
     b = graph.branching_factor
     for level in range(graph.depth + 1):
-        first, width, y = (b**level - 1) // (b - 1), size / b**level, marks[HOME_KEY].y + gap * (level + 1)
+        first = (b**level - 1) // (b - 1)
+        width = size / b**level
+        y = marks[HOME_KEY].y + gap * (level + 1)
         radius = min(size / 32, 0.3 * gap, 0.39 * width)
         marks |= {first + i: Mark((i + 0.5) * width, y, radius) for i in range(b**level)}
     return []
@@ -170,8 +183,12 @@ def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Lin
 
 def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[Line]:
     """Add the paths to two nodes, one column that parts where they do. Returns stubs for the other branches."""
-    b, home, radius, fan = graph.branching_factor, marks[HOME_KEY], min(size / 32, 0.3 * gap), 1.6 * gap
-    paths, stubs = [graph.nodes_to(node) for node in nodes], []
+    b = graph.branching_factor
+    home = marks[HOME_KEY]
+    radius = min(size / 32, 0.3 * gap)
+    fan = 1.6 * gap
+    paths = [graph.nodes_to(node) for node in nodes]
+    stubs = []
     marks[0] = Mark(home.x, home.y + gap, radius)
     for level in range(1, graph.depth + 1):
         drawn = sorted({path[level] for path in paths if len(path) > level})
@@ -188,7 +205,8 @@ def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tu
 def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> list[Line]:
     """Short lines towards the branches that are not drawn, in their order among those that are."""
     known: list[float] = list(children) or [(b - 1) / 2]
-    places, stubs = [child.x for child in children.values()] or [parent.x], []
+    places = [child.x for child in children.values()] or [parent.x]
+    stubs = []
     for branch in sorted({*range(0, b, -(-b // MAX_STUBS))} - {*children}):
         beyond = min(branch - known[0], 0) + max(branch - known[-1], 0)
         x = float(np.interp(branch, known, places)) + beyond * fan

@@ -37,7 +37,9 @@ class Steps(NamedTuple):
     def empty(cls, rows: Rows, num_steps: int, device: torch.device | str | None = None) -> Steps:
         """Buffers for ``num_steps`` steps, for `rollout` to fill again and again; by default on the rows' device."""
         require(*at_least_one(num_steps=num_steps))
-        t, n, device = num_steps, rows.num_rows, rows.device if device is None else device
+        t = num_steps
+        n = rows.num_rows
+        device = rows.device if device is None else device
         return cls(
             observation=torch.empty(t + 1, n, *rows.image_shape, dtype=torch.uint8, device=device),
             is_init=torch.empty(t + 1, n, dtype=torch.bool, device=device),
@@ -113,7 +115,8 @@ def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
 def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
     """Take the steps of a part of the buffers, whose actions are there; the states that they lead to."""
     outputs = {name: getattr(steps, name)[part] for name in ("action", "reward", "done", "outcome")}
-    seen, is_init = steps.observation[1:][part], steps.is_init[1:][part]
+    seen = steps.observation[1:][part]
+    is_init = steps.is_init[1:][part]
     state = rows.native.run(state, num_steps=len(is_init), restarts=True, observation=seen, **outputs)
     is_init.copy_(outputs["done"])
     return state
@@ -121,7 +124,9 @@ def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
 
 def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
     """Fill buffers by the tensor engine; the states that the last step led to."""
-    params, uses, start = rows.params, rows.uses, rows.state
+    params = rows.params
+    uses = rows.uses
+    start = rows.state
     state = dynamics.begin(start, rows.is_done, params, uses)
     words = dynamics.words_of(state.tick, params, uses)
     steps.observation[0] = dynamics.observe(state, words, params, uses)
@@ -131,7 +136,10 @@ def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
         action = policy[t] if isinstance(policy, Tensor) else _chosen(rows, policy, steps, t, start)
         state = dynamics.advance(state, action, words, params, uses, absorbing=False)
         done = is_done(state, params.tree)
-        steps.action[t], steps.reward[t], steps.done[t], steps.is_init[t + 1] = action, state.reward, done, done
+        steps.action[t] = action
+        steps.reward[t] = state.reward
+        steps.done[t] = done
+        steps.is_init[t + 1] = done
         steps.outcome[t] = dynamics.arrivals(state, done, params)[0]
         state = dynamics.begin(state, done, params, uses)
         words = dynamics.words_of(state.tick, params, uses)

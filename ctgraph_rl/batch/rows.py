@@ -100,7 +100,8 @@ class Rows(TakesNumbers, nn.Module):
         self._choose_engine()
         bank = shared_bank(self.pool, self.num_rows, noise_bank)
         no_images = bank.images.new_empty(0, *bank.shape)
-        self._bank, self.image_shape = bank._replace(images=no_images, noises=no_images), bank.shape
+        self._bank = bank._replace(images=no_images, noises=no_images)
+        self.image_shape = bank.shape
         self.white = max(int(white_level(task.images)) for task in self.pool)
         self.register_buffer("bank", bank.images.to(device), persistent=False)
         self.register_buffer("noises", bank.noises.to(device), persistent=False)
@@ -110,7 +111,8 @@ class Rows(TakesNumbers, nn.Module):
             self.register_buffer(field, zeros.to(dtype, copy=True))
         for field in _ASSIGNED:
             self.register_buffer(field, zeros.clone())
-        self.tensors, self.native = TensorEngine(), Native()
+        self.tensors = TensorEngine()
+        self.native = Native()
         self.set_tasks(tasks)
 
     @property
@@ -171,7 +173,8 @@ class Rows(TakesNumbers, nn.Module):
         Raises:
             ValueError: if the number of tasks is not the number of rows, or a task is not in the pool.
         """
-        tasks, n = require_all(Task, "tasks", tasks), self.num_rows
+        tasks = require_all(Task, "tasks", tasks)
+        n = self.num_rows
         require((len(tasks) == n, f"set_tasks needs one task per row, {n} in all, got {len(tasks)}"))
         whole_pool = torch.arange(len(self.pool), device=self.device)
         numbers = torch.tensor(numbers_in(self.pool, tasks), device=self.device, dtype=torch.int64)
@@ -276,7 +279,8 @@ class Rows(TakesNumbers, nn.Module):
             seed: int64 [N], or [1] for all.
             row: int64 [N], the numbers that distinguish rows of one seed.
         """
-        self.seed, self.row = seed.clone(), row.clone()
+        self.seed = seed.clone()
+        self.row = row.clone()
         self.tick = torch.zeros_like(self.row)
         if self.tasks_change:
             self._restart(self.assignment)
@@ -295,7 +299,8 @@ class Rows(TakesNumbers, nn.Module):
 
         The reward is in ``state``. Rows outside the mask stay as they are, draw nothing, and may have any action.
         """
-        before, engine = self.state, self.engine
+        before = self.state
+        engine = self.engine
         state, shown = engine.step(before, action if mask is None else action * mask)
         if mask is not None:
             state = dynamics.choose(mask, state, before)
@@ -354,7 +359,8 @@ class Rows(TakesNumbers, nn.Module):
             (action.dtype == torch.int64, f"{spec}, got dtype {action.dtype}"),
             (action.shape == (self.num_rows,), f"{spec}, got shape {list(action.shape)}"),
         )
-        outside, finished = (action < 0) | (action > self.max_branching), self.is_done
+        outside = (action < 0) | (action > self.max_branching)
+        finished = self.is_done
         outside, finished = (outside, finished) if mask is None else (outside & mask, finished & mask)
         if (outside | finished).any():
             require(
@@ -385,7 +391,8 @@ class Rows(TakesNumbers, nn.Module):
                 return type(part)(*map(moved, part)) if hasattr(part, "_fields") else tuple(map(moved, part))
             return fn(part) if isinstance(part, Tensor) else part
 
-        self._choices, self.tables = fn(self._choices), moved(self.tables)
+        self._choices = fn(self._choices)
+        self.tables = moved(self.tables)
         self._take_params()
         self._choose_engine()
         return self

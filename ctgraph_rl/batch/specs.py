@@ -34,7 +34,8 @@ def specs_of(pool: Sequence[Task], batch_size: tuple[int, ...] = (), num_task_id
     Raises:
         ValueError: for observations of different shapes, and for more than the machine can hold.
     """
-    shape, column = observation_shape(pool, math.prod(batch_size)), (*batch_size, 1)
+    shape = observation_shape(pool, math.prod(batch_size))
+    column = (*batch_size, 1)
     white = 255 if len(shape) == 3 else max(int(white_level(task.images)) for task in pool)
     keys: dict[str, Bounded | Binary | Unbounded] = {
         "observation": Bounded(0, white, shape=(*batch_size, *shape), dtype=torch.uint8, device="cpu"),

@@ -27,7 +27,8 @@ class TensorEngine:
         draws = getattr(self, "_draws", None)
         if draws is None or not draws.serve(params, tables.uses):
             self._draws = Draws(params, tables.uses)
-        self.params, self.uses = params, tables.uses
+        self.params = params
+        self.uses = tables.uses
 
     def reset(self, state: RowState, mask: Tensor) -> tuple[RowState, Shown]:
         """See `Rows.reset`."""
@@ -45,7 +46,8 @@ class TensorEngine:
 
     def act(self, state: RowState, action: Tensor) -> tuple[RowState, tuple[Tensor, Tensor]]:
         """See `Rows.act`."""
-        now, then = self._draws.now(state.tick), self._draws.then(state.tick, 1)
+        now = self._draws.now(state.tick)
+        then = self._draws.then(state.tick, 1)
         state = dynamics.advance(state, action, now, self.params, self.uses, absorbing=False)
         observation = dynamics.observe(state, then, self.params, self.uses)
         self._draws.move(state.tick, then)

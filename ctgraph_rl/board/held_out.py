@@ -55,7 +55,8 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
         count: how many seeds, >= 1.
         folder: where each process has a folder, with the file of its curriculum.
     """
-    cells, first = [], submission.finished[0]
+    cells = []
+    first = submission.finished[0]
     for seed in seeds_of(submission, number, count):
         own = made_folder(folder / f"seed{seed}").resolve()
         curriculum = other_curriculum(submission.curriculum, f"{submission.digest} {number} {seed}")
@@ -72,9 +73,12 @@ def held_out_checks(submission: Submission, results: Sequence[tuple[Cell, Result
         submission: with the submitted scores.
         results: of each seed.
     """
-    name, found = score_name(submission), []
+    name = score_name(submission)
+    found = []
     for cell, result in results:
-        seed, failure, value = cell.job.seeds[0], result.failure, None
+        seed = cell.job.seeds[0]
+        failure = result.failure
+        value = None
         try:
             if result.log is not None:
                 value = score_of(result.log, cell.curriculum, name)
@@ -118,7 +122,8 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
         others[task] = other_task(task, key) if isinstance(task, Task) else task
     blocks = tuple(replace(block, tasks=tuple(others[task] for task in block.tasks)) for block in curriculum.blocks)
     evaluation = replace(curriculum.evaluation, held_out=tuple(others[task] for task in held_out))
-    name, source = f"{curriculum.name} (held out)", f"{curriculum.source}; images and goals drawn by {key}"
+    name = f"{curriculum.name} (held out)"
+    source = f"{curriculum.source}; images and goals drawn by {key}"
     return replace(curriculum, name=name, source=source, blocks=blocks, evaluation=evaluation)
 
 

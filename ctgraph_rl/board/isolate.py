@@ -178,7 +178,8 @@ class _Tail(threading.Thread):
     def __init__(self, pipe: IO[bytes] | None) -> None:
         assert pipe is not None
         super().__init__(daemon=True)
-        self._pipe, self._kept = pipe, b""
+        self._pipe = pipe
+        self._kept = b""
         self.start()
 
     def run(self) -> None:
@@ -333,7 +334,8 @@ def _used(folder: int | Path, depth: int = 0, files: int = 0) -> _Used:
         depth: of folders above it.
         files: that were counted before.
     """
-    disk, strange = 0, None
+    disk = 0
+    strange = None
     if depth > MOST_DEPTH:
         return _Used(disk, files, f"it made more than {MOST_DEPTH} folders within each other")
     with os.scandir(folder) as entries:
@@ -343,7 +345,9 @@ def _used(folder: int | Path, depth: int = 0, files: int = 0) -> _Used:
                 disk += entry.stat(follow_symlinks=False).st_blocks * 512
                 if entry.is_dir(follow_symlinks=False):
                     below = _opened(entry, folder, depth, files)
-                    disk, files, strange = disk + below.disk, below.files, strange or below.strange
+                    disk = disk + below.disk
+                    files = below.files
+                    strange = strange or below.strange
             if files > MOST_FILES or strange is not None:
                 break
     return _Used(disk, files, strange)

@@ -114,12 +114,15 @@ def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str
 def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
     """Return the rules for the values of an object with the right keys."""
     code, tuning, compute = (method[key] for key in ("code", "tuning", "compute"))
-    authors, failed = method["authors"], method["failed"]
+    authors = method["authors"]
+    failed = method["failed"]
     listed = isinstance(authors, list) and bool(authors) and all(map(_is_text, authors))
     reasons = isinstance(failed, Mapping) and all(is_int(seed, 0) and _is_text(why) for seed, why in failed.items())
     seeds = tuning["seeds"]
     whole = isinstance(seeds, list) and all(is_int(seed, 0) for seed in seeds)
-    repository, commit, given = code["repository"], code["commit"], method["given"]
+    repository = code["repository"]
+    commit = code["commit"]
+    given = method["given"]
     return [
         *(_text_rule(name, value) for name, value in (("name", method["name"]), ("code.licence", code["licence"]))),
         *(_text_rule(f"given.{key}", given[key], or_null=True) for key in ("boundaries", "task_id")),
@@ -211,13 +214,16 @@ def fact_rules(
         runs: lines of ``runs.csv``.
         num_tasks: of the curriculum.
     """
-    said, hours = method["given"], method["compute"]["hours"]
+    said = method["given"]
+    hours = method["compute"]["hours"]
     pairs = [(key, said[key], value) for key, value in facts["given"].items() if said[key] is not None]
     logged = facts["compute"]["hours"]
     near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
-    kept, largest = method["bytes_per_task"] * (num_tasks - 1), max((run.agent_bytes or 0 for run in runs), default=0)
+    kept = method["bytes_per_task"] * (num_tasks - 1)
+    largest = max((run.agent_bytes or 0 for run in runs), default=0)
     fits = not largest or kept <= largest
-    all_kept, further = f"{kept:,} bytes for {num_tasks - 1} further tasks", method["bytes_per_task"]
+    all_kept = f"{kept:,} bytes for {num_tasks - 1} further tasks"
+    further = method["bytes_per_task"]
     less = f"bytes_per_task is {further}, {all_kept}, the agents of the runs have {largest:,} bytes in all: correct it"
     return [
         *(

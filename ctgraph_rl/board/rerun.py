@@ -221,7 +221,8 @@ def result_of(cell: Cell, seed: int, outcome: Outcome) -> Result:
             require_no_link(path)
         if not (run_dir / METRICS).is_file():
             return _failed(run_dir, outcome)
-        log, has_agent = RunLog.read(run_dir / LOG), (run_dir / AGENT).exists()
+        log = RunLog.read(run_dir / LOG)
+        has_agent = (run_dir / AGENT).exists()
         state = read_plain(content_of(run_dir / AGENT)) if has_agent else None
         agent, size = (sum_of_state(state), num_bytes_of(state)) if has_agent else ("", None)
         return Result(log, agent, None, size, _experts(cell.folder.resolve(), log))
@@ -259,7 +260,8 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     here = numbers_of(about)
     fix = "install the versions of versions.txt"
     require((stored == here, f"the runs have numbers version {stored}, this ctgraph_rl has {here}: {fix}"))
-    portable, this = is_portable(submission.config), {**machine(), "cpu": cpu_model() or ""}
+    portable = is_portable(submission.config)
+    this = {**machine(), "cpu": cpu_model() or ""}
     if portable:
         this["machine"] = f"{platform.machine()} portable"
     device = str(submission.config.get("device", "cpu"))

@@ -96,7 +96,9 @@ def rescore(submission: Submission) -> list[Check]:
 
 def _of_the_whole(submission: Submission) -> Iterator[Check]:
     """Yield checks of curriculum, seeds and method."""
-    method, runs, of_track = submission.method, submission.runs, submission.track
+    method = submission.method
+    runs = submission.runs
+    of_track = submission.track
     named = None if of_track is None else of_track.name
     yield equal("track", method["track"], named)
     if of_track is not None:
@@ -146,7 +148,8 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
-        said, alone = experts_of(log), [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
+        said = experts_of(log)
+        alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
         for what, key in [("curricula", "fingerprint"), *([("groups", "together")] if said else [])]:
             expected, found = ([each.get(key) for each in some] for some in (said, alone))
             yield equal(f"{what} of experts", expected, found, run.run)
@@ -155,12 +158,14 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
 
 def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
     """Yield checks that a log has the evaluations of the protocol, and frames to the end of the curriculum."""
-    curriculum, how = submission.curriculum, submission.curriculum.evaluation
+    curriculum = submission.curriculum
+    how = submission.curriculum.evaluation
     yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)
     tasks_at = Evaluator(curriculum, run.seed, log).tasks_at
     wanted = [(at, number, how.num_episodes) for at in curriculum.moments for number, _ in tasks_at(at).values()]
     there = [(m["frames"], m["task"], m.get("episodes")) for m in log.of_kind("evaluation")]
-    missing, more = sorted({*wanted} - {*there}), sorted({*there} - {*wanted}, key=str)
+    missing = sorted({*wanted} - {*there})
+    more = sorted({*there} - {*wanted}, key=str)
     sides: dict[str, list[Any]] = {"missing": missing, "more": more}
     notes = [f"{what} (frames, task, episodes): {listed(some)}" for what, some in sides.items() if some]
     same = wanted == there
@@ -198,11 +203,13 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
     the track and `MEASURES`.
     """
     same_kind = submission.scored_on == machine()["machine"]
-    wrong, count = [], 0
+    wrong = []
+    count = 0
     needed = {name for stated in submission.metrics.values() for name in stated}
     needed |= {*MEASURES} if submission.track is None else {*MEASURES, submission.track.score}
     runs = {run.run for run in logs}
-    more, rule = sorted(set(submission.metrics) - runs), "no finished run has this name"
+    more = sorted(set(submission.metrics) - runs)
+    rule = "no finished run has this name"
     if more:
         wrong.append(Check(METRICS, "metrics of finished runs", listed(more), False, note=rule))
     for run, log in logs.items():

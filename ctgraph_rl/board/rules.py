@@ -47,7 +47,8 @@ def one_line(reason: str) -> str:
 
 def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
     """Return the rule that a curriculum is one of a track, or without a track the published one of its name."""
-    name, found = curriculum.name.removesuffix(MODIFIED), curriculum.fingerprint
+    name = curriculum.name.removesuffix(MODIFIED)
+    found = curriculum.fingerprint
     if of_track is not None:
         wanted = ", ".join(each.curriculum.fingerprint for each in of_track.variants)
         is_there = of_track.variant_of(curriculum) is not None
@@ -75,8 +76,10 @@ def seed_rules(seeds: Iterable[int], tuned: Iterable[int], of_track: Track | Non
     rules = [(not used, f"seeds {listed(sorted(used))} are among tuning.seeds: submit runs of other seeds")]
     if of_track is None:
         return rules
-    wanted, reserved = set(of_track.seeds), own & set(of_track.tuning_seeds)
-    missing, others = wanted - own, own - wanted - reserved
+    wanted = set(of_track.seeds)
+    reserved = own & set(of_track.tuning_seeds)
+    missing = wanted - own
+    others = own - wanted - reserved
     asked = f"track {of_track.id} has seeds {_ranges(wanted)}"
     return [
         *rules,
@@ -148,7 +151,8 @@ def failure_rules(runs: Sequence[Run], reasons: Mapping[int, str]) -> Iterator[R
         reasons: why runs failed or were stopped, by seed.
     """
     for run in runs:
-        known, fix = run.seed in reasons, f"finish it, or account for it: failed: {{{run.seed}: why}} in method.yaml"
+        known = run.seed in reasons
+        fix = f"finish it, or account for it: failed: {{{run.seed}: why}} in method.yaml"
         if run.reason is not None:
             yield known, f"{run.path} has no results ({run.reason}): {fix}"
             continue

@@ -35,8 +35,13 @@ from ctgraph_rl.runs.settings import as_before
 from ctgraph_rl.strict import MAX_DEPTH, csv_rows, files_below, named, sha256_of, unpacked, yaml_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-METHOD, CONFIG, VERSIONS, RUNS, LOGS = "method.yaml", "config.yaml", "versions.txt", "runs.csv", "logs"
-EVALUATIONS, METRICS = "evaluations.parquet", "metrics.csv"
+METHOD = "method.yaml"
+CONFIG = "config.yaml"
+VERSIONS = "versions.txt"
+RUNS = "runs.csv"
+LOGS = "logs"
+EVALUATIONS = "evaluations.parquet"
+METRICS = "metrics.csv"
 
 FILES = (METHOD, CONFIG, VERSIONS, CURRICULUM, RUNS, EVALUATIONS, METRICS)
 """Files of a submission beside its logs."""
@@ -47,7 +52,8 @@ VERIFICATION = "verification.json"
 MOST_BYTES_OF_A_FILE, MOST_BYTES_OF_A_TABLE = 2**28, 2**26
 """Largest file but the logs that is read, 256 MiB, and largest CSV file."""
 
-MOST_BYTES_OF_A_CONFIGURATION, MAX_NESTING = 2**18, 16
+MOST_BYTES_OF_A_CONFIGURATION = 2**18
+MAX_NESTING = 16
 
 MOST_RUNS, MOST_METRICS, MOST_SECONDS = 10_000, 1_000, 1e9
 """Of a submission, of a run in ``metrics.csv``, and of a run."""
@@ -57,7 +63,8 @@ MACHINE = "machine"
 NO_PACKAGES = ("python", MACHINE)
 """Names in ``versions.txt`` that pip does not know."""
 
-FINISHED, FAILED = "finished", "failed"
+FINISHED = "finished"
+FAILED = "failed"
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
 """Names of runs, which are names of files."""
@@ -211,7 +218,8 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
         (not odd, f"{path} has names that are not UTF-8, {', '.join(map(ascii, odd[:3]))}: give them others"),
         (not missing, f"{path} lacks {', '.join(missing)}: ctgraph-rl submit RUNS --to DIR writes all of them"),
     )
-    method, runs = read_method(path / METHOD), read_runs(path / RUNS)
+    method = read_method(path / METHOD)
+    runs = read_runs(path / RUNS)
     absent = [log_name(run.run) for run in runs if not (path / log_name(run.run)).is_file()]
     require((not absent, f"{path} lacks {', '.join(absent[:3])}, which {RUNS} names"))
     if of_track is None and method["track"] is not None:
@@ -238,7 +246,8 @@ def read_runs(path: Path) -> tuple[SubmittedRun, ...]:
     """
     rows = _rows(path, COLUMNS, ["run"], MOST_RUNS)
     runs = [_run(row, f"{path}: line {number}") for number, row in enumerate(rows, 2)]
-    names, seeds = [run.run.lower() for run in runs], [run.seed for run in runs]
+    names = [run.run.lower() for run in runs]
+    seeds = [run.seed for run in runs]
     require(
         (len(rows) > 0, f"{path} must have 1..{MOST_RUNS:,} runs, got none"),
         (len(set(names)) == len(names), f"{path} names a run twice: {_twice(names)}"),

@@ -163,7 +163,8 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 def _line(run: Run, name: str, reasons: Mapping[int, str]) -> SubmittedRun:
     """Return the line of a run in ``runs.csv``."""
-    log, finished = RunLog.read(run.path / LOG), run.reason is None
+    log = RunLog.read(run.path / LOG)
+    finished = run.reason is None
     state = _state(run.path / AGENT) if finished and (run.path / AGENT).exists() else None
     return SubmittedRun(
         run=name,
@@ -278,7 +279,8 @@ def _setting(text: str) -> tuple[str, Any]:
 
 def summary(made: Submission) -> str:
     """Return in words what a submission holds, and what to do next."""
-    count, finished = len(made.runs), len(made.finished)
+    count = len(made.runs)
+    finished = len(made.finished)
     failed = f", {count - finished} of them failed" if finished < count else ""
     where = "for no track" if made.track is None else f"for track {made.track.id}"
     lines = [

@@ -19,7 +19,9 @@ LOAD, EQUAL, AT_LEAST, ANY_BIT, RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 NUMBER_AT, ABI_AT, ARGUMENTS_AT = 0, 4, 16
 """Where the kernel shows the number of the call, the ABI and the arguments, from linux/seccomp.h."""
 
-ALLOW, REFUSE, KILL = 0x7FFF0000, 0x00050000, 0x80000000
+ALLOW = 0x7FFF0000
+REFUSE = 0x00050000
+KILL = 0x80000000
 
 X32 = 0x40000000
 """Numbers of the ABI x32, which x86-64 has beside its own, begin here."""

@@ -87,7 +87,8 @@ def compared(submitted: Sequence[float], found: Sequence[float]) -> Difference:
 def _least_drop(scores: np.ndarray, found: int) -> float:
     """Return the smallest drop of the last scores, [1, submitted + found], that the test does not exclude."""
     reach = 2 * float(np.ptp(scores)) + 1
-    low, high = -reach, reach
+    low = -reach
+    high = reach
 
     def is_excluded(drop: float) -> bool:
         shifted = scores.copy()
@@ -124,9 +125,11 @@ def detectable(submitted: int, found: int, power: float = POWER) -> float:
     if 1 / math.comb(submitted + found, found) > ALPHA:
         return math.inf
     noise = np.random.default_rng(0).standard_normal((SAMPLES, submitted + found))
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     while _share_found(noise, found, high) < power:
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
     for _ in range(12):
         middle = (low + high) / 2
         low, high = (middle, high) if _share_found(noise, found, middle) < power else (low, middle)

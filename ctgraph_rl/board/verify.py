@@ -139,10 +139,12 @@ def planned(submission: Submission, level: str, number: int, count: int, folder:
 
 def described(plan: Plan, means: Means) -> list[str]:
     """Return lines about what will run, in which limits, and what is not isolated."""
-    submission, cells = plan.submission, plan.cells
+    submission = plan.submission
+    cells = plan.cells
     seeds = [f"{RERUN} of seeds {_listed(cell.job.seeds for cell in plan.reruns)}"]
     seeds += [f"{HELD_OUT} seeds {_listed(cell.job.seeds for cell in plan.held_out)}"] if plan.held_out else []
-    frames, seconds = sum(cell.num_frames for cell in cells), sum(cell.seconds for cell in cells)
+    frames = sum(cell.num_frames for cell in cells)
+    seconds = sum(cell.seconds for cell in cells)
     limits = means.limits(max(cells, key=lambda cell: cell.seconds))
     most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
@@ -167,7 +169,8 @@ def _time(seconds: float) -> str:
 
 def code_in_words(submission: Submission) -> str:
     """Return whose code a submission runs."""
-    entry, code = submission.method["entry_point"], submission.method["code"]
+    entry = submission.method["entry_point"]
+    code = submission.method["code"]
     named = [entry] if entry is not None else dict.fromkeys(targets(submission.config))
     others = [name for name in named if name == entry or not is_of_this_package(name)]
     source = f"of {code['repository']} at {code['commit']}"
@@ -215,7 +218,8 @@ def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
     What an earlier verification of the same number has finished is not run again.
     """
     cells = plan.cells
-    total, before = sum(cell.num_frames for cell in cells), sum(cell.frames for cell in cells)
+    total = sum(cell.num_frames for cell in cells)
+    before = sum(cell.frames for cell in cells)
     outcomes = {}
     with Bar(len(cells), total, done=min(before, total)) as bar:
         for place, cell in enumerate(cells):
@@ -365,7 +369,9 @@ def parser() -> argparse.ArgumentParser:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse values out of range."""
-    number, code, hours = arguments.number, arguments.code, arguments.hours
+    number = arguments.number
+    code = arguments.code
+    hours = arguments.hours
     require(
         (is_int(arguments.cells, 1), f"--cells must be an integer >= 1, got {arguments.cells}"),
         (number is None or is_int(number, 0, NUMBERS - 1), f"--number must be in [0, 2**63), got {number}"),

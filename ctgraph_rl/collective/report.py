@@ -122,7 +122,8 @@ def _draw_times(found: Sequence[Collective]) -> Any:
     figure = new_figure(WIDTH, 2.8)
     axes = figure.subplots()
     for position, (name, times) in enumerate(list(lines.items())[:MOST_AGENTS]):
-        numbers, look = sorted(times), agent_style(position)
+        numbers = sorted(times)
+        look = agent_style(position)
         means = [math.fsum(times[number]) / len(times[number]) for number in numbers]
         axes.plot(numbers, means, label=short(name), **look)
         axes.plot(numbers, [means[0] * numbers[0] / number for number in numbers], ":", color=look["color"])
@@ -136,7 +137,8 @@ def _draw_times(found: Sequence[Collective]) -> Any:
 
 def _draw_helps(collective: Collective) -> Any:
     """Draw how often each member has helped each other."""
-    count, by_pair = collective.about["num_members"], collective.by_pair
+    count = collective.about["num_members"]
+    by_pair = collective.by_pair
     figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
     axes = figure.subplots()
     cells = [[by_pair[sender, receiver] for sender in range(count)] for receiver in range(count)]

@@ -111,7 +111,8 @@ def read_collective(path: Path | str) -> Collective:
     [about, *_] = [*log.of_kind("collective"), {}]
     names = about.get("config"), about.get("members")
     require((all(names), f"{path / COLLECTIVE} does not say what was run: its first line is missing"))
-    config, members = about["config"], about["members"]
+    config = about["config"]
+    members = about["members"]
     called = {part: str(config[part]["_target_"]).rpartition(".")[2] for part in ("agent", "method", "exchange")}
     run = {"curriculum": members[0]["curriculum"], **called, "num_members": len(members), "seed": config["seed"]}
     learned = [row for number, each in enumerate(members) for row in _learned(path, number, each)]
@@ -145,7 +146,8 @@ def _learned(path: Path, number: int, about: Mapping[str, Any]) -> Iterator[Lear
 
 def described(collective: Collective) -> str:
     """Return a few lines on a collective."""
-    about, num = collective.about, len(collective.learned)
+    about = collective.about
+    num = len(collective.learned)
     return "\n".join(
         [
             f"{about['num_members']} members, {about['exchange']}, {about['curriculum']}: learned "

@@ -178,11 +178,13 @@ class Seen(NamedTuple):
 
 def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
     """Choose each row's view, and draw what is not in the bank; arguments as above."""
-    x, rows = params.x, bank_rows(state, words[2], params.x, uses)
+    x = params.x
+    rows = bank_rows(state, words[2], params.x, uses)
     angle = noise = torch.zeros_like(rows)
     if uses.views:
         view = randint(words[3], x.num_views * x.num_angles)
-        rows, angle = rows + view // x.num_angles, view % x.num_angles
+        rows = rows + view // x.num_angles
+        angle = view % x.num_angles
     if uses.pixel_noise:
         upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
         noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
@@ -206,7 +208,8 @@ def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses:
 
 def read(seen: Seen, state: RowState, params: RowParams, uses: Uses) -> Tensor:
     """Return the images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
-    x, images = params.x, params.bank.index_select(0, seen.rows)
+    x = params.x
+    images = params.bank.index_select(0, seen.rows)
     if uses.noise_bank:
         images = add_saturating(images, params.noise_bank.index_select(0, seen.noise))
     elif uses.pixel_noise:
@@ -258,7 +261,8 @@ def _paid(
 
 def _share(after: State, goal_leaf: Tensor, params: RowParams, uses: Uses) -> Tensor:
     """float32: the reward functions' shares, as if every row were at an end state."""
-    tree, g = params.tree, params.g
+    tree = params.tree
+    g = params.g
     arrival = Arrival(after.node - tree.first_leaf, goal_leaf, tree.branching_factor, g.depth, uses.max_depth)
     share = uses.reward_fns[0](arrival)
     for i, reward_fn in enumerate(uses.reward_fns[1:], 1):
@@ -311,7 +315,8 @@ def begin(state: RowState, mask: Tensor | None, params: RowParams, uses: Uses) -
 def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
     """Return states with the rows of a mask at home."""
     starts = mask.long()
-    keeps, nothing = 1 - starts, torch.zeros_like(state.reward)
+    keeps = 1 - starts
+    nothing = torch.zeros_like(state.reward)
     reward = torch.where(mask, nothing, state.reward)
     return state._replace(
         state_type=state.state_type * keeps.to(torch.uint8),  # the home state is 0; faster than filling by a mask
@@ -326,7 +331,8 @@ def _cleared(state: RowState, mask: Tensor, uses: Uses) -> RowState:
 
 def _count_episode(state: RowState, mask: Tensor, params: RowParams) -> RowState:
     """Begin an episode: where the last one with a goal is over, draw a goal and how many episodes it lasts."""
-    g, left = params.g, state.episodes_left
+    g = params.g
+    left = state.episodes_left
     words = draw(params.seed, params.row, state.tick, STREAM_GOAL)
     span = g.change_last - g.change_first + 1
     first, second = (g.change_first + randint(word, span) for word in (words[0], words[3]))

@@ -56,7 +56,9 @@ class CTGraph:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        b, d, p = self.branching_factor, self.depth, self.wait_prob
+        b = self.branching_factor
+        d = self.depth
+        p = self.wait_prob
         shape_ok = is_int(b, 2) and is_int(d, 1)
         # 2**63 > 2**63 - 1: beyond depth 63 no tree fits, and b**d need not be computed.
         fits = not shape_ok or (d < 64 and self.num_states <= MAX_STATES)
@@ -130,7 +132,8 @@ class CTGraph:
     @property
     def exact_reward_prob_random(self) -> Fraction:
         """P_R without rounding, for the float that ``wait_prob`` is; see `reward_prob_random`."""
-        b, p = self.branching_factor, Fraction(self.wait_prob)
+        b = self.branching_factor
+        p = Fraction(self.wait_prob)
         return (b + 1) * ((1 - p) / ((b + 1) * (b + 1 - p))) ** (self.depth + 1)
 
     @property
@@ -145,7 +148,8 @@ class CTGraph:
     @property
     def log_reward_prob_random(self) -> float:
         """ln P_R, finite for every graph."""
-        b, p = self.branching_factor, self.wait_prob
+        b = self.branching_factor
+        p = self.wait_prob
         return math.log(b + 1) + (self.depth + 1) * (math.log1p(-p) - math.log(b + 1) - math.log(b + 1 - p))
 
     @property
@@ -186,7 +190,8 @@ class CTGraph:
             ValueError: if ``length`` is not an integer.
         """
         require((is_int(length), f"length must be an integer, got {length!r}"))
-        waits, p = self.depth + 1, self.wait_prob
+        waits = self.depth + 1
+        p = self.wait_prob
         stays = length - 2 * waits
         if stays < 0 or (p == 0 and stays > 0):
             return 0.0

@@ -72,8 +72,11 @@ def philox(words: Sequence[Tensor]) -> tuple[Tensor, ...]:
 
 def add_noise(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`reading.add_noise`."""
-    images, start, read_noise = images.contiguous(), start.long().contiguous(), read_noise.long().contiguous()
-    made, count = torch.empty_like(images), len(images)
+    images = images.contiguous()
+    start = start.long().contiguous()
+    read_noise = read_noise.long().contiguous()
+    made = torch.empty_like(images)
+    count = len(images)
     library().ctgraph_noise(
         *(ctypes.c_void_p(each.data_ptr()) for each in (made, images, start, read_noise)),
         ctypes.c_int64(count),
@@ -114,7 +117,8 @@ def library() -> ctypes.CDLL:
 def _made() -> ctypes.CDLL:
     source = Path(__file__).with_suffix(".c")
     compiler = shlex.split(os.environ.get("CC", "cc"))
-    folder, key = _cache_folder(), _key(source, compiler)
+    folder = _cache_folder()
+    key = _key(source, compiler)
     made = ctypes.CDLL(str(_found(folder, key) or _compiled(source, compiler, folder, key)))
     made.ctgraph_run.restype = ctypes.c_int64
     made.ctgraph_philox.restype = made.ctgraph_noise.restype = None

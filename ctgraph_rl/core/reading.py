@@ -51,7 +51,8 @@ def by_parts(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`add_noise` in one piece."""
-    pixels, high = images[0].numel(), (read_noise + 1).to(torch.int32).unsqueeze(-1)
+    pixels = images[0].numel()
+    high = (read_noise + 1).to(torch.int32).unsqueeze(-1)
     bits = splitmix64(start, (pixels + 3) // 4).view(torch.uint16)[:, :pixels].to(torch.int32)
     noise = bits.mul_(high).bitwise_right_shift_(16).to(torch.uint8)
     return add_saturating(images, noise.view_as(images))
@@ -59,7 +60,8 @@ def noisy(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
     """`add_noise` where each pixel draws its number by itself: more arithmetic, and one kernel where it is compiled."""
-    start, high = start.unsqueeze(-1), (read_noise + 1).long().unsqueeze(-1)
+    start = start.unsqueeze(-1)
+    high = (read_noise + 1).long().unsqueeze(-1)
     pixel = torch.arange(images[0].numel(), device=images.device) + (start & 0)  # [N, pixels]: a faster kernel
     bits = (splitmix64_at(start, pixel // 4) >> pixel % 4 * 16) & 0xFFFF
     return add_saturating(images, (bits * high >> 16).to(torch.uint8).view_as(images))
@@ -110,7 +112,8 @@ def add_cue(images: Tensor, level: Tensor, shows: Tensor, element: Tensor) -> Te
     Returns:
         uint8 of the shape of ``images``.
     """
-    size, ones = images.shape[-1], (1,) * (images.ndim - 1)
+    size = images.shape[-1]
+    ones = (1,) * (images.ndim - 1)
     place = torch.arange(size, device=images.device)
     if images.ndim == 2:
         inside = place == element.unsqueeze(-1)

@@ -69,7 +69,8 @@ class Region:
 
     def _warm_up(self) -> None:
         """Run the function on another stream than the usual one, as a capture does."""
-        stream, usual = torch.cuda.Stream(), torch.cuda.current_stream()
+        stream = torch.cuda.Stream()
+        usual = torch.cuda.current_stream()
         stream.wait_stream(usual)
         with torch.cuda.stream(stream):
             self._run()

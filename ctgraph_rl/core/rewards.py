@@ -67,7 +67,8 @@ class Gradient:
 
     def __call__(self, arrival: Arrival) -> Tensor:
         """See `RewardFn`."""
-        b, depth = arrival.branching_factor, arrival.depth
+        b = arrival.branching_factor
+        depth = arrival.depth
         place = torch.arange(arrival.max_depth, device=b.device)
         weight = b.unsqueeze(-1) ** torch.where(place < depth.unsqueeze(-1), place, 0)
         lost = (weight * arrival.differences()).sum(-1)  # exact: at most b^d - 1

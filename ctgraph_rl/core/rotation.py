@@ -31,15 +31,18 @@ def rotate(images: Tensor, degrees: int) -> Tensor:
 @lru_cache(maxsize=512)
 def taps_of(size: int, degrees: int) -> tuple[Tensor, Tensor]:
     """For each pixel the four source pixels and their weights * 2**16; both int64 [r * r, 4]."""
-    angle, centre = math.radians(degrees), (size - 1) / 2
+    angle = math.radians(degrees)
+    centre = (size - 1) / 2
     grid = torch.arange(size, dtype=torch.float64, device="cpu") - centre
     y, x = torch.meshgrid(grid, grid, indexing="ij")
     source_x = math.cos(angle) * x - math.sin(angle) * y + centre
     source_y = math.sin(angle) * x + math.cos(angle) * y + centre
-    taps, weights = [], []
+    taps = []
+    weights = []
     for step_y in (0, 1):
         for step_x in (0, 1):
-            tap_y, tap_x = source_y.floor() + step_y, source_x.floor() + step_x
+            tap_y = source_y.floor() + step_y
+            tap_x = source_x.floor() + step_x
             weight = (1 - (source_y - tap_y).abs()) * (1 - (source_x - tap_x).abs())
             inside = (tap_y >= 0) & (tap_y < size) & (tap_x >= 0) & (tap_x < size)
             taps.append((tap_y * size + tap_x).where(inside, 0.0).long().flatten())

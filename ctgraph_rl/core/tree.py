@@ -101,7 +101,8 @@ def _moves(branching_factor: int, extra_end_step: bool, last_action: int) -> lis
     """Return where an action leads, section 2 of the paper: [stays, before an end state, state type, action]."""
 
     def next_kind(stays: bool, before_end: bool, kind: int, action: int) -> int:
-        waits, decides = action == WAIT_ACTION, WAIT_ACTION < action <= branching_factor
+        waits = action == WAIT_ACTION
+        decides = WAIT_ACTION < action <= branching_factor
         if kind == _HOME:
             return _WAIT
         if kind == _WAIT and waits:
@@ -143,7 +144,8 @@ def transition(state: State, action: Tensor, stays: Tensor | None, tree: TreePar
     move = torch.add(move, node >= tree.first_leaf, alpha=block)
     if stays is not None:
         move = torch.add(move, stays, alpha=2 * block)
-    next_kind, decides = _look_up(tree.next_kind, move), _look_up(tree.decides, move)
+    next_kind = _look_up(tree.next_kind, move)
+    decides = _look_up(tree.decides, move)
     if tree.extra_end_step is not None:
         next_kind = next_kind.masked_fill((kind == _HOME) & (node > 0), _HOME)
     branch = branch_of(node, action, tree.swap)

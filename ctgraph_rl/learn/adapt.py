@@ -28,7 +28,8 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
         return policy
     act = partial(_NumpyPolicy, discrete=num_actions is not None)
     if hasattr(policy, "predict"):
-        predict, space = policy.predict, getattr(policy, "observation_space", None)
+        predict = policy.predict
+        space = getattr(policy, "observation_space", None)
         blind = shows_ids and space is not None and "task_id" not in getattr(space, "spaces", {})
         fix = "give it a Dict space of observation and task_id, or hide it: replace(curriculum, protocol=Protocol())"
         require((not blind, f"the protocol shows a task_id that {type(policy).__name__} has no place for: {fix}"))

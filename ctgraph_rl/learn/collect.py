@@ -92,7 +92,8 @@ def agent_specs(curriculum: Curriculum) -> Specs:
 
 def _pool_and_ids(curriculum: Curriculum) -> tuple[tuple[TaskLike, ...], int]:
     """Return all tasks of a curriculum, held-out ones too, and the length of the task ids in observations or 0."""
-    how, pool = curriculum.protocol, (*curriculum.tasks, *curriculum.evaluation.held_out)
+    how = curriculum.protocol
+    pool = (*curriculum.tasks, *curriculum.evaluation.held_out)
     return pool, how.length(len(curriculum.tasks)) if how.task_id == "one_hot" else 0
 
 
@@ -145,7 +146,8 @@ def batches(
     start = start_of_episodes(env, initial_state)
     data = dict((env.reset().update(start) if carried is None else carried).items(True, True))
     act_once = CapturedAct(env, policy, start) if _is_captured(env, policy) else partial(act, env, policy, start=start)
-    unstored, num_rows = [key for key in start if key.startswith(UNSTORED)], env.numel()
+    unstored = [key for key in start if key.startswith(UNSTORED)]
+    num_rows = env.numel()
     for first in range(done, num_frames, num_rows * num_steps):
         steps: list[Step] = []
         with set_exploration_type(ExplorationType.RANDOM):
@@ -205,7 +207,9 @@ class CapturedAct:
     """
 
     def __init__(self, env: CTGraphEnv, policy: Policy, start: Step) -> None:
-        self.env, self.policy, self.start = env, policy, start
+        self.env = env
+        self.policy = policy
+        self.start = start
         self._read = {*env.observation_spec.keys(), *env.done_keys, *start.keys()}
         self._region: Region | None = None
         self._params: RowParams | None = None
@@ -216,7 +220,8 @@ class CapturedAct:
         if rows.tasks_change:
             return act(self.env, self.policy, data, self.start)
         if self._region is None or self._params is not rows.params:
-            self._region, self._params = Region(self._act), rows.params
+            self._region = Region(self._act)
+            self._params = rows.params
         given = {key: value for key, value in data.items() if key in self._read}
         found = self._region(_labelled("carried", given) | _labelled("rows", rows.state._asdict()))
         rows.state = RowState(**_part("rows", found))
@@ -224,8 +229,11 @@ class CapturedAct:
         return step, _part("following", found)
 
     def _act(self, given: Step) -> Step:
-        env, rows = self.env, self.env.rows
-        checks, env.check_actions, rows.state = env.check_actions, False, RowState(**_part("rows", given))
+        env = self.env
+        rows = self.env.rows
+        checks = env.check_actions
+        env.check_actions = False
+        rows.state = RowState(**_part("rows", given))
         try:
             step, following = act(env, self.policy, _part("carried", given), self.start)
         finally:

@@ -138,7 +138,8 @@ def learn_collective(
             log, or cannot learn their curriculum; each is named by its number, from 0.
         FloatingPointError: if a loss or weight of a member is not finite; names the member, block and frames.
     """
-    members, log = require_all(Member, "members", members), RunLog() if log is None else log
+    members = require_all(Member, "members", members)
+    log = RunLog() if log is None else log
     _check(members, exchange)
     exchange.connect([member.agent for member in members])
     collective = _Collective(members, exchange, Mail(exchange.drop_prob, exchange.delay_prob, seed), log)
@@ -149,7 +150,9 @@ def learn_collective(
 
 def _check(members: Sequence[Member], exchange: Exchange) -> None:
     """Refuse members that are too many, too few, or not apart."""
-    count, agents, logs = len(members), {id(each.agent) for each in members}, {id(each.log) for each in members}
+    count = len(members)
+    agents = {id(each.agent) for each in members}
+    logs = {id(each.log) for each in members}
     other = f"num_members must be the number of members, {count}, got {exchange.num_members!r}"
     require(
         (exchange.num_members == count, other),
@@ -188,7 +191,8 @@ class _Learner:
     @contextmanager
     def drawing(self) -> Iterator[None]:
         """Let torch's global generators be those of this member."""
-        before, before_cuda = torch.get_rng_state(), self._cuda_state()
+        before = torch.get_rng_state()
+        before_cuda = self._cuda_state()
         torch.set_rng_state(self.random)
         self._set_cuda_state(self.random_cuda)
         try:
@@ -234,7 +238,10 @@ class _Collective:
     """All members, and what is between them."""
 
     def __init__(self, members: Sequence[Member], exchange: Exchange, mail: Mail, log: RunLog) -> None:
-        self.members, self.exchange, self.mail, self.log = members, exchange, mail, log
+        self.members = members
+        self.exchange = exchange
+        self.mail = mail
+        self.log = log
         self.rounds = 0
         self.learners: list[_Learner] = []
         self.advanced: list[_Learner] = []

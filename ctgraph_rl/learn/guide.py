@@ -37,8 +37,11 @@ class Guide:
     """
 
     def __init__(self, policy: Policy, env: CTGraphEnv, guide_frames: int) -> None:
-        self.policy, self.env, self.guide_frames = policy, env, guide_frames
-        self.navigation, self.frames = NavigationPolicy(env), 0
+        self.policy = policy
+        self.env = env
+        self.guide_frames = guide_frames
+        self.navigation = NavigationPolicy(env)
+        self.frames = 0
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and what else the policy writes.
@@ -49,7 +52,8 @@ class Guide:
         share = guided_share(self.frames, self.guide_frames)
         if not share:
             return self.policy(tensordict)
-        actions, before = self.navigation.action(tensordict), tensordict.get(GUIDED, None)
+        actions = self.navigation.action(tensordict)
+        before = tensordict.get(GUIDED, None)
         guided = torch.rand(actions.shape, device=actions.device, dtype=torch.float32) < share
         if before is not None:
             guided = torch.where(tensordict["is_init"].squeeze(-1), guided, before)

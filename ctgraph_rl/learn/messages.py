@@ -116,7 +116,8 @@ class Mail:
 
     def __init__(self, drop_prob: float = 0.0, delay_prob: float = 0.0, seed: int = 0) -> None:
         require(*fraction(drop_prob=drop_prob, delay_prob=delay_prob))
-        self.drop_prob, self.delay_prob = drop_prob, delay_prob
+        self.drop_prob = drop_prob
+        self.delay_prob = delay_prob
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
         self.here: list[Message] = []
         self.late: list[Message] = []
@@ -128,7 +129,8 @@ class Mail:
 
     def begin(self) -> None:
         """Begin an exchange: what was late at the last one is here, and counts start at zero."""
-        self.here, self.late = [*self.here, *self.late], []
+        self.here = [*self.here, *self.late]
+        self.late = []
         self.counts.clear()
         self.bytes.clear()
 

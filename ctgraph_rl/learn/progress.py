@@ -24,7 +24,9 @@ class ProgressBar:
     """
 
     def __init__(self, num_blocks: int, num_frames: int, console: Console | None = None, done: int = 0) -> None:
-        self.num_blocks, self.num_frames, self.done = num_blocks, num_frames, done
+        self.num_blocks = num_blocks
+        self.num_frames = num_frames
+        self.done = done
         self.console = Console(stderr=True) if console is None else console
         self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
         self._live = self.console.is_terminal

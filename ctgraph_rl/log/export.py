@@ -83,7 +83,8 @@ def numbered(regimes: Sequence[Regime]) -> Iterator[tuple[int, Regime]]:
     evaluated: set[str] | None = None
     for regime in regimes:
         if regime.training or evaluated is None or regime.task in evaluated:
-            block, evaluated = block + 1, None if regime.training else set()
+            block = block + 1
+            evaluated = None if regime.training else set()
         if evaluated is not None:
             evaluated.add(regime.task)
         yield block, regime

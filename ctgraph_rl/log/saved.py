@@ -63,7 +63,9 @@ def _require_small(value: Any, num_bytes: int) -> None:
     Raises:
         ValueError: for more parts than the file has bytes, and for tensors that would not fit this machine.
     """
-    parts, count, total = [value], 0, 0
+    parts = [value]
+    count = 0
+    total = 0
     while parts and count <= num_bytes:
         part = parts.pop()
         count += 1
@@ -163,7 +165,8 @@ def _check_sizes(content: bytes, records: list[zipfile.ZipInfo]) -> None:
 def _names(pickled: bytes) -> Iterator[tuple[str, str]]:
     """Yield what a pickle names, each with the kind of what follows."""
     known: dict[Any, str] = {}
-    name, last = "", ""
+    name = ""
+    last = ""
     for operation, argument, _ in pickletools.genops(pickled):
         if "PUT" in operation.name:
             known[argument] = last

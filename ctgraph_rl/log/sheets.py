@@ -80,7 +80,8 @@ def to_latex(sheet: Sheet) -> str:
     header = " & ".join(MATHS.get(name, latex_text(name)) for name in sheet.columns)
     lines = [" & ".join(map(latex_text, row)) + r" \\" for row in sheet.rows]
     notes = [f"% {terminal_text(line)}" for line in (sheet.title, *sheet.notes)]
-    begin, end = rf"\begin{{tabular}}{{{''.join(sides)}}}", r"\end{tabular}"
+    begin = rf"\begin{{tabular}}{{{''.join(sides)}}}"
+    end = r"\end{tabular}"
     return "\n".join([*notes, begin, r"\toprule", header + r" \\", r"\midrule", *lines, r"\bottomrule", end, ""])
 
 

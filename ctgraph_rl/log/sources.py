@@ -179,7 +179,8 @@ def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
     """Return the statements that define a name, and those that define what they mention, in order."""
     mentions = {each: {node.id for node in ast.walk(each) if isinstance(node, ast.Name)} for each in statements}
     defines = {each: set(_defined(each)) for each in mentions}
-    wanted, kept = {name}, set[ast.stmt]()
+    wanted = {name}
+    kept = set[ast.stmt]()
     while new := {each for each in mentions if each not in kept and defines[each] & wanted}:
         kept |= new
         wanted |= set[str]().union(*(mentions[each] for each in new))

@@ -85,7 +85,8 @@ def false_alarms(labelling: Labelling) -> Tensor:
 def labels_per_task(labelling: Labelling) -> Tensor:
     """Return the number of different labels that were learned with, over the number of tasks; 1 is right."""
     labelling.check_one_task_each()
-    labels, tasks = labelling.acted[labelling.learned].unique(), labelling.task.unique()
+    labels = labelling.acted[labelling.learned].unique()
+    tasks = labelling.task.unique()
     return torch.tensor([len(labels) / len(tasks)], dtype=torch.float64, device="cpu")
 
 

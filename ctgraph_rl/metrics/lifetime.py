@@ -34,7 +34,8 @@ from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 
 NEW = "New et al. 2022, Lifelong learning metrics (arXiv 2201.08278), as in l2metrics 3.1.0"
 BAKER = f"{NEW}; Baker et al. 2023 (arXiv 2301.07799)"
-SCALE, OFFSET = 100.0, 1.0
+SCALE = 100.0
+OFFSET = 1.0
 LONGEST_WINDOW = 100
 UNSATURATED_SHARE = 0.2
 """Share of an expert's saturation below which sample efficiency is 0."""
@@ -54,7 +55,8 @@ def smooth(values: Tensor) -> Tensor:
     window = min(int(len(values) * 0.2), LONGEST_WINDOW)
     if window < 3:
         return values
-    head, tail = values[1:window].flip(0), values[-window:-1].flip(0)
+    head = values[1:window].flip(0)
+    tail = values[-window:-1].flip(0)
     weights = torch.full((window,), 1 / window, dtype=values.dtype, device="cpu")
     means = (torch.cat([head, values, tail]).unfold(0, window, 1) * weights).sum(1)
     return means[math.floor(window / 2 - 1) : len(means) - math.ceil(window / 2)]
@@ -276,14 +278,17 @@ def _first_at_least(values: Tensor, level: float) -> int:
 
 def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
     """Mean over a task's evaluations that are no reference themselves of the change against the reference."""
-    training, terminal = table.training.tolist(), table.terminal.tolist()
+    training = table.training.tolist()
+    terminal = table.terminal.tolist()
     last: list[float | None] = [None] * len(table.names)
     reference: list[float | None] = [None] * len(table.names)
     changes: list[list[float]] = [[] for _ in table.names]
     for i, task in enumerate(table.task.tolist()):
-        trained, evaluated = last[task], reference[task]
+        trained = last[task]
+        evaluated = reference[task]
         if training[i]:
-            last[task], reference[task] = terminal[i], None
+            last[task] = terminal[i]
+            reference[task] = None
         elif trained is not None and evaluated is None:
             reference[task] = terminal[i]
         elif trained is not None and evaluated is not None:
@@ -294,7 +299,8 @@ def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
 def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
     """The first value of every ordered pair (a, b) in which a is trained before, or after, b's first training."""
     table = RegimeTable.of(regimes)
-    count, trainings = len(table.names), list(table.places(training=True))
+    count = len(table.names)
+    trainings = list(table.places(training=True))
     first = np.array([own[0] if own else len(table) for own in trainings])
     last = np.array([own[-1] if own else -1 for own in trainings])
     has_term = first[:, None] < first if forward else last[:, None] > first
@@ -313,9 +319,11 @@ def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, 
     Returns:
         The position of the last training between, the number of the evaluated task and the value, [pairs] each.
     """
-    evaluated, trained = np.flatnonzero(~table.training), np.flatnonzero(table.training)
+    evaluated = np.flatnonzero(~table.training)
+    trained = np.flatnonzero(table.training)
     ordered = evaluated[np.argsort(table.task[evaluated], kind="stable")]
-    before, after = ordered[:-1], ordered[1:]
+    before = ordered[:-1]
+    after = ordered[1:]
     changes = np.flatnonzero(np.diff(table.task[trained], prepend=-1))  # where other trainings begin
     start, end = (np.searchsorted(trained, places) for places in (before, after))
     of_end = np.searchsorted(changes, end, "left") - 1

@@ -227,7 +227,8 @@ def _blocks(performance: Tensor, trained: Trained | None) -> list[list[int]]:
     Raises:
         ValueError: if the matrix has not a row for each block and one before.
     """
-    blocks, tasks = performance.shape[0] - 1, performance.shape[1]
+    blocks = performance.shape[0] - 1
+    tasks = performance.shape[1]
     if trained is None and blocks != tasks:
         got = f"got {blocks} blocks and {tasks} tasks"
         raise ValueError(f"without trained, the definition needs one block per task, {got}")

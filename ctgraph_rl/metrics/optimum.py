@@ -144,7 +144,8 @@ def _count_at_first_success(counts: Tensor, episodes: Tensor, success_rates: Ten
     found = (success_rates > 0).nonzero().flatten().tolist()
     if not found:
         return math.nan
-    i, before = found[0], counts[found[0] - 1].item() if found[0] else 0
+    i = found[0]
+    before = counts[found[0] - 1].item() if found[0] else 0
     played = episodes[i].item()
     position = (played + 1) / (round(played * success_rates[i].item()) + 1)
     return before + (counts[i].item() - before) * position / played

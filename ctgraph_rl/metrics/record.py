@@ -162,7 +162,8 @@ def _register(
     metric: Callable[..., Metric], meaning: Definition, renamed: Mapping[str, str], bounds: BoundsOf, is_time: bool
 ) -> None:
     """List a metric with the inputs of its arguments."""
-    name, arguments = metric.__name__, signature(metric).parameters
+    name = metric.__name__
+    arguments = signature(metric).parameters
     sources = {argument: renamed.get(argument, argument) for argument in arguments}
     required = [argument for argument, each in arguments.items() if each.default is Parameter.empty]
     options = arguments.keys() - {*required, *(each for each in sources if sources[each] in INPUTS)}
@@ -187,7 +188,8 @@ def undefined(metric: Callable[..., Metric], reason: str) -> Metric:
 
 def _metric(meaning: Definition, terms: Tensor, missing: str, aggregate: Callable[[Tensor], Tensor]) -> Metric:
     has_value = terms.isfinite()
-    count, without = len(terms), int((~has_value).sum())
+    count = len(terms)
+    without = int((~has_value).sum())
     reason = None
     if count == 0:
         reason = "the formula has no terms here"

@@ -62,7 +62,8 @@ class RegimeTable(Sequence[Regime]):
     """
 
     def __init__(self, names: Sequence[str], columns: Column, values: Tensor) -> None:
-        self.names, self.values = tuple(names), values
+        self.names = tuple(names)
+        self.values = values
         self.task, self.length = (np.asarray(each, dtype=np.int64) for each in (columns.task, columns.length))
         self.training = np.asarray(columns.training, dtype=bool)
         self.starts = np.concatenate([[0], self.length.cumsum()])

@@ -63,7 +63,8 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
         values: in [0, 1], rising.
         tail: the probability below.
     """
-    n, ones = len(values), sum(value == 1 for value in values)
+    n = len(values)
+    ones = sum(value == 1 for value in values)
     if ones + sum(value == 0 for value in values) == n:
         return float(scipy("special").betaincinv(ones, n - ones + 1, tail)) if ones else 0.0
     if values[0] == values[-1]:
@@ -73,7 +74,10 @@ def _least_mean(values: tuple[float, ...], tail: float) -> float:
     for _ in range(REFINEMENTS):
         shares = below(grid) * (n / values[-1])
         place = int(np.clip(np.searchsorted(shares, tail), 1, GRID - 1))
-        lower, upper, at, to = grid[place - 1], grid[place], shares[place - 1], shares[place]
+        lower = grid[place - 1]
+        upper = grid[place]
+        at = shares[place - 1]
+        to = shares[place]
         grid = np.linspace(lower, upper, GRID)
     return float(lower + (upper - lower) * (tail - at) / (to - at)) if to > at else float(lower)
 

@@ -85,7 +85,8 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
     shows their mean; one without a value is a space.
     """
     known = [value for curve in evaluations.values() for _, value in curve if not math.isnan(value)]
-    low, high = min([0.0, *known]), max([1.0, *known])
+    low = min([0.0, *known])
+    high = max([1.0, *known])
 
     def bar(values: Sequence[float]) -> str:
         there = [value for value in values if not math.isnan(value)]
@@ -219,7 +220,8 @@ def print_problems(problems: Iterable[Problem], runs: Sequence[Run]) -> bool:
     Returns:
         Whether something is left out, or runs of one configuration are of different code.
     """
-    left_out, mixed = [f"left out: {problem.reason}" for problem in problems], mixed_code(runs)
+    left_out = [f"left out: {problem.reason}" for problem in problems]
+    mixed = mixed_code(runs)
     notes = [f"code: {sentence}" for sentence in (*mixed, *code_notes(runs))]
     for line in (*left_out, *notes, *(f"labels: {sentence}" for sentence in label_notes(runs))):
         print(terminal_text(line), file=sys.stderr)

@@ -62,7 +62,9 @@ class Checkpoints:
         self, folder: Path | str, seconds: float = SECONDS, strict: bool = False, interrupt: Interrupt | None = None
     ) -> None:
         require(*not_negative(seconds=seconds), *true_or_false(strict=strict))
-        self.folder, self.seconds, self.strict = as_path("folder", folder), seconds, strict
+        self.folder = as_path("folder", folder)
+        self.seconds = seconds
+        self.strict = strict
         self.interrupt = Interrupt() if interrupt is None else interrupt
         self._last: float | None = None
 
@@ -88,7 +90,8 @@ class Checkpoints:
             OSError: if it cannot be written; names the sizes and the checkpoint that is kept.
             ValueError: if the first one cannot be read back, for it holds more than tensors and plain values.
         """
-        path, content = self.path_of(state["frames"]), encoded(state)
+        path = self.path_of(state["frames"])
+        content = encoded(state)
         if self._last is None:
             _require_plain(content)
         made_folder(self.folder)
@@ -208,7 +211,8 @@ def decoded(path: Path) -> State:
         raise BrokenCheckpoint(f"{error}; {advice}") from None
     try:
         header = json.loads(head)
-        version, expected = header["format"], (header["bytes"], header["sha256"])
+        version = header["format"]
+        expected = (header["bytes"], header["sha256"])
     except (ValueError, KeyError, TypeError, RecursionError):
         raise BrokenCheckpoint(f"{path} is no checkpoint, or torn; {advice}") from None
     if version != FORMAT:

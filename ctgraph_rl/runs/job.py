@@ -78,7 +78,8 @@ class Job:
         """
         device = checked_device(cfg.device)
         prepare_torch(cfg)
-        make_method, make_alone = method_of(cfg), config.target(cfg, "agent")
+        make_method = method_of(cfg)
+        make_alone = config.target(cfg, "agent")
         curriculum = curriculum_of(cfg, make_method())
         for task in curriculum.tasks if cfg.experts else ():  # what an agent cannot learn alone is refused first
             new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
@@ -101,7 +102,8 @@ class Job:
             together: the seeds of the group that the run is trained in, if it is not alone.
             experts: of each task, if they were trained before.
         """
-        cfg, saved = self.cfg, self._checkpoints(run_dir)
+        cfg = self.cfg
+        saved = self._checkpoints(run_dir)
         with self._tracking(run_dir) as listeners:
             if self._replaces(run_dir):
                 saved.clear()
@@ -140,7 +142,8 @@ class Job:
 
     def expert(self, alone: Curriculum, run_dir: Path, together: Sequence[int] = ()) -> tuple[Agent, RunDirectory]:
         """Build an agent that learns a task alone, as `new_agent` does, and prepare its directory."""
-        agent, saved = new_agent(alone, self.make_alone, self.cfg.seed, self.device), self._checkpoints(run_dir)
+        agent = new_agent(alone, self.make_alone, self.cfg.seed, self.device)
+        saved = self._checkpoints(run_dir)
         return agent, RunDirectory(run_dir, self._of_experts, saved, together, console=self._console)
 
     def learn_alone(self, alone: Curriculum, run_dirs: RunDirs) -> Failures:
@@ -153,7 +156,8 @@ class Job:
 
     def _experts(self) -> list[Expert]:
         """Return the experts of the curriculum, found or trained with the run's own agent, seed and threads."""
-        folder, keys = Path(self.cfg.experts_dir), {self.cfg.seed: self.decides_experts}
+        folder = Path(self.cfg.experts_dir)
+        keys = {self.cfg.seed: self.decides_experts}
         found, _ = find_or_train(self.curriculum, self.learn_alone, folder, keys, print, waiting=self.interrupt.check)
         return found[self.cfg.seed]
 
@@ -229,12 +233,14 @@ def make_agent(
     require((isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"))
     names = {"agent": name, "method": method, "detector": detector}
     cfg = config.with_names(names, None if config_dir is None else Path(config_dir))
-    cfg.seed, cfg.device = cfg.seed if seed is None else seed, cfg.device if device is None else str(device)
+    cfg.seed = cfg.seed if seed is None else seed
+    cfg.device = cfg.device if device is None else str(device)
     for group, values in (("agent", settings), ("method", plain(method_settings or {}))):
         cfg[group] = {**cfg[group], **values}
     config.check_values(cfg)
     prepare_torch(cfg)
-    make_method, make_alone = method_of(cfg), config.target(cfg, "agent")
+    make_method = method_of(cfg)
+    make_alone = config.target(cfg, "agent")
     kind = type(make_method()).__name__
     other = (
         f"{kind} learns another curriculum: replace yours by {kind}(...).prepare(curriculum), here and where it is used"

@@ -88,7 +88,8 @@ def load(
         FileNotFoundError: if there is no run, or none that has been saved.
         ValueError: for an agent, a method or a curriculum that must be given, and files that do not belong together.
     """
-    run_dir, device = as_path("run_dir", run_dir), checked_device(device)
+    run_dir = as_path("run_dir", run_dir)
+    device = checked_device(device)
     if not (run_dir / LOG).exists():
         raise FileNotFoundError(f"{run_dir} holds no run: there is no {LOG}")
     log = RunLog.read(run_dir / LOG)
@@ -163,7 +164,8 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     """Return what builds a part that a configuration names, such as its agent, if its class is one of ``baselines``."""
     settings = settings if isinstance(settings, Mapping) else {}
     name = str(settings.get("_target_"))
-    ours, maker = OURS[part].fullmatch(name), "make_method" if part in ("method", "detector") else "make_agent"
+    ours = OURS[part].fullmatch(name)
+    maker = "make_method" if part in ("method", "detector") else "make_agent"
     if ours is None:
         name = terminal_text(name[:80])
         raise ValueError(f"{run_dir} is of the {part} {name}, no baseline: give load(..., {maker}=), in Python")

@@ -128,11 +128,13 @@ class Recorder:
             (writes, "overwrite, resume and logger need a run_dir"),
         )
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
-        self.curriculum, self.run_dir = curriculum, None if run_dir is None else as_path("run_dir", run_dir)
+        self.curriculum = curriculum
+        self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)
         self.saved: Mapping[str, Any] | None = None
         self.frames = 0
         self.finished = False
-        self._evaluated, self._trained = -1, 0
+        self._evaluated = -1
+        self._trained = 0
         self._tracker: Tracker | None = None
         names = None if code is None else [full_name(each) for each in code]
         self._about = {**provenance(curriculum, names), "config": {"seed": seed, **(about or {})}}
@@ -149,7 +151,8 @@ class Recorder:
 
     def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
         """Return the log of a run that begins, or of one that is resumed."""
-        path, begun = run_dir / LOG, RunLog.begun(run_dir / LOG)
+        path = run_dir / LOG
+        begun = RunLog.begun(run_dir / LOG)
         stopped = begun is not None and not (run_dir / METRICS).exists()
         if not overwrite and not (resume and begun is not None) and path.exists() and not RunLog.is_blank(path):
             what = "a run that was stopped" if stopped else "no run" if begun is None else "a finished run"
@@ -163,8 +166,10 @@ class Recorder:
         state = self._checkpoints.newest() if resume else None
         if state is not None:
             require(("learner" in state, f"{self._checkpoints.folder} holds no checkpoint of a Recorder"))
-            self.saved, self.frames = state["learner"], state["frames"]
-            self._evaluated, self._trained = state["evaluated"], state["trained"]
+            self.saved = state["learner"]
+            self.frames = state["frames"]
+            self._evaluated = state["evaluated"]
+            self._trained = state["trained"]
             return resumed_log(run_dir, state, self._about, self._checkpoints.strict)
         made_folder(run_dir)
         self._checkpoints.clear()
@@ -223,7 +228,8 @@ class Recorder:
             ValueError: for frames out of order or beyond the curriculum, without a run_dir, and for a state that cannot
                 be read back.
         """
-        least, last = max(self._evaluated, self._trained, self.frames), self.curriculum.num_frames
+        least = max(self._evaluated, self._trained, self.frames)
+        last = self.curriculum.num_frames
         require(
             (self.run_dir is not None, "a checkpoint needs a run_dir: Recorder(curriculum, run_dir)"),
             (
@@ -350,7 +356,8 @@ class Recorder:
             self._end()
 
     def _adapted(self, policy: Any, policy_for: Callable[[int], Any] | None, frames: int) -> Policy:
-        ids, shown = self.curriculum.task_ids, self.curriculum.protocol.task_id
+        ids = self.curriculum.task_ids
+        shown = self.curriculum.protocol.task_id
         if policy_for is None:
             return self._adapt(policy)
         require((shown != "hidden", "policy_for is for task ids, which are hidden in this protocol: give policy"))

@@ -24,7 +24,11 @@ from ctgraph_rl.log.files import CHECKPOINTS, FAILURE, LOCK, LOG, METRICS, MOST_
 from ctgraph_rl.log.sums import MOST_BYTES_OF_SUMS, SUMS, is_complete
 from ctgraph_rl.runs import config
 
-DONE, STALE, FAILED, IN_USE, MISSING = "done", "stale", "failed", "in use", "missing"
+DONE = "done"
+STALE = "stale"
+FAILED = "failed"
+IN_USE = "in use"
+MISSING = "missing"
 
 START_AGAIN = "overwrite=stale runs what is stale again, overwrite=true all"
 
@@ -201,7 +205,8 @@ class SweepProgress:
     def _watch(self) -> None:
         start = last_line = time.perf_counter()
         ended_before = sum(self.look()[:2])
-        pause, over = 1.0, False
+        pause = 1.0
+        over = False
         while not over:
             over = self._stop.wait(pause)  # one more look then: cells may have ended since the last
             now = time.perf_counter()

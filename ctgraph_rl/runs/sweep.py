@@ -81,7 +81,8 @@ class Sweeper(Base):
         variants: Sequence[Mapping[str, Any]] | None = None,
     ) -> None:
         super().__init__(max_batch_size, params)
-        self.status, self.variants = status, variants or ({},)
+        self.status = status
+        self.variants = variants or ({},)
         self._values: dict[str, tuple[str, Any] | None] = {}
         self._stale: dict[Path, str] = {}
         self._begun: dict[Path, tuple[int, ...]] = {}
@@ -235,7 +236,8 @@ class Sweeper(Base):
             self._begun[folder] = tuple((first_line(run_dir) or {}).get("together", ()))
             changed, unknown = changed_code(one, run_dir, self._known)
         except Exception as error:  # of the code of a user, which may have changed so that it cannot be run
-            changed, unknown = [f"what builds it, which now fails ({type(error).__name__}: {error}),"], False
+            changed = [f"what builds it, which now fails ({type(error).__name__}: {error}),"]
+            unknown = False
         if changed:
             self._stale[folder] = ", ".join(changed)
         self._num_unknown += unknown
@@ -278,7 +280,8 @@ class Sweeper(Base):
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
         save_yaml(self.config, folder / "multirun.yaml")
-        settings, size = list(jobs), self.max_batch_size or len(jobs)
+        settings = list(jobs)
+        size = self.max_batch_size or len(jobs)
         for first in range(0, len(settings), size):
             batch = settings[first : first + size]
             try:
@@ -348,7 +351,8 @@ def sweepable(arguments: Sequence[str]) -> list[str]:
 
 def _as_choice(key: str, value: str) -> str:
     """Return a setting as the choice of its one value; unchanged, if it has several, or would be read differently."""
-    setting, choice = f"{key}={value}", f"{key}=choice({value})"
+    setting = f"{key}={value}"
+    choice = f"{key}=choice({value})"
     parse = OverridesParser.create().parse_override
     try:
         before = parse(setting).value()

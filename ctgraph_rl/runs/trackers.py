@@ -80,7 +80,8 @@ class Tracker:
 
     def __call__(self, measurement: Mapping[str, Any]) -> None:
         """Send one measurement, with the run's frames as the step; before the first, those of a resumed run's log."""
-        log, self._log = self._log, None
+        log = self._log
+        self._log = None
         if log is not None and log.exists():
             for earlier in RunLog.read(log).measurements[:-1]:  # the last one is this
                 self(earlier)

@@ -93,7 +93,8 @@ def read_curriculum(
         _check_keys(content, _KEYS, optional=(_DERIVED,))
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
         curriculum = make(**_parts(content))
-        stated, found = content["fingerprint"], curriculum.fingerprint
+        stated = content["fingerprint"]
+        found = curriculum.fingerprint
         fix = f"if it was changed on purpose, write {found!r} there, and a new version and name"
         require((stated == found, f"fingerprint is {stated!r}, but the content has {found!r}; {fix}"))
     return curriculum

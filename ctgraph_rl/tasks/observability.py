@@ -40,7 +40,8 @@ def states_per_observation(task: Task) -> dict[str, int]:
         ValueError: for a ``legacy_index`` with more than two branches, where unlike numbers of states share ids.
     """
     require(_index_rule(task))
-    x, graph = task.observations, task.graph
+    x = task.observations
+    graph = task.graph
     counts = {kind: getattr(graph, f"num_{kind.name.lower()}_states") for kind in PLACED}
     return {kind.name.lower(): 1 if x.is_unique(kind) else count for kind, count in counts.items()}
 
@@ -75,7 +76,8 @@ def state_entropy(task: Task, policy: str = "random") -> float:
 
 def _visits(graph: CTGraph, waits: float, decides: float) -> dict[StateType, dict[int, float]]:
     """Expected visits of each kind of state by level; home has one visit, and the fail state the rest of the ends."""
-    p, depth = graph.wait_prob, graph.depth
+    p = graph.wait_prob
+    depth = graph.depth
     leaves = waits * (1 - p) / (1 - waits * p)
     reached = [(leaves * decides) ** level for level in range(depth + 1)]
     return {
@@ -92,6 +94,7 @@ def _bits(by_level: dict[int, float], branches: int) -> float:
 
 
 def _index_rule(task: Task) -> tuple[bool, str]:
-    b, x = task.graph.branching_factor, task.observations
+    b = task.graph.branching_factor
+    x = task.observations
     own = not (x.legacy_index and b > 2 and any(map(x.is_unique, PLACED)))
     return own, f"observability is exact only for ids of their own, not a legacy_index with branching_factor={b}"

@@ -68,7 +68,8 @@ class Observations:
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         if self.unique_ends is None:
             object.__setattr__(self, "unique_ends", bool(self.unique_decisions or self.unique_waits))
-        given, rotation = {name: getattr(self, name) for name in ranges}, self.read_rotation
+        given = {name: getattr(self, name) for name in ranges}
+        rotation = self.read_rotation
         degrees = f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {rotation!r}"
         require(
             *((_is_range(ids), _range_rule(name, ids)) for name, ids in given.items()),

@@ -120,7 +120,8 @@ def _dialect(content: Mapping[str, Any]) -> str:
 
 def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
     """Return the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
-    wanted, names = _places(dialect).values(), (*_SECTIONS, "general_seed")
+    wanted = _places(dialect).values()
+    names = (*_SECTIONS, "general_seed")
     unknown = [f"unknown section {name!r}{_suggest(name, names)}" for name in content if name not in names]
     whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
     absent = {name: "must be an object" if name in content else "is missing" for name in _SECTIONS if name not in whole}
@@ -162,7 +163,8 @@ def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> l
 
     noise, rotation, first, end = (found[name] for name in ("noise", "rotation", "min_episodes", "max_episodes"))
     episodes = is_int(first) and is_int(end) and (max(first, end) <= 0 or 1 <= first < end)
-    distribution, choices = found["distribution"], " or ".join(map(repr, _DISTRIBUTIONS))
+    distribution = found["distribution"]
+    choices = " or ".join(map(repr, _DISTRIBUTIONS))
     known = isinstance(distribution, str) and distribution in _DISTRIBUTIONS
     flags = [name for name in ("is_stochastic", "unique_decisions", "unique_waits", "one_hot") if name in found]
     still = found["one_hot"] is not True or (is_real(noise) and noise < 1 and rotation == 1)
@@ -192,7 +194,8 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
     """Values in our words as arguments of `Task`, all but the goal."""
     changes = found["min_episodes"] > 0
     noise = 0 if found["one_hot"] else found["noise"]
-    count, seed = found["num_images"], found["image_seed"]
+    count = found["num_images"]
+    seed = found["image_seed"]
     images = ReferenceOneHot(count) if found["one_hot"] else ReferenceImages(count, seed, noise)
     shown = {name: found[name] for name in ("wait_ids", "decision_ids", "end_ids", "unique_waits", "unique_decisions")}
     on_read = {"read_noise": math.floor(noise), "read_rotation": found["rotation"] - 1}
@@ -228,7 +231,8 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
 
 def _expressible(task: Task) -> list[tuple[bool, str]]:
     """Return the rules for tasks that a file of the 2023 dialect can express."""
-    x, images = task.observations, task.images
+    x = task.observations
+    images = task.images
     unique = x.unique_waits or x.unique_decisions or x.unique_ends
     kinds = (ReferenceImages, ReferenceOneHot)
     one_noise = not isinstance(images, ReferenceImages) or x.read_noise == math.floor(images.noise)
@@ -256,7 +260,8 @@ def _expressible(task: Task) -> list[tuple[bool, str]]:
 
 def _values(task: Task) -> dict[str, Any]:
     """A task in the words of `_KEYS`."""
-    x, images = task.observations, task.images
+    x = task.observations
+    images = task.images
     first, last = task.goal_change or (-1, -2)
     return {
         **{name: getattr(task.graph, name) for name in ("depth", "branching_factor", "wait_prob")},

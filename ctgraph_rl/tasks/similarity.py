@@ -151,7 +151,8 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
 
 def _num_rewired(one: Task, other: Task, common: CTGraph) -> int:
     """Return how many decision states of the common tree lead elsewhere in one of two tasks than in the other."""
-    swaps, b = {one.swapped_branches, other.swapped_branches}, common.branching_factor
+    swaps = {one.swapped_branches, other.swapped_branches}
+    b = common.branching_factor
     differing = [swap for swap in swaps if swap is not None] if len(swaps) > 1 else []
     inside = [path for path, (first, _) in differing if len(path) < common.depth and max((*path, first)) <= b]
     return len(set(inside))
@@ -187,7 +188,8 @@ class _Choices:
 
     def of_nodes(self, kind: StateType, level: int, nodes: Sequence[int]) -> list[int]:
         """The sets at nodes by their numbers within a level."""
-        sets, goal = self.sets[kind, level], self.goal_nodes[level]
+        sets = self.sets[kind, level]
+        goal = self.goal_nodes[level]
         return [sets[ON_THE_WAY if node == goal else ELSEWHERE] if self.collapsed else sets[node] for node in nodes]
 
     def in_use(self, kind: StateType) -> Iterator[int]:
@@ -205,9 +207,12 @@ def _choices(tasks: tuple[Task, ...], gamma: float) -> list[_Choices]:
 
 def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[StateType, int], list[int]]:
     """Backward induction from the end states, as `values` does it, that keeps what is optimal."""
-    tree, best = smallest_tree(task, is_needle(task)), BestActions(task, gamma)
-    step, p = task.step_reward, task.graph.wait_prob
-    fails, margin = step + task.fail_reward, ROUNDING * _largest(task)
+    tree = smallest_tree(task, is_needle(task))
+    best = BestActions(task, gamma)
+    step = task.step_reward
+    p = task.graph.wait_prob
+    fails = step + task.fail_reward
+    margin = ROUNDING * _largest(task)
     arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)
     sets = {}
     for level in reversed(range(task.graph.depth + 1)):
@@ -240,7 +245,8 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
 def _equal_share(one: _Choices, other: _Choices) -> float:
     """Share of the states of the common tree with equal sets."""
     tree = _common(one.task, other.task)
-    b, d = tree.branching_factor, tree.depth
+    b = tree.branching_factor
+    d = tree.depth
     count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
     equal = sum(count(one, other, kind, level, b) for kind in CHOOSING for level in range(d + (kind == StateType.WAIT)))
     return equal / (tree.num_decision_states + tree.num_wait_states)
@@ -315,17 +321,21 @@ def _levels(task: Task, kind: StateType) -> range:
 
 def _unique_ids(task: Task, kind: StateType, level: int) -> list[int]:
     """The ids of the states of a level, in their order."""
-    x, graph = task.observations, task.graph
-    states, limit = graph.num_states, MAX_ENUMERATED_STATES
+    x = task.observations
+    graph = task.graph
+    states = graph.num_states
+    limit = MAX_ENUMERATED_STATES
     require((states <= limit, f"unique ids on this graph need a visit to each of its {states} states, limit {limit}"))
     first, last = x.ids(kind)
-    before, size = x.first_of_level(graph, kind, level), last - first + 1
+    before = x.first_of_level(graph, kind, level)
+    size = last - first + 1
     return [first + (before + node) % size for node in range(graph.branching_factor**level)]
 
 
 def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
     """Return a digest of each image behind ids, equal for equal images of any set."""
-    needed, variants = bank_bytes([task]), task.images.num_variants
+    needed = bank_bytes([task])
+    variants = task.images.num_variants
     rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"
     require((needed <= MAX_COMPARED_BYTES, rule))
     digests = _digests(task.images)  # type: ignore[arg-type]
@@ -336,6 +346,7 @@ def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
 def _digests(images: ImageSet) -> list[bytes]:
     """A hash of every image; of vectors without the zeros at their end."""
     rows = images.bank(0).numpy()
-    vectors, shape = rows.ndim == 2, repr(rows.shape[2:]).encode()
+    vectors = rows.ndim == 2
+    shape = repr(rows.shape[2:]).encode()
     contents = (row.tobytes().rstrip(b"\0") if vectors else shape + row.tobytes() for row in rows)
     return [hashlib.blake2b(content, digest_size=16).digest() for content in contents]

@@ -111,7 +111,8 @@ class Task:
         one_hot = len(self.images.shape) == 1
         x = self.observations
         varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
-        room, last_id = self.images.num_images, self.observations.last_id
+        room = self.images.num_images
+        last_id = self.observations.last_id
         too_few = f"num_images={room} is too few for id {last_id} in observations: needs at least {last_id + 1}"
         require(
             self._goal_rule(),
@@ -184,7 +185,9 @@ class Task:
         return env(tasks, seed, task_pool=task_pool, device=device, task_ids=task_ids, num_task_ids=num_task_ids)
 
     def _check_parts(self) -> None:
-        images, reward_fn, shown = self.images, self.reward_fn, self.observations
+        images = self.images
+        reward_fn = self.reward_fn
+        shown = self.observations
         has_images = hasattr(images, "bank") and not isinstance(images, type)
         pays = callable(reward_fn) and not isinstance(reward_fn, type)
         require(
@@ -195,7 +198,8 @@ class Task:
         )
 
     def _reward_rules(self) -> list[tuple[bool, str]]:
-        cue, change = self.observations.reward_cue, self.goal_change
+        cue = self.observations.reward_cue
+        change = self.goal_change
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
         lasts = change is None or (pair and is_int(change[1], change[0], MAX_EPISODES))
         cues = not cue or is_real(self.goal_reward, SMALLEST_CUED_REWARD)
@@ -216,7 +220,8 @@ class Task:
         return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 
     def _goal_rule(self) -> tuple[bool, str]:
-        b, d = self.graph.branching_factor, self.graph.depth
+        b = self.graph.branching_factor
+        d = self.graph.depth
         goal = self.goal
         holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
         message = f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
@@ -240,7 +245,8 @@ class Task:
 
     def decision_to(self, node: int) -> int:
         """Return the decision, in 1..b, that leads from its parent to ``node``, any but the root 0."""
-        branch, swap = self.graph.decision(node), self.swapped_branches
+        branch = self.graph.decision(node)
+        swap = self.swapped_branches
         if swap is None or self.graph.parent(node) != self.swapped_node or branch not in swap[1]:
             return branch
         return sum(swap[1]) - branch

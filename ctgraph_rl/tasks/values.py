@@ -211,8 +211,11 @@ def _divided(num_ids: int, counts: list[int]) -> list[float]:
 
 
 def _random_episode_length(task: Task) -> Fraction:
-    b, d, p = task.graph.branching_factor, task.graph.depth, Fraction(task.graph.wait_prob)
-    wait, leaves = (b + 1) / (b + 1 - p), (1 - p) / (b + 1 - p)
+    b = task.graph.branching_factor
+    d = task.graph.depth
+    p = Fraction(task.graph.wait_prob)
+    wait = (b + 1) / (b + 1 - p)
+    leaves = (1 - p) / (b + 1 - p)
     reached = [(leaves * b / (b + 1)) ** k for k in range(d + 1)]
     return 1 + wait * sum(reached) + leaves * (sum(reached[:d]) + task.extra_end_step * reached[d])
 
@@ -231,7 +234,8 @@ def smallest_tree(task: Task, collapses: bool) -> _EveryNode | _GoalPath:
     """The smallest tree that is exact."""
     if collapses:
         return _GoalPath(task)
-    states, limit = task.graph.num_states, MAX_ENUMERATED_STATES
+    states = task.graph.num_states
+    limit = MAX_ENUMERATED_STATES
     too_many = f"{type(task.reward_fn).__name__} on this graph needs a visit to each of its {states} states"
     require((states <= limit, f"{too_many}, more than the limit of {limit} (2**21); use a smaller depth"))
     return _EveryNode(task)
@@ -256,7 +260,8 @@ class _EveryNode:
     def children(self, values: Tensor, level: int) -> Tensor:
         """Values of level + 1 by parent and decision: float64 [b^level, b]."""
         by_branch = values.view(-1, self.task.graph.branching_factor)
-        swap, node = self.task.swapped_branches, self.task.swapped_node
+        swap = self.task.swapped_branches
+        node = self.task.swapped_node
         if swap is None or node is None or len(swap[0]) != level:
             return by_branch
         by_decision, (first, second) = by_branch.clone(), (branch - 1 for branch in swap[1])
@@ -299,7 +304,8 @@ class BestActions:
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is best once stays best. float64, as ``arrival``."""
-        p, s = self.task.graph.wait_prob, self.task.step_reward
+        p = self.task.graph.wait_prob
+        s = self.task.step_reward
         return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_min(s + self.task.fail_reward)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
@@ -312,7 +318,8 @@ class _WorstActions(BestActions):
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is worst once stays worst. float64, as ``arrival``."""
-        p, s = self.task.graph.wait_prob, self.task.step_reward
+        p = self.task.graph.wait_prob
+        s = self.task.step_reward
         return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_max(s + self.task.fail_reward)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
@@ -330,14 +337,17 @@ class _Memoryless:
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """The module's V(wait), solved. float64, as ``arrival``."""
-        probs, p = self._action_probs(StateType.WAIT, level), self.task.graph.wait_prob
-        waits, fails = probs[:, WAIT_ACTION], probs[:, 1:].sum(-1)
+        probs = self._action_probs(StateType.WAIT, level)
+        p = self.task.graph.wait_prob
+        waits = probs[:, WAIT_ACTION]
+        fails = probs[:, 1:].sum(-1)
         leaves = self.task.step_reward + waits * (1 - p) * arrival + fails * self.task.fail_reward
         return leaves / (1 - self.gamma * p * waits)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """The mean over decisions and failing. float64 [n] of [n, b]."""
-        probs, b = self._action_probs(StateType.DECISION, level), self.task.graph.branching_factor
+        probs = self._action_probs(StateType.DECISION, level)
+        b = self.task.graph.branching_factor
         fails = probs[:, WAIT_ACTION] + probs[:, b + 1 :].sum(-1)
         decided = self.gamma * (probs[:, 1 : b + 1] * children).sum(-1)
         return self.task.step_reward + decided + fails * self.task.fail_reward
@@ -359,7 +369,8 @@ def is_needle(task: Task) -> bool:
 
 
 def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
-    b, images = task.graph.branching_factor, task.images.num_images
+    b = task.graph.branching_factor
+    images = task.images.num_images
     is_table = isinstance(policy, Tensor) and policy.dim() == 2 and policy.is_floating_point()
     got = (policy.dtype, list(policy.shape)) if isinstance(policy, Tensor) else type(policy).__name__
     shape_rule = f"policy must be a float tensor [{images}, A] with A >= {b + 1}, one row per image, got {got}"
@@ -380,7 +391,10 @@ def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
 
 def _needle_rules(task: Task, ceiling: str) -> list[tuple[bool, str]]:
     """Return the rules on rewards for which a ceiling is exact."""
-    name, goal, fail, step = type(task.reward_fn).__name__, task.goal_reward, task.fail_reward, task.step_reward
+    name = type(task.reward_fn).__name__
+    goal = task.goal_reward
+    fail = task.fail_reward
+    step = task.step_reward
     only = f"the {ceiling} ceiling is exact only for"
     return [
         (is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),

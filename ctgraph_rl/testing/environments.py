@@ -43,7 +43,8 @@ class TaskContract(_OfTasks):
 
     def test_tasks_are_equal_and_hashed_by_value(self) -> None:
         """Two calls of `make_tasks` give the same tasks, and a call gives different ones."""
-        once, again = list(self.make_tasks()), list(self.make_tasks())
+        once = list(self.make_tasks())
+        again = list(self.make_tasks())
 
         assert once == again
         assert [hash(task) for task in once] == [hash(task) for task in again]
@@ -102,12 +103,16 @@ class EnvironmentContract(_OfTasks):
         ended = 0
 
         for step, following in self.steps(env):
-            after, done = step["next"], step["next", "done"]
-            count, total = count + 1, total + after["reward"]
+            after = step["next"]
+            done = step["next", "done"]
+            count = count + 1
+            total = total + after["reward"]
             assert count.equal(after["step_count"])
             assert torch.allclose(total, after["episode_reward"])
             assert following["is_init"].equal(done)
-            count, total, ended = count * ~done, total * ~done, ended + int(done.sum())
+            count = count * ~done
+            total = total * ~done
+            ended = ended + int(done.sum())
             assert count.equal(following["step_count"])
         assert ended, f"no episode ended in {NUM_STEPS} steps: give tasks with a shorter time limit"
 
@@ -144,7 +149,8 @@ class EnvironmentContract(_OfTasks):
         tasks = list(self.make_tasks())
         if not getattr(tasks[0], "resumes", False):
             return
-        env, other = self.make_env(tasks), self.make_env(tasks)
+        env = self.make_env(tasks)
+        other = self.make_env(tasks)
         *_, (_, data) = self.steps(env)
         other.load_state_dict(env.state_dict())
 

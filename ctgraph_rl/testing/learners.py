@@ -87,7 +87,8 @@ class AgentContract:
 
     def test_a_run_resumes_from_a_saved_state_with_the_same_bits(self) -> None:
         """The state after the second batch, which PyTorch saves and loads without code."""
-        curriculum, states = self.curriculum(), []
+        curriculum = self.curriculum()
+        states = []
         whole, log = self.learnt(curriculum, checkpoint=lambda state, ends: states.append(_bytes(state())))
         saved = torch.load(io.BytesIO(states[1]), weights_only=True)
         resumed, again = self.learnt(curriculum, saved=saved)

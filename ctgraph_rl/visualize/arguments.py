@@ -124,7 +124,8 @@ def _called(name: str, task: Task) -> Selection:
 
 
 def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
-    tasks, labels = ct_graphs(curriculum.tasks, "a drawing or a game"), curriculum.labels
+    tasks = ct_graphs(curriculum.tasks, "a drawing or a game")
+    labels = curriculum.labels
     rule = f"--task must be in 1..{len(tasks)}, the tasks of {curriculum.name}, got {number}"
     require((is_int(number, 1, len(tasks)), rule))
     return Selection(tasks[number - 1], f"{curriculum.name}, task {number}: {labels[number - 1]}")
@@ -133,5 +134,6 @@ def _of_curriculum(curriculum: Curriculum, number: int) -> Selection:
 def _of_run(run: Path, number: int) -> Selection:
     trained = load(run)
     selection = _of_curriculum(trained.curriculum, number)
-    policy, initial_state = trained.policy_for(selection.task), trained.agent.initial_state
+    policy = trained.policy_for(selection.task)
+    initial_state = trained.agent.initial_state
     return selection._replace(policy=policy, initial_state=initial_state, curriculum=trained.curriculum)

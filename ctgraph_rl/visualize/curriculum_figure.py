@@ -106,7 +106,8 @@ def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: I
 
 def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
     size = max(3.0, 9.0 - len(layout.leaves) / 6 - layout.graph.depth / 4)
-    ends, stars = set(layout.leaves), set(goals)
+    ends = set(layout.leaves)
+    stars = set(goals)
     for points, style in (
         ([place for node, place in places.items() if node not in ends], mark(StateType.DECISION, size)),
         ([places[end] for end in ends - stars], mark(StateType.END, size)),

@@ -34,7 +34,8 @@ def to_dot(task: Task, name: str = "") -> str:
 def _statements(task: Task, name: str) -> Iterator[str]:
     goal = task.graph.node_at(task.goal)
     layout = lay_out(task.graph, [goal], MOST_LEAVES)
-    b, p = task.graph.branching_factor, task.graph.wait_prob
+    b = task.graph.branching_factor
+    p = task.graph.wait_prob
     yield _attributes("graph", label=name, labelloc="t")
     yield _attributes("node", style="filled", fontname="sans-serif")
     for state in (*drawn.states(layout), FAIL_KEY):

@@ -47,7 +47,8 @@ def _frames(player: Player, size: int, most: int) -> list[Tensor]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(player.seed)
         player.start()
-        frames, over = [player.env.render(size)[0]], False
+        frames = [player.env.render(size)[0]]
+        over = False
         while not over and len(frames) < most:
             over = player.step()
             frames.append(player.env.render(size)[0])

@@ -49,9 +49,11 @@ class Layout:
     @property
     def stubs(self) -> list[tuple[int, int]]:
         """Hints at branches left out: a node, and how far to the left (below 0) or right of those drawn."""
-        b, hints = self.graph.branching_factor, []
+        b = self.graph.branching_factor
+        hints = []
         for node, branches in self._branches().items():
-            left, right = min(branches) - 1, b - max(branches)
+            left = min(branches) - 1
+            right = b - max(branches)
             hints += [(node, -1 - k) for k in range(min(left, MOST_STUBS))]
             hints += [(node, 1 + k) for k in range(min(right, MOST_STUBS))]
         return hints
@@ -79,16 +81,19 @@ def lay_out(graph: CTGraph, ends: Iterable[int], most_leaves: int = MOST_LEAVES)
         ends: end states, at least one.
         most_leaves: end states up to which all are drawn.
     """
-    first, count = graph.num_decision_states, graph.num_end_states
+    first = graph.num_decision_states
+    count = graph.num_end_states
     chosen = range(first, first + count) if count <= most_leaves else sorted(set(ends))
     x = {end: (i + 0.5) / len(chosen) for i, end in enumerate(chosen)}
-    level, below = dict.fromkeys(x, graph.depth), x
+    level = dict.fromkeys(x, graph.depth)
+    below = x
     for depth in reversed(range(graph.depth)):
         row: dict[int, list[float]] = {}
         for node, place in below.items():
             row.setdefault(graph.parent(node), []).append(place)
         below = {node: (places[0] + places[-1]) / 2 for node, places in row.items()}
-        x, level = below | x, dict.fromkeys(below, depth) | level
+        x = below | x
+        level = dict.fromkeys(below, depth) | level
     return Layout(graph, x, level)
 
 

@@ -63,7 +63,9 @@ class Game:
     """
 
     def __init__(self, player: Player, console: Console) -> None:
-        self.player, self.console, self.graph = player, console, player.task.graph
+        self.player = player
+        self.console = console
+        self.graph = player.task.graph
         self.episodes = self.successes = 0
         self.is_over = False
 
@@ -141,7 +143,8 @@ def truth(task: Task, kind: StateType, place: int, goal_leaf: int) -> Tree:
         goal_leaf: the number of the end state with the goal.
     """
     graph = task.graph
-    goal, below = graph.num_decision_states + goal_leaf, place
+    goal = graph.num_decision_states + goal_leaf
+    below = place
     while below < graph.num_decision_states:
         below = graph.branching_factor * below + 1
     layout = lay_out(graph, [goal, below], MOST_BRANCHES)

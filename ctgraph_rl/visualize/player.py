@@ -33,7 +33,8 @@ class Player:
         greedy: bool = True,
         curriculum: Curriculum | None = None,
     ) -> None:
-        self.task, self.seed = task, seed
+        self.task = task
+        self.seed = seed
         self.env = CTGraphEnv([task], seed) if curriculum is None else make_env(curriculum, [task], seed)
         self.policy = policy(self.env) if isinstance(policy, type) else policy
         self.memory = TensorDict(batch_size=[1]) if initial_state is None else initial_state(1)

@@ -14,7 +14,8 @@ HOME, WAIT, DECISION, END, FAIL = StateType
 Key = tuple[StateType, int]
 """A state: its type and its node, the heap index that ``env.node`` gives. Home and fail have node 0."""
 
-HOME_KEY, FAIL_KEY = (HOME, 0), (FAIL, 0)
+HOME_KEY = (HOME, 0)
+FAIL_KEY = (FAIL, 0)
 
 
 class Edge(NamedTuple):

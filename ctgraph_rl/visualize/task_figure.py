@@ -74,15 +74,20 @@ class _TaskPicture:
     """The arguments of `draw_task`, laid out on the axes."""
 
     def __init__(self, axes: Any, task: Task, visits: Counts, policy: PerAction, values: PerAction, ids: bool) -> None:
-        self.axes, self.task, self.visits, self.ids = axes, task, visits, ids
-        self.graph, self.goal = task.graph, task.graph.node_at(task.goal)
+        self.axes = axes
+        self.task = task
+        self.visits = visits
+        self.ids = ids
+        self.graph = task.graph
+        self.goal = task.graph.node_at(task.goal)
         self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
         self.values = {key: [float(value) for value in of] for key, of in values.items()}
         self.layout = lay_out(self.graph, [self.goal, *self._most_visited()])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
         self.places = {state: self._place(state) for state in drawn.states(self.layout, self.waits)}
         self.size, beside = self._sizes()
-        self.has_room, self.has_numbers = beside >= ROOM, beside >= ROOM_FOR_NUMBERS
+        self.has_room = beside >= ROOM
+        self.has_numbers = beside >= ROOM_FOR_NUMBERS
 
     def _most_visited(self) -> list[int]:
         counts = {node: count for (kind, node), count in self.visits.items() if kind == END and node != self.goal}
@@ -104,8 +109,10 @@ class _TaskPicture:
 
     def _sizes(self) -> tuple[float, float]:
         """Return the width of marks and the distance between end states, in points."""
-        box, points = self.axes.get_window_extent(), 72 / self.axes.figure.dpi
-        beside, below = points * box.width / len(self.layout.leaves), points * box.height / (self.height + 2)
+        box = self.axes.get_window_extent()
+        points = 72 / self.axes.figure.dpi
+        beside = points * box.width / len(self.layout.leaves)
+        below = points * box.height / (self.height + 2)
         share = 0.52 if beside >= ROOM else 0.75
         return max(2.0, min(LARGEST_MARK, share * beside, 0.55 * below)), beside
 
@@ -231,7 +238,8 @@ class _TaskPicture:
                 wrong = self._wrong((kind, node))
                 arrow = base | {"linewidth": 0.8 + 2 * sum(_of(self.policy.get((kind, node), ()), wrong))}
                 self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
-                numbers, side = self._numbers((kind, node), wrong), -1 if kind == WAIT else 1  # away from branches
+                numbers = self._numbers((kind, node), wrong)
+                side = -1 if kind == WAIT else 1  # away from branches
                 style = {"va": "top" if kind == WAIT else "bottom", "fontsize": 6, "color": colour(FAIL)}
                 self._note(numbers, place, (0.55 * self.size, 3 * side), **style)
 

@@ -59,7 +59,8 @@ def visits(
         """The policy, with a note of each row's state and action."""
 
         def __init__(self, env: CTGraphEnv) -> None:
-            self.env, self.acts = env, policy(env) if isinstance(policy, type) else policy
+            self.env = env
+            self.acts = policy(env) if isinstance(policy, type) else policy
             self.episode = torch.zeros_like(env.node)
 
         def __call__(self, data: TensorDictBase) -> TensorDictBase:
@@ -79,7 +80,8 @@ def visits(
 
 def _count(task: Task, steps: Tensor, ends: TensorDictBase) -> Visits:
     """Counts of steps, int64 [S, 3] of state type, node and action, and of where episodes ended."""
-    first, leaves = task.graph.num_decision_states, ends["leaf"].flatten().tolist()
+    first = task.graph.num_decision_states
+    leaves = ends["leaf"].flatten().tolist()
     num_actions = max(task.graph.branching_factor, int(steps[:, 2].max())) + 1
     counts: Counter[tuple[StateType, int]] = Counter()
     actions: dict[tuple[StateType, int], list[float]] = {}

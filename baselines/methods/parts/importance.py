@@ -43,7 +43,8 @@ class Importance(Method):
     def __init__(self, coeff: float, heads: str) -> None:
         super().__init__()
         require(*positive(coeff=coeff), *one_of(("auto", "single", "multi"), heads=heads))
-        self.coeff, self.heads_setting = coeff, heads
+        self.coeff = coeff
+        self.heads_setting = heads
         self.needs_task_id = heads == "multi"
         self.heads: Heads | None = None
         if heads != "single":
@@ -114,7 +115,8 @@ class Samples:
 
     def __init__(self, num_frames: int) -> None:
         require(*at_least_one(num_samples=num_frames))
-        self.num_frames, self.num_held = num_frames, 0
+        self.num_frames = num_frames
+        self.num_held = 0
         self.remaining = math.inf
         """Frames of the present batch's first pass that are still to come."""
 
@@ -200,7 +202,8 @@ class SampledImportance(Importance):
 
     def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
         """Return the sum of the terms of all samples, [P] each, divided by the number of frames."""
-        total, frames = torch.zeros_like(self.importance), 0
+        total = torch.zeros_like(self.importance)
+        frames = 0
         for item in self.samples.items():
             for term in terms(item):
                 total += term

@@ -65,8 +65,12 @@ class TaskEmbeddings:
         require(*at_least_one(**counts, buffer_size=buffer_size, num_quantiles=num_quantiles))
         message = f"buffer_size must be at least num_samples={num_samples}, or no task is embedded, got {buffer_size}"
         require((buffer_size >= num_samples, message))
-        self.embedding, self.num_samples, self.buffer_size = embedding, num_samples, buffer_size
-        self.num_references, self.num_directions, self.num_quantiles = num_references, num_directions, num_quantiles
+        self.embedding = embedding
+        self.num_samples = num_samples
+        self.buffer_size = buffer_size
+        self.num_references = num_references
+        self.num_directions = num_directions
+        self.num_quantiles = num_quantiles
         self.of_slot: dict[int, Tensor] = {}
         """Embeddings of norm 1, float32 [Z]."""
 
@@ -164,7 +168,8 @@ class SelectedMasks(MaskLC):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        self.generator, self.curriculum = own_generator(), curriculum
+        self.generator = own_generator()
+        self.curriculum = curriculum
         self.of_id = {number: task for task, number in curriculum.task_ids.items()}
         self.num_actions = most_actions(curriculum.tasks)
         for name in ("community", "places", "offsets"):

@@ -39,7 +39,8 @@ class SelfLabelled:
     """
 
     def __init__(self, method: Method, detector: Detector) -> None:
-        self.method, self.detector = method, detector
+        self.method = method
+        self.detector = detector
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:
         """Return the curriculum, whose ids are hidden.
@@ -47,7 +48,9 @@ class SelfLabelled:
         Raises:
             ValueError: if there is nothing to detect, or the method needs more than labels.
         """
-        how, detector, method = curriculum.protocol, type(self.detector).__name__, type(self.method).__name__
+        how = curriculum.protocol
+        detector = type(self.detector).__name__
+        method = type(self.method).__name__
         hidden = how.boundaries == "hidden" or self.detector.is_oracle
         several = [number for number, block in enumerate(curriculum.blocks, 1) if len(set(block.tasks)) > 1]
         reads = getattr(self.method, "reads_tasks", "")
@@ -93,7 +96,8 @@ class SelfLabelled:
         Raises:
             ValueError: if agent, method and detector do not fit together.
         """
-        detector, name = self.detector, type(self.detector).__name__
+        detector = self.detector
+        name = type(self.detector).__name__
         shape = curriculum.tasks[0].observation_shape
         missing = "features" in detector.needs and trunk_of(agent.policy) is None
         fix = "its policy has no trunk with `over_time`, as those of baselines have"
@@ -143,8 +147,10 @@ class SelfLabelledAgent(nn.Module):
     def __init__(self, learner: Agent, detector: Detector, policy: nn.Module, max_labels: int) -> None:
         super().__init__()
         self.learner: Any = learner
-        self.detector, self.max_labels = detector, max_labels
-        self.num_envs, self.num_steps = learner.num_envs, learner.num_steps
+        self.detector = detector
+        self.max_labels = max_labels
+        self.num_envs = learner.num_envs
+        self.num_steps = learner.num_steps
         object.__setattr__(self, "_trunk", trunk_of(policy))  # a part of the agent, which holds it
         self.label = 0
         """The label that acts, and unless labels are tried learns."""
@@ -218,7 +224,8 @@ class SelfLabelledAgent(nn.Module):
     @torch.no_grad()
     def _seen(self, batch: TensorDictBase) -> Seen:
         """Return what the detector sees of a batch."""
-        after, needs = batch["next"], self.detector.needs
+        after = batch["next"]
+        needs = self.detector.needs
         given = {
             "action": batch["action"],
             "is_init": batch["is_init"].squeeze(-1),
@@ -240,8 +247,10 @@ class SelfLabelledAgent(nn.Module):
 
     def _resume(self, label: int) -> None:
         """Learn the label that has started."""
-        self.label, self.num_labels = label, max(self.num_labels, label + 1)
-        self.home, self.waiting = None, []
+        self.label = label
+        self.num_labels = max(self.num_labels, label + 1)
+        self.home = None
+        self.waiting = []
         self.detector.start_label(label, trial=False)
         self.snapshots = []
         if self.detector.snapshot_every is not None:
@@ -264,7 +273,8 @@ class SelfLabelledAgent(nn.Module):
         self.snapshots = self.snapshots[:1]
         self._restore()
         self.learner.end_task()
-        self.home, self.waiting = self.label, list(range(self.num_labels))
+        self.home = self.label
+        self.waiting = list(range(self.num_labels))
         self._try_next()
         return undone
 
@@ -284,7 +294,8 @@ class SelfLabelledAgent(nn.Module):
     def _try_next(self) -> None:
         """Try the next label; after the last one open a new one, if there is room."""
         if self.waiting:
-            self.label, self.num_tried = self.waiting.pop(0), 0
+            self.label = self.waiting.pop(0)
+            self.num_tried = 0
             self.learner.start_task(self.label)
             self.detector.start_label(self.label, trial=True)
         else:
@@ -308,7 +319,8 @@ class SelfLabelledAgent(nn.Module):
         """Restore what `get_extra_state` returned."""
         for name in STATE:
             setattr(self, name, state[name])
-        self.waiting, self.snapshots = list(state["waiting"]), deepcopy(state["snapshots"])
+        self.waiting = list(state["waiting"])
+        self.snapshots = deepcopy(state["snapshots"])
         self.detector.load_state_dict(state["detector"])
 
 

@@ -96,7 +96,8 @@ def _file(name: str, content: str) -> dict[str, Any]:
 
 def _records(name: str, columns: Columns, key: str, first: str) -> dict[str, Any]:
     """Return the records of a file, with a field for each column."""
-    records, home = name.partition(".")[0], first.partition(".")[0]
+    records = name.partition(".")[0]
+    home = first.partition(".")[0]
     fields = []
     for column, (kind, meaning) in columns.items():
         own: dict[str, Any] = {

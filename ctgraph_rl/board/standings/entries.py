@@ -159,11 +159,13 @@ def entry_of(submission: Submission) -> Entry:
     Raises:
         ValueError: if it is for no track, or not of the track that it names, and for values that no metric has.
     """
-    track, name = submission.track, submission.method["name"]
+    track = submission.track
+    name = submission.method["name"]
     require((track is not None, f"{name} is for no track: name one in {METHOD}, or submit with --track"))
     assert track is not None
     variant = track.variant_of(submission.curriculum)
-    found, own = submission.curriculum.fingerprint, replace(track, version=track_version(submission.method))
+    found = submission.curriculum.fingerprint
+    own = replace(track, version=track_version(submission.method))
     other = "" if own.version == track.version else f"; it was submitted to {own.id}: use a package that has it"
     require(
         (variant is not None, f"the curriculum (fingerprint {found}) is none of track {track.id}{other}"),

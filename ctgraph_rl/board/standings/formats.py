@@ -49,7 +49,8 @@ class Column(NamedTuple):
 
 def columns(line: Standing) -> list[Column]:
     """Return the cells of a line."""
-    entry, compute = line.entry, line.entry.method["compute"]
+    entry = line.entry
+    compute = line.entry.method["compute"]
     per_task = entry.method["bytes_per_task"]
     numbers = [_measure(name, estimate) for name, estimate in line.estimates.items()]
     n = str(line.score).rpartition(" n = ")[2]
@@ -93,7 +94,8 @@ def notes(table: Table) -> list[str]:
 
 def facts(table: Table) -> list[tuple[str, str]]:
     """Return what a table's tasks allow, with the budget and the seeds."""
-    curriculum, seeds = table.variant.curriculum, table.track.seeds
+    curriculum = table.variant.curriculum
+    seeds = table.track.seeds
     whole = seeds == tuple(range(seeds[0], seeds[-1] + 1))
     about = [
         ("curriculum", f"{curriculum.name}, fingerprint {curriculum.fingerprint}"),
@@ -189,7 +191,8 @@ def entries_csv(tables: Sequence[Table]) -> str:
 
 
 def _entry_cells(table: Table, line: Standing) -> Iterator[Any]:
-    entry, score = line.entry, line.score
+    entry = line.entry
+    score = line.score
     yield from (entry.id, entry.name, table.track.id, table.variant.rung, table.variant.given)
     yield from (table.variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
     yield from (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
@@ -214,7 +217,8 @@ def as_json(tables: Sequence[Table]) -> dict[str, Any]:
 
 
 def _json(table: Table) -> dict[str, Any]:
-    track, variant = table.track, table.variant
+    track = table.track
+    variant = table.variant
     return {
         "track": {"name": track.name, "version": track.version, "measures": track.measures},
         "breakthrough": track.breakthrough,
@@ -279,7 +283,8 @@ def model_index(tables: Sequence[Table]) -> str:
 
 def _result(table: Table, line: Standing) -> dict[str, Any]:
     """Return the result of an entry: task, data set, metrics and source."""
-    variant, method = table.variant, line.entry.method
+    variant = table.variant
+    method = line.entry.method
     named = {name: estimate for name, estimate in line.estimates.items() if estimate.value is not None}
     return {
         "task": dict(TASK),

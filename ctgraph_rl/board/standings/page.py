@@ -64,7 +64,8 @@ def write_board(
     _require_packages()
     entries, problems = read_entries(paths, config_dir)
     require((bool(entries), "; ".join(problem.reason for problem in problems)))
-    made, folder = tables(entries), made_folder(Path(folder))
+    made = tables(entries)
+    folder = made_folder(Path(folder))
     data = {
         "entries.csv": (formats.entries_csv(made), formats.ENTRY_COLUMNS),
         "scores.csv": (formats.scores_csv(made), formats.SCORE_COLUMNS),

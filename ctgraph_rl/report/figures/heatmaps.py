@@ -48,8 +48,10 @@ def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFi
 
 def draw_matrices(section: Section, result: Result) -> Any:
     """Performance and transfer side by side; below each other where there are many tasks."""
-    performance, transfer = result.performance(), result.transfer()
-    tasks, rows = len(performance[0]), len(performance)
+    performance = result.performance()
+    transfer = result.transfer()
+    tasks = len(performance[0])
+    rows = len(performance)
     beside = tasks <= MOST_NUMBERS
     height = min(1.3 + 0.34 * rows, 6.0) if beside else min(1.2 + 0.22 * rows, 6.5)
     figure = new_figure(WIDTH, height if beside else 2 * height)
@@ -63,7 +65,8 @@ def draw_performance(axes: Any, matrix: Matrix, labels: Sequence[str], trained: 
     """The performance matrix on a scale from 0, or the lowest value, to 1, or the highest; row 0 is untrained."""
     values = _values(matrix)
     known = [value for row in values for value in row if not math.isnan(value)]
-    low, high = min([0.0, *known]), max([1.0, *known])
+    low = min([0.0, *known])
+    high = max([1.0, *known])
     image = _show(axes, values, "viridis", low, high)
     _name(axes, labels, len(values), 0)
     _write(axes, matrix, image, "")

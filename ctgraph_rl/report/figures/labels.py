@@ -54,7 +54,8 @@ def draw_labels(section: Section) -> Any:
         spans = run.history.spans if run.history else ()
         of_label = dict(_tasks_of_labels(spans, blocks))
         for span in spans:
-            colour, place = _colour(of_label.get(span.label)), (span.start, span.end)
+            colour = _colour(of_label.get(span.label))
+            place = (span.start, span.end)
             look: dict[str, Any] = {
                 "colour": colour,
                 "room": section.ends[-1],

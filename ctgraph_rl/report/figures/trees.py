@@ -88,7 +88,9 @@ def find_trees(run: Run) -> Trees:
 
 
 def _visits(trained: Trained, task: Any, seed: int) -> Visits:
-    curriculum, state = trained.curriculum, trained.agent.initial_state
+    curriculum = trained.curriculum
+    state = trained.agent.initial_state
     per_row = curriculum.evaluation.episodes_per_row
-    episodes, policy = per_row * math.ceil(EPISODES / per_row), trained.policy_for(task)
+    episodes = per_row * math.ceil(EPISODES / per_row)
+    policy = trained.policy_for(task)
     return visits(task, policy, state, episodes, seed, episodes_per_row=per_row, curriculum=curriculum)

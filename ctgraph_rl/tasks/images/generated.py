@@ -149,7 +149,8 @@ class GroupedImages(SquareImages):
 @lru_cache(maxsize=16)
 def _paper_images(image_set: PaperImages) -> Tensor:
     """The first different images of the seed's sequence of candidates."""
-    candidates, images = image_set.num_images, None
+    candidates = image_set.num_images
+    images = None
     while images is None or len(images) < image_set.num_images:
         needed = candidates * (_BYTES_OF_A_PIXEL * image_set.size**2 + _BYTES_OF_A_BLUEPRINT)
         require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
@@ -181,8 +182,10 @@ def _render(blueprints: Tensor, size: int) -> Tensor:
 @lru_cache(maxsize=16)
 def _grouped_images(image_set: GroupedImages) -> Tensor:
     """Each group's first candidates that repeat none of any group, where candidate k of all groups precedes k + 1."""
-    groups, cells = image_set.groups, image_set.cells
-    candidates, chosen = max(groups), [torch.empty(0, dtype=torch.int64, device="cpu")]
+    groups = image_set.groups
+    cells = image_set.cells
+    candidates = max(groups)
+    chosen = [torch.empty(0, dtype=torch.int64, device="cpu")]
     while any(len(positions) < size for positions, size in zip(chosen, groups, strict=False)):
         needed = candidates * len(groups) * cells**2 * _BYTES_OF_A_CELL
         require_memory(f"{image_set.num_images:,} images while they are made", needed, "images")
@@ -196,7 +199,8 @@ def _grouped_images(image_set: GroupedImages) -> Tensor:
 
 def _candidates(image_set: GroupedImages, count: int) -> Tensor:
     """int64 [count, G, c * c]: levels of the first candidates of each group."""
-    seed, cells = image_set.seed, image_set.cells
+    seed = image_set.seed
+    cells = image_set.cells
     kept_by_image = 1 - image_set.within / UNRELATED  # (1 - s_i)^2
     kept_by_both = 1 - image_set.between / UNRELATED
     group_share = 1 - math.sqrt(kept_by_both / kept_by_image) if kept_by_image else 0.0

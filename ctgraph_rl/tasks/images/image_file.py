@@ -60,7 +60,8 @@ class ImageFile:
         return cls(str(path), _sha256(str(path)), size)
 
     def _hash_rule(self) -> tuple[bool, str]:
-        found, fix = _sha256(self.path), f"if that is the content you mean, ImageFile.of({self.path!r}) fills it in"
+        found = _sha256(self.path)
+        fix = f"if that is the content you mean, ImageFile.of({self.path!r}) fills it in"
         return found == self.sha256, f"sha256 of {self.path} must be {self.sha256!r}, but the file has {found!r}; {fix}"
 
     @property

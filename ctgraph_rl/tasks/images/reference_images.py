@@ -149,9 +149,12 @@ def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
     y, x = _sources(images.shape[-1], degrees)
     border = images.shape[-1] // 2  # no pixel comes from farther outside
     padded = np.pad(images, ((0, 0), (border, border), (border, border)))
-    above, left = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
-    down, right = y - above, x - left
-    rows, columns = above + border, left + border
+    above = np.floor(y).astype(np.int64)
+    left = np.floor(x).astype(np.int64)
+    down = y - above
+    right = x - left
+    rows = above + border
+    columns = left + border
     upper, lower = (
         (1 - right) * padded[:, row, columns] + right * padded[:, row, columns + 1] for row in (rows, rows + 1)
     )
@@ -164,8 +167,10 @@ def _rotate(images: np.ndarray, degrees: int) -> np.ndarray:
 @lru_cache(maxsize=_ANGLES)
 def _sources(size: int, degrees: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns in the image that the pixels of the rotated one come from, float64 [r, r] each."""
-    angle, centre = math.radians(degrees), (size - 1) / 2
-    cos, sin = math.cos(angle), math.sin(angle)
+    angle = math.radians(degrees)
+    centre = (size - 1) / 2
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     y, x = np.mgrid[:size, :size].astype(np.float64)
     first_x = _fused(sin, centre, -cos * centre) + centre
     first_y = _fused(-cos, centre, -sin * centre) + centre

@@ -66,7 +66,8 @@ class GymTask:
         object.__setattr__(self, "wrappers", wrappers)
         object.__setattr__(self, "return_range", as_tuple(self.return_range))
         names = isinstance(wrappers, tuple) and all(isinstance(each, str) and ":" in each for each in wrappers)
-        limit, pair = self.max_episode_steps, self.return_range
+        limit = self.max_episode_steps
+        pair = self.return_range
         in_order = isinstance(pair, tuple) and len(pair) == 2 and is_real(pair[0]) and is_real(pair[1], pair[0])
         require(
             (isinstance(self.id, str) and bool(self.id), f"id must be the id of an environment, got {self.id!r}"),
@@ -147,7 +148,8 @@ class GymTask:
         except Exception as error:  # of an environment of anyone
             raise ValueError(f"GymTask({self.id!r}) cannot be made: {type(error).__name__}: {error}") from error
         flatten = "add the wrapper gymnasium.wrappers:FlattenObservation, or one of your own"
-        shown, actions = env.observation_space, env.action_space
+        shown = env.observation_space
+        actions = env.action_space
         require(
             (limit is not None, f"{self.id} has no time limit, so an episode may never end: give max_episode_steps"),
             (_is_shown(shown), f"{self.id} shows {shown}, which cannot be stacked as images or vectors: {flatten}"),
