@@ -229,6 +229,29 @@ class RunLog:
         """Measurements of one kind, in order."""
         return [measurement for measurement in self.measurements if measurement["kind"] == kind]
 
+    def rows(self, kind: str) -> Iterator[dict[str, Any]]:
+        """Yield the measurements of a kind, after the curriculum, the fingerprint and the seed of the run."""
+        about = (self.of_kind("run") or [{}])[0]
+        run = {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint")}
+        run["seed"] = (about.get("config") or {}).get("seed")
+        for measurement in self.of_kind(kind):
+            yield {**run, **{name: value for name, value in measurement.items() if name != "kind"}}
+
+    def to_pandas(self, kind: str = "evaluation") -> Any:
+        """Return the measurements of a kind as a ``pandas.DataFrame``, one row each; see `rows`.
+
+        Args:
+            kind: ``evaluation`` or ``training``.
+
+        Raises:
+            ModuleNotFoundError: without pandas.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("RunLog.to_pandas needs pandas: pip install pandas") from error
+        return pandas.DataFrame(list(self.rows(kind)))
+
     def performance(self, num_tasks: int = 0) -> Tensor:
         """The performance matrix: mean return, float64 [blocks + 1, tasks]; NaN where not, or not yet, evaluated.
 

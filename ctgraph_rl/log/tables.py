@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.disk import write_whole
+from ctgraph_rl.disk import write_named, write_whole
 from ctgraph_rl.log.escape import csv_text, utf8_text
 from ctgraph_rl.log.run_log import RunLog
 
@@ -106,6 +106,41 @@ def evaluations_parquet(logs: Iterable[RunLog]) -> bytes:
     return _parquet(arrow, types, [row for log in logs for row in _rows(log, "evaluation", list(types))])
 
 
+def check_table(path: Path) -> None:
+    """Refuse a file of evaluations that `write_evaluations` cannot write.
+
+    Raises:
+        ValueError: for another ending than ``.csv`` and ``.parquet``.
+        ModuleNotFoundError: for Parquet without pyarrow; names the extra to install.
+    """
+    require((path.suffix in (".csv", ".parquet"), f"a table of evaluations ends in .csv or .parquet, got {path}"))
+    if path.suffix == ".parquet":
+        require_parquet()
+
+
+def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> None:
+    """Write the evaluations of many runs as one table, in CSV or Parquet by the ending of its name.
+
+    Args:
+        path: the file.
+        runs: agent, directory and log of each; agent and directory are the first two columns.
+
+    Raises:
+        ValueError, ModuleNotFoundError: as `check_table`.
+    """
+    check_table(path)
+    types: dict[str, str] = {}
+    for _, _, log in runs:
+        types |= _types(log, "evaluation", EVALUATIONS)
+    names = list(types)
+    rows = [[agent, place, *row] for agent, place, log in runs for row in _rows(log, "evaluation", names)]
+    columns = {"agent": "string", "run": "string", **types}
+    if path.suffix == ".csv":
+        write_named(path, csv_text([list(columns), *rows]))
+    else:
+        write_named(path, _parquet(_pyarrow(needed=True), columns, rows))
+
+
 def require_parquet() -> None:
     """Refuse work that needs pyarrow where it is not installed.
 
@@ -124,11 +159,7 @@ def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[
 
 
 def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
-    about = (log.of_kind("run") or [{}])[0]
-    run = {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint")}
-    run["seed"] = (about.get("config") or {}).get("seed")
-    for measurement in log.of_kind(kind):
-        row = {**run, **measurement}
+    for row in log.rows(kind):
         yield [row.get(name) for name in names]
 
 

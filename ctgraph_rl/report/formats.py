@@ -25,23 +25,41 @@ WIDTH = 80
 """Characters of a line on a terminal."""
 
 MEANS = "mean [95 % interval]"
-LEGEND = f"{MEANS}, solved seeds and median times [exact 95 % interval]"
+_EXACT = "solved seeds and median times [exact 95 % interval]"
+LEGEND = f"{MEANS}, {_EXACT}"
+
+LEGENDS = {
+    "exact": LEGEND,
+    "t": f"mean [Student's 95 % interval], {_EXACT}",
+    "std": f"mean ± standard deviation over seeds, {_EXACT}",
+    "iqm": f"interquartile mean [bootstrap 95 % interval], {_EXACT}",
+    "seeds": "each run alone",
+}
+"""What the numbers of a table are, by `ctgraph_rl.report.results.STATISTICS`, and of a table of single runs."""
+
+WHY_EXACT = (
+    "--statistics exact: few seeds of bounded values need wider intervals than Student's or a bootstrap's; "
+    "t, std and iqm show those."
+)
 
 
-def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return the table for a terminal: under each curriculum and agent a line for each measure."""
-    return "\n\n".join([LEGEND, *(_text(page, modified.get(page.curriculum)) for page in pages(rows))])
+    head = textwrap.fill(legend, WIDTH)
+    if legend == LEGEND:
+        head += "\n" + textwrap.fill(WHY_EXACT, WIDTH)
+    return "\n\n".join([head, *(_text(page, modified.get(page.curriculum)) for page in pages(rows))])
 
 
-def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return a table in Markdown for each curriculum."""
-    return "\n\n".join(_markdown(page, modified.get(page.curriculum)) for page in pages(rows))
+    return "\n\n".join(_markdown(page, modified.get(page.curriculum), legend) for page in pages(rows))
 
 
-def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED) -> str:
+def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return a table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
     labels = Labels()
-    tables = (as_latex(each, labels, modified.get(each.curriculum)) for each in matrices(rows))
+    tables = (as_latex(each, labels, modified.get(each.curriculum), legend) for each in matrices(rows))
     return "\n\n".join([PREAMBLE, *tables])
 
 
@@ -49,12 +67,12 @@ def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
     """Return the table of agents and measures of each curriculum; the first column is the agents' number of seeds."""
     for curriculum in dict.fromkeys(row.curriculum for row in rows):
         its = [row for row in rows if row.curriculum == curriculum]
-        cells = {(row.agent, measure_name(row.measure)): row for row in its if row.measure != NO_RUN_FINISHED}
+        cells = {(row.shown, measure_name(row.measure)): row for row in its if row.measure != NO_RUN_FINISHED}
         notes = list(dict.fromkeys(row.note for row in its if row.note))
         measures = list(dict.fromkeys(measure for _, measure in cells))
         agents = {
-            agent: _seeds([row for row in its if row.agent == agent])
-            for agent in dict.fromkeys(row.agent for row in its)
+            agent: _seeds([row for row in its if row.shown == agent])
+            for agent in dict.fromkeys(row.shown for row in its)
         }
         lines = [
             (agent, (Cell(n), *(_as_cell(cells.get((agent, measure)), notes) for measure in measures)))
@@ -82,15 +100,15 @@ def measure_name(measure: str) -> str:
     return measure.replace("_", " ")
 
 
-def as_latex(matrix: Matrix, labels: Labels, modified: str | None = None) -> str:
+def as_latex(matrix: Matrix, labels: Labels, modified: str | None = None, legend: str = LEGEND) -> str:
     """Return the table of agents and measures of a curriculum in LaTeX."""
     what = f" Modified: {modified}." if modified else ""
-    caption = f"{matrix.curriculum}: {LEGEND}; n: seeds with a value / seeds expected.{what}"
+    caption = f"{matrix.curriculum}: {legend}; n: seeds with a value / seeds expected.{what}"
     label = labels.new(matrix.curriculum, "measures")
     return latex_table(Table(caption, label, "agent", matrix.head, rows=matrix.rows, notes=matrix.notes))
 
 
-FORMATS: dict[str, Callable[[Sequence[Row], Modified], str]] = {"text": text, "markdown": markdown, "latex": latex}
+FORMATS: dict[str, Callable[[Sequence[Row], Modified, str], str]] = {"text": text, "markdown": markdown, "latex": latex}
 SENTENCES: dict[str, Callable[[str], str]] = {
     **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
 }
@@ -134,7 +152,7 @@ def pages(rows: Sequence[Row]) -> Iterator[Page]:
 def _line(row: Row, notes: list[str]) -> Line:
     value, _, n = str(row.estimate).partition(" n = ")
     mark = str(notes.index(row.note) + 1) if row.note else ""
-    return Line(row.agent, measure_name(row.measure), value, n, mark)
+    return Line(row.shown, measure_name(row.measure), value, n, mark)
 
 
 def _text(page: Page, modified: str | None) -> str:
@@ -159,10 +177,10 @@ def _text(page: Page, modified: str | None) -> str:
     return "\n".join(shown)
 
 
-def _markdown(page: Page, modified: str | None) -> str:
+def _markdown(page: Page, modified: str | None, legend: str) -> str:
     columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
     about = ["", f"Modified: {markdown_text(modified)}"] if modified else []
-    head = [f"### {markdown_text(page.curriculum)}", *about, "", LEGEND, "", *columns]
+    head = [f"### {markdown_text(page.curriculum)}", *about, "", legend, "", *columns]
     lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
     notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
     return "\n".join([*head, *lines, *([""] if notes else []), *notes])

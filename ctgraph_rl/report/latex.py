@@ -129,8 +129,9 @@ def _value(cell: Cell) -> str:
 
 
 def signed(value: str) -> str:
-    """Return numbers with minus signs and infinities as formulas, and a dash for none."""
-    return "--" if value == "-" else value.replace("-", "$-$").replace("inf", r"$\infty$")
+    """Return numbers with minus, plus-minus and infinity as formulas, and a dash for none."""
+    formula = value.replace("-", "$-$").replace("inf", r"$\infty$").replace("±", r"$\pm$")
+    return "--" if value == "-" else formula
 
 
 def letters(number: int) -> str:

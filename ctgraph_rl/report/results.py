@@ -1,6 +1,6 @@
 """Many runs as one table: each agent on each curriculum, with intervals over seeds.
 
-``ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--format latex] [--csv FILE]``
+``ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--statistics std] [--per-seed] [--csv FILE]``
 
 Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
 undefined metric is counted, as in n = 9/10. What cannot be read is named and left out, and runs of one configuration
@@ -22,10 +22,13 @@ from ctgraph_rl import metrics
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
-from ctgraph_rl.report.formats import FORMATS, NO_RUN_FINISHED, SENTENCES
+from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.names import AGENT_OPTION, displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.report.terminal import print_problems
@@ -62,7 +65,18 @@ AT_END = {
 }
 """Measures of how tasks ended, by the first word of their name; the others are metrics of runs."""
 
-HEADER = ("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note")
+HEADER = (
+    *("curriculum", "agent", "measure", "value", "low", "high", "n", "n_undefined", "method", "definition", "note"),
+    *("std", "seed"),
+)
+
+STATISTICS = {
+    "exact": "intervals that hold for few seeds of bounded values, where the others are too narrow",
+    "t": "Student's intervals of means",
+    "std": "standard deviations over seeds",
+    "iqm": "interquartile means with rliable's stratified bootstrap",
+}
+"""What means over seeds are shown with; times are medians and solved seeds are shares with exact intervals in all."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +90,7 @@ class Row:
         estimate: over seeds.
         definition: id of the metric's definition.
         note: why seeds have no value.
+        seed: of the run that it is of; None for all seeds.
     """
 
     curriculum: str
@@ -84,16 +99,46 @@ class Row:
     estimate: Estimate
     definition: str
     note: str
+    seed: int | None = None
+
+    @property
+    def shown(self) -> str:
+        """The agent, and the seed of a row of one run."""
+        return self.agent if self.seed is None else f"{self.agent}, seed {self.seed}"
 
 
-def table(runs: Sequence[Run]) -> list[Row]:
-    """Every metric, and how tasks ended, for each agent on each curriculum."""
-    found, bounds = grouped(runs), bounds_by_curriculum(runs)
-    lines = {
-        (name, agent): (*_metrics(by_seed, bounds[name]), *_at_the_end(by_seed, bounds[name]))
-        for (name, agent), by_seed in found.items()
-    }
-    return [Row(name, agent, *line) for (name, agent), of_agent in lines.items() for line in of_agent]
+def table(runs: Sequence[Run], statistics: str = "exact") -> list[Row]:
+    """Every metric, and how tasks ended, for each agent on each curriculum.
+
+    Args:
+        runs: finished or not.
+        statistics: one of `STATISTICS`.
+    """
+    bounds = bounds_by_curriculum(runs)
+    rows = []
+    for (name, agent), by_seed in grouped(runs).items():
+        lines = (*_metrics(by_seed, bounds[name], statistics), *_at_the_end(by_seed, bounds[name], statistics))
+        rows += [Row(name, agent, *line) for line in lines]
+    return rows
+
+
+def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
+    """Every metric, and how tasks ended, of each run, without intervals."""
+    bounds = bounds_by_curriculum(runs)
+    rows = []
+    for (name, agent), by_seed in grouped(runs).items():
+        for seed, run in by_seed.items():
+            alone = {seed: run}
+            lines = (*_metrics(alone, bounds[name], "std"), *_at_the_end(alone, bounds[name], "std"))
+            every = [Row(name, agent, *line, seed=seed) for line in lines]
+            rows += [_without_interval(row) for row in every if row.measure != "interquartile_return"]
+    return rows
+
+
+def _without_interval(row: Row) -> Row:
+    """Return the row of a run without what only several seeds have."""
+    estimate = replace(row.estimate, low=None, high=None, method="one run", reason=None)
+    return replace(row, estimate=estimate, note="" if estimate.n else row.note)
 
 
 def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
@@ -123,13 +168,14 @@ def _pairs(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Compa
     return pairs
 
 
-def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Row]:
+def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequence[str] = ()) -> list[Row]:
     """The rows of some measures; agents none of whose runs finished stay.
 
     Args:
         rows: the whole table.
         names: of measures, ``solved`` for all tasks' shares; None: `SHOWN`, and `WHERE_KNOWN` where a run
             of the curriculum has a value.
+        also: measures that are shown with `SHOWN`.
 
     Raises:
         ValueError: for a name that no row has; lists those that there are.
@@ -139,7 +185,8 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None) -> list[Ro
     message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
     require((not choices or not unknown, message))
     with_value = {(row.curriculum, row.measure) for row in rows if row.measure in WHERE_KNOWN and row.estimate.n}
-    always, further = (*(SHOWN if names is None else names), NO_RUN_FINISHED), with_value if names is None else ()
+    always = (*SHOWN, *also, NO_RUN_FINISHED) if names is None else (*names, NO_RUN_FINISHED)
+    further = with_value if names is None else ()
     return [row for row in rows if row.measure.split(" ")[0] in always or (row.curriculum, row.measure) in further]
 
 
@@ -151,10 +198,22 @@ def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
 def _cells(row: Row) -> list[Any]:
     e = row.estimate
     numbers = (e.value, e.low, e.high, e.n, e.n_undefined, e.method)
-    return [row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note]
+    return [row.curriculum, row.agent, row.measure, *numbers, row.definition, row.note, e.std, row.seed]
 
 
-def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
+def write_tidy(path: Path, runs: Sequence[Run]) -> None:
+    """Write every evaluation of runs as a row of one table, in CSV or Parquet by the ending of its name.
+
+    Raises:
+        ValueError: for another ending.
+        ModuleNotFoundError: for Parquet without pyarrow.
+    """
+    known = [(agent, run) for (_, agent), of in grouped(runs).items() for run in of.values() if run is not None]
+    logs = [(agent, str(run.path), RunLog.read(run.path / LOG)) for agent, run in known if run.history is not None]
+    write_evaluations(path, logs)
+
+
+def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """A line for each metric; one for all if no run finished."""
     present = [run for run in by_seed.values() if run is not None]
     if not any(run.metrics for run in present):
@@ -162,15 +221,26 @@ def _metrics(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estim
         yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
     for metric in dict.fromkeys(metric for run in present for metric in run.metrics):
         definition = next(run.metrics[metric]["definition"] for run in present if metric in run.metrics)
-        estimate = _estimate(by_seed, metric, bounds)
+        estimate = _estimate(by_seed, metric, bounds, kind)
         yield metric, estimate, definition, _note(by_seed, metric, estimate)
 
 
-def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns) -> Estimate:
+def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
     """Return a metric over seeds; a time as its median, infinite for a seed that never got there."""
     if metric in metrics.METRICS and metrics.METRICS[metric].is_time:
         return statistics.median_time([_time(run, metric) for run in by_seed.values()])
-    return mean([_value(run, metric) for run in by_seed.values()], bounds=bounds.of_metric(metric))
+    return _over_seeds([_value(run, metric) for run in by_seed.values()], bounds.of_metric(metric), kind)
+
+
+def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
+    """Return the values of seeds as one number, by one of `STATISTICS`."""
+    if kind == "t":
+        return mean(values)
+    if kind == "std":
+        return statistics.mean_and_std(values)
+    if kind == "iqm":
+        return statistics.iqm([values])
+    return mean(values, bounds=bounds)
 
 
 def _time(run: Run | None, metric: str) -> float | None:
@@ -178,27 +248,30 @@ def _time(run: Run | None, metric: str) -> float | None:
     return math.inf if never else _value(run, metric)
 
 
-def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
+def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
     if any(run is not None and run.tasks for run in by_seed.values()):
-        yield from _over_tasks(by_seed, bounds)
+        yield from _over_tasks(by_seed, bounds, kind)
     tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
     if tasks:
         returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
-        estimate = statistics.interquartile_mean(returns, bounds=bounds.of_returns)
+        if kind == "iqm":
+            estimate = statistics.iqm(returns)
+        else:
+            estimate = statistics.interquartile_mean(returns, bounds=bounds.of_returns)
         yield _ended("interquartile_return", estimate, by_seed)
     for task in tasks:
         estimate = statistics.solved_rate([_solved(run, task) for run in by_seed.values()])
         yield _ended(f"solved {task}", estimate, by_seed)
 
 
-def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns) -> Iterator[tuple[str, Estimate, str, str]]:
+def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
     runs = by_seed.values()
     returns = [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in runs]
-    yield _ended("mean_final_return", mean(returns, bounds=bounds.of_returns), by_seed)
+    yield _ended("mean_final_return", _over_seeds(returns, bounds.of_returns, kind), by_seed)
     solved = [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in runs]
-    yield _ended("solved_rate", mean(solved, bounds=(0.0, 1.0)), by_seed)
+    yield _ended("solved_rate", _over_seeds(solved, (0.0, 1.0), kind), by_seed)
 
 
 def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Estimate, str, str]:
@@ -249,15 +322,22 @@ def main() -> None:
         parser.error("--difference is of the metric that --compare names; give both")
     with refused_by(parser):
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
+        if arguments.tidy is not None:
+            check_table(arguments.tidy)
         runs, problems = find_runs(arguments.runs)
         require((bool(runs), "; ".join(problem.reason for problem in problems)))
         runs = displayed(runs, arguments.agent)
         pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
-        rows = table(runs)
+        rows = rows_by_seed(runs) if arguments.per_seed else table(runs, arguments.statistics)
         names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
-        print(FORMATS[arguments.format](rows if arguments.all else selected(rows, names), modifications(runs)))
+        also = ["interquartile_return"] if arguments.statistics == "iqm" else []
+        shown = rows if arguments.all else selected(rows, names, also)
+        kind = "seeds" if arguments.per_seed else arguments.statistics
+        print(FORMATS[arguments.format](shown, modifications(runs), LEGENDS[kind]))
         if arguments.csv is not None:
             write_csv(arguments.csv, rows)
+        if arguments.tidy is not None:
+            write_tidy(arguments.tidy, runs)
         for pair, found in pairs.items():
             print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
     if print_problems(problems, runs):
@@ -271,7 +351,14 @@ def _parser() -> argparse.ArgumentParser:
     which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
     which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
     parser.add_argument("--format", choices=FORMATS, default="text", help="of what is printed (default: text)")
+    kinds = "; ".join(f"{kind}: {what}" for kind, what in STATISTICS.items())
+    of_seeds = parser.add_mutually_exclusive_group()
+    of_seeds.add_argument("--statistics", choices=STATISTICS, default="exact", help=f"{kinds} (default: exact)")
+    of_seeds.add_argument("--per-seed", action="store_true", help="show each run alone: a row for each of its measures")
     parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
+    parser.add_argument(
+        "--tidy", type=Path, metavar="FILE", help="also write every evaluation as a row into this .csv or .parquet file"
+    )
     parser.add_argument("--agent", **AGENT_OPTION)
     parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
     parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")

@@ -8,6 +8,9 @@ There is one rule for each kind of number, and ``docs/explanation/statistics.md`
 - A time: the interval of the median by order statistics, where a seed that never got there took infinitely long.
 - A number of two groups' means, such as forward transfer: both groups are weighted at random as in Gaffke's interval.
 
+Beside these are the numbers that other papers show: `mean` without bounds has Student's interval, `mean_and_std` the
+standard deviation, and `iqm` the interquartile mean of rliable.
+
 A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip install 'ctgraph_rl[stats]'``.
 """
 
@@ -26,11 +29,17 @@ from ctgraph_rl.report.intervals import UNBOUNDED, Bounds, gaffke, median_ranks,
 LEVEL = 0.95
 LEAST_FOR_BOOTSTRAP = 10
 RESAMPLES = 10_000
+BATCH = 1000
+"""Bootstrap samples in memory at a time."""
+
 MOST_FLIPPED = 16
 """Pairs up to which all flips of signs are tried."""
 
 ROUNDING = 1e-12
 """Sums that differ by less are equal."""
+
+EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and the interval shows which"
+"""Why an interval has a width though no two seeds differ."""
 
 MOST_SEEDS = 2**20
 """Number of seeds at which `seeds_needed` gives up."""
@@ -51,7 +60,8 @@ class Estimate:
         n: seeds with a value.
         n_undefined: seeds without one.
         method: what the value and the interval are.
-        reason: why value or interval are missing.
+        reason: why value or interval are missing, or why an interval of equal seeds is wide.
+        std: standard deviation over seeds, shown in place of an interval; None for other estimates.
     """
 
     value: float | None
@@ -61,11 +71,14 @@ class Estimate:
     n_undefined: int
     method: str
     reason: str | None = None
+    std: float | None = None
 
     def __str__(self) -> str:
-        """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``."""
+        """Value, interval and seeds, such as ``0.50 [0.25, 0.75] n = 9/10``, or ``0.50 ± 0.10 n = 10``."""
         value = "-" if self.value is None else f"{self.value:z.2f}"
         interval = "" if self.low is None or self.high is None else f" [{self.low:z.2f}, {self.high:z.2f}]"
+        if self.std is not None:
+            interval = f" ± {self.std:.2f}"
         missing = f"/{self.n + self.n_undefined}" if self.n_undefined else ""
         return f"{value}{interval} n = {self.n}{missing}"
 
@@ -122,6 +135,8 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
         reason = "one seed has no interval"
     elif bounded:
         low, high = gaffke(known, limits, level)
+        if min(known) == max(known) and limits.low < limits.high:
+            reason = EQUAL_SEEDS
     elif min(known) == max(known):
         reason = "all seeds are equal: no spread to estimate"
     else:
@@ -129,6 +144,68 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
         lowest, highest, _ = limits if within else UNBOUNDED
         low, high = max(lowest, centre - half), min(highest, centre + half)
     return Estimate(centre, low=low, high=high, n=len(known), n_undefined=missing, method=method, reason=reason)
+
+
+@takes_numbers
+def mean_and_std(values: Values) -> Estimate:
+    """Return the mean with the standard deviation over seeds, with n - 1 in its denominator.
+
+    A standard deviation says how much seeds differ. It is no interval of the mean.
+
+    Args:
+        values: one per seed; None or NaN for a seed without.
+    """
+    known, missing = _known(values)
+    method = "mean, standard deviation over seeds"
+    if not known:
+        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+    std = float(np.std(known, ddof=1)) if len(known) > 1 else None
+    reason = "one seed has no standard deviation" if std is None else None
+    centre = math.fsum(known) / len(known)
+    return Estimate(centre, None, None, len(known), missing, method=method, reason=reason, std=std)
+
+
+@takes_numbers
+def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
+    """Return the interquartile mean with a stratified bootstrap, as rliable defines both (Agarwal et al. 2021).
+
+    The value is `scipy.stats.trim_mean` of a quarter at each side of all values of all tasks together. The interval has
+    the percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task anew, independently of other tasks.
+    Few seeds have intervals that cover less than they say; see `interquartile_mean`.
+
+    Args:
+        values: for each task, one value per seed; None or NaN for a seed without.
+        level: coverage of the interval.
+        resamples: bootstrap samples.
+        seed: of the bootstrap.
+    """
+    stats = scipy("stats")
+    require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
+    require((len(values) > 0, "iqm needs the values of at least one task"))
+    known, missing = zip(*(_known(task) for task in values), strict=True)
+    n, undefined = min(map(len, known)), max(missing)
+    method = f"IQM, percentiles of a stratified bootstrap {level:.0%}"
+    if n == 0:
+        return Estimate(None, None, None, 0, undefined, method=method, reason="no seed has a value")
+    value = float(stats.trim_mean(np.concatenate(known), 0.25))
+    if n == 1:
+        return Estimate(value, None, None, n, undefined, method=method, reason="one seed has no interval")
+
+    def middle(*tasks: np.ndarray, axis: int) -> np.ndarray:
+        return np.asarray(stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis))
+
+    found = stats.bootstrap(
+        known,
+        middle,
+        n_resamples=resamples,
+        batch=BATCH,
+        vectorized=True,
+        confidence_level=level,
+        method="percentile",
+        random_state=np.random.default_rng(seed),
+    )
+    low, high = found.confidence_interval
+    return Estimate(value, low=float(low), high=float(high), n=n, n_undefined=undefined, method=method)
 
 
 @takes_numbers

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import sys
 import textwrap
+import types
 
 import pytest
 from helpers.scripted import Scripted, curriculum, task
@@ -105,3 +106,15 @@ def test_the_columns_are_what_the_loop_logs():
     for kind, columns in (("evaluation", EVALUATIONS), ("training", TRAINING)):
         logged = {name for measurement in log.of_kind(kind) for name in measurement} - {"kind"}
         assert set(columns) - set(tables.RUN) <= logged
+
+
+def test_a_log_is_a_data_frame_where_pandas_is_there(log, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=list))  # it gets a list of rows
+
+    (evaluation,), training = log.to_pandas(), log.to_pandas("training")
+
+    assert (evaluation["curriculum"], evaluation["seed"], evaluation["return_mean"]) == ("two, tasks", 3, 0.25)
+    assert [row["loss"] for row in training] == [0.5, 0.25]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ModuleNotFoundError, match="pip install pandas"):
+        log.to_pandas()

@@ -201,9 +201,67 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
     assert rows[1]["low"] == "" and rows[1]["note"] == "all seeds are equal: no spread to estimate"
 
 
+def shown_by(monkeypatch, capsys, *arguments: str) -> str:
+    """Return what the command prints."""
+    monkeypatch.setattr(sys, "argv", ["results", *arguments])
+    results.main()
+    return capsys.readouterr().out
+
+
+def test_a_table_has_the_statistics_that_are_asked_for(tmp_path, monkeypatch, capsys):
+    for seed, value in enumerate((0.0, 0.25, 0.5, 1.0)):
+        make_run(tmp_path, seed, (value, 1.0))
+
+    shown = {
+        kind: " ".join(shown_by(monkeypatch, capsys, str(tmp_path), "--statistics", kind).split())
+        for kind in results.STATISTICS
+    }
+
+    assert "--statistics exact: few seeds of bounded values need wider intervals" in shown["exact"]
+    assert "solved rate 0.62 [0.24, 0.90] n = 4" in shown["exact"]
+    assert "solved rate 0.62 [0.23, 1.02] n = 4" in shown["t"]
+    assert "$\\pm$ 0.25" in shown_by(monkeypatch, capsys, str(tmp_path), "--statistics", "std", "--format", "latex")
+    assert shown["std"].startswith("mean ± standard deviation over seeds, solved seeds")
+    assert "average performance 0.72 ± 0.21 n = 4" in shown["std"]
+    assert "average performance 0.69 [" in shown["iqm"]
+    assert "interquartile return 0.88 [" in shown["iqm"]  # 0, 0.25, 0.5 and five times 1
+
+
+def test_each_seed_is_a_row_where_that_is_asked_for(tmp_path, monkeypatch, capsys):
+    for seed, value in enumerate((0.0, 0.5)):
+        make_run(tmp_path, seed, (value, 1.0))
+    make_run(tmp_path, 2, finished=False)
+
+    shown = shown_by(monkeypatch, capsys, str(tmp_path), "--per-seed", "--csv", str(tmp_path / "table.csv"))
+
+    assert "  PPO, seed 1\n    average performance  0.75   n = 1" in shown
+    assert "seed 2: unfinished" in shown
+    rows = list(csv.DictReader((tmp_path / "table.csv").open(newline="")))
+    returns = [(row["seed"], row["value"], row["low"]) for row in rows if row["measure"] == "mean_final_return"]
+    assert returns == [("0", "0.5", ""), ("1", "0.75", "")]
+
+
+def test_every_evaluation_is_a_row_of_a_tidy_table(tmp_path, monkeypatch, capsys):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "runs").mkdir()
+    path = make_run(tmp_path / "runs", 0, (0.25, 1.0))
+    make_run(tmp_path / "runs", 1, finished=False)
+    for name in ("all.csv", "all.parquet"):
+        shown_by(monkeypatch, capsys, str(tmp_path / "runs"), "--tidy", str(tmp_path / name))
+
+    rows = list(csv.DictReader((tmp_path / "all.csv").open(newline="")))
+
+    assert len(rows) == 12
+    names = ("agent", "run", "curriculum", "seed", "block", "task", "label", "return_mean")
+    assert [rows[4][name] for name in names] == ["PPO", str(path), "two", "0", "2", "1", "goal1", "0.25"]
+    typed = parquet.read_table(tmp_path / "all.parquet").to_pylist()
+    assert [row["return_mean"] for row in typed] == [float(row["return_mean"]) for row in rows]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["runs", "--tidy", "all.xlsx"], "a table of evaluations ends in .csv or .parquet, got all.xlsx"),
         (["empty"], "empty holds no run: no run.jsonl in or below it"),
         (["nowhere"], "nowhere holds no run: there is no such directory"),
         (["table.csv"], "table.csv holds no run: it is a file; name a run directory"),
@@ -317,7 +375,7 @@ def test_an_agent_none_of_whose_runs_finished_is_one_row(tmp_path):
         ("every_metric", "- n = 0/1", "seed 0: unfinished; no seed has a value")
     ]
     assert selected(rows) == selected(rows, ["regret"]) == rows
-    assert formats.text(rows).splitlines()[2:] == [
+    assert formats.text(rows).splitlines()[4:] == [
         *("two", "  PPO", "    every metric  -  n = 0/1  (1)", "  (1) seed 0: unfinished; no seed has a value")
     ]
 

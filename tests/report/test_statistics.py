@@ -15,7 +15,9 @@ from ctgraph_rl.report.statistics import (
     compare,
     holm,
     interquartile_mean,
+    iqm,
     mean,
+    mean_and_std,
     median_time,
     of_two_groups,
     seeds_needed,
@@ -251,6 +253,55 @@ def test_the_interquartile_mean_needs_ten_seeds():
 
     assert (estimate.value, estimate.low, estimate.n, estimate.n_undefined) == (None, None, 9, 3)
     assert estimate.reason == "needs 10 seeds of each task, got 9"
+
+
+SCORES = [[0.0, 0.1, 0.9, 1.0, 0.4], [0.2, 0.3, 0.3, 0.8, 0.7], [1.0, 1.0, 0.0, 0.6, 0.5]]
+
+
+@pytest.mark.parametrize(
+    ("tasks", "value"),
+    [
+        (SCORES, (0.2 + 0.3 + 0.3 + 0.4 + 0.5 + 0.6 + 0.7 + 0.8 + 0.9) / 9),  # 15 values: 3 are cut at each side
+        ([[0.0, 0.25, 1.0]], (0.0 + 0.25 + 1.0) / 3),  # a quarter of 3 is less than one
+        ([[0.0, 0.25, 0.5, 1.0]], 0.375),
+        ([[0.0, None, 0.25], [0.5, 1.0, math.nan]], 0.375),
+    ],
+)
+def test_the_iqm_is_rliables_trimmed_mean_of_all_tasks_and_seeds(tasks, value):
+    assert iqm(tasks).value == pytest.approx(value, abs=1e-15)
+
+
+def test_the_interval_of_the_iqm_draws_the_seeds_of_each_task_anew():
+    rng = np.random.default_rng(1)
+    drawn = np.concatenate([rng.choice(task, (10_000, len(task))) for task in SCORES], axis=1)
+    sums = np.sort(drawn, axis=1)[:, 3:12].mean(axis=1)
+
+    estimate = iqm(SCORES)
+
+    assert (estimate.low, estimate.high) == pytest.approx(np.quantile(sums, (0.025, 0.975)), abs=0.02)
+    assert (estimate.n, estimate.method) == (5, "IQM, percentiles of a stratified bootstrap 95%")
+    constant = iqm([[0.0] * 4, [0.5] * 4, [1.0] * 4])
+    assert (constant.low, constant.value, constant.high) == (0.5, 0.5, 0.5)
+
+
+def test_one_seed_and_none_have_no_interval_of_the_iqm():
+    assert (iqm([[0.5], [1.0]]).value, iqm([[0.5], [1.0]]).reason) == (0.75, "one seed has no interval")
+    assert iqm([[None]]).reason == "no seed has a value"
+
+
+def test_a_mean_is_shown_with_the_standard_deviation_of_seeds():
+    estimate = mean_and_std([1.0, 2.0, None, 3.0, 4.0])
+
+    assert (estimate.value, estimate.std) == (2.5, pytest.approx(math.sqrt(5 / 3), abs=1e-15))
+    assert str(estimate) == "2.50 ± 1.29 n = 4/5"
+    assert mean_and_std([1.0]).reason == "one seed has no standard deviation"
+
+
+def test_an_interval_of_equal_seeds_is_explained():
+    bounded, of_one_value = mean([0.0] * 3, bounds=(-1.0, 1.0)), mean([0.0] * 3, bounds=(0.0, 0.0))
+
+    assert (str(bounded), bounded.reason) == ("0.00 [-0.71, 0.71] n = 3", statistics.EQUAL_SEEDS)
+    assert of_one_value.reason is None
 
 
 def test_a_paired_comparison_is_of_the_differences():
