@@ -13,16 +13,11 @@ from typing import Any
 
 import torch
 import yaml
-from tensordict import TensorDictBase
-from torch import Tensor
 
-from baselines.parts.networks import draw
-from baselines.parts.policy_gradient import PolicyGradient, generalized_advantages
-from baselines.update.stack import Stack
-from baselines.update.update import update
+from baselines.parts.policy_gradient import PolicyGradient
+from baselines.update.captured import CapturedGroup
 from benchmarks.environment_ladder import WAYS, Run, Rung
 from ctgraph_rl.batch.specs import specs_of
-from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
 from ctgraph_rl.packages import class_named, conf_dir
@@ -107,79 +102,21 @@ def learning(
 
 
 def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> Run:
-    """Return a run of many seeds of an agent: each learns from a batch of its own."""
-    group = Seeds([built(name, task) for _ in range(num_seeds)], task, device)
-    return lambda: group.learn(next(group.batches))
+    """Return a run of many seeds of an agent, as ``together=true`` trains them: each learns from a batch of its own."""
+    agents = [built(name, task).to(device) for _ in range(num_seeds)]
+    generators = [torch.Generator(device="cpu").manual_seed(seed) for seed in range(num_seeds)]
+    group = CapturedGroup(agents, generators)
+    num_envs = agents[0].num_envs
+    num_steps = agents[0].num_steps
+    env = CTGraphEnv([task] * num_seeds * num_envs, device=device, check_actions=False, info=False)
+    row = torch.arange(num_seeds * num_envs, device=device)
+    env.rows.set_streams(row // num_envs, row % num_envs)
+    frames = ENDLESS * env.numel() * num_steps
+    collected = collect(env, group.policy, frames, num_steps, agents[0].initial_state)
 
-
-class Seeds:
-    """Seeds of one agent on one device, whose networks act and learn as one stack.
-
-    All draw from the device's generator, so their numbers are not those of seeds in `baselines.update.seeds.Group`,
-    which have one generator each; the arithmetic is the same.
-
-    Args:
-        learners: one for each seed, on the CPU.
-        task: what all learn.
-        device: where they learn.
-    """
-
-    capturable = True
-
-    def __init__(self, learners: Sequence[PolicyGradient], task: Task, device: torch.device) -> None:
-        self.first, self.count = learners[0], len(learners)
-        self.num_envs, self.num_steps = self.first.num_envs, self.first.num_steps
-        learners = [learner.to(device) for learner in learners]
-        self.stack = Stack(learners)
-        num_rows = self.count * self.num_envs
-        env = CTGraphEnv([task] * num_rows, device=device, check_actions=False, info=False)
-        row = torch.arange(num_rows, device=device)
-        env.rows.set_streams(row // self.num_envs, row % self.num_envs)
-        frames = ENDLESS * num_rows * self.num_steps
-        self.batches = collect(env, self, frames, self.num_steps, self.first.initial_state)
-        self.update = Region(self.gradient_step) if captures(device) else self.gradient_step
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Write the actions of all seeds, [seeds * num_envs], and what they need to learn from them."""
-        given = {key: data[key].unflatten(0, (self.count, -1)) for key in self.first.trunk.in_keys}
-        written = self.stack.one_step(given)
-        log_probs = written.pop("log_probs")
-        action = draw(log_probs.softmax(dim=-1))
-        written |= {"action": action, "action_log_prob": log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)}
-        for key, value in written.items():
-            data.set(key, value.flatten(0, 1))
-        return data
-
-    def learn(self, batch: TensorDictBase) -> int:
-        """Let all seeds learn from a batch, [seeds * num_envs, num_steps]; return its frames."""
-        items = self._items(batch)
-        size = items["action"].shape[1] // self.first.num_minibatches
-        for _ in range(self.first.num_epochs):
-            order = torch.rand(items["action"].shape[:2], device=batch.device, dtype=torch.float32).argsort(dim=1)
-            for part in order.split(size, dim=1):
-                self.update({key: _taken(value, part) for key, value in items.items()})
+    def run() -> int:
+        batch = next(collected)
+        group.learn(batch)
         return batch.numel()
 
-    @torch.no_grad()
-    def _items(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return what the seeds learn from, [seeds, items, ...] each: frames, or with memory rows."""
-        after, values = batch["next"], batch["state_value"]
-        last = {key: after[key][:, -1].unflatten(0, (self.count, -1)) for key in self.first.trunk.in_keys}
-        of_last = self.stack.one_step(last)["state_value"].flatten(0, 1)
-        following = torch.cat([values[:, 1:], of_last.unsqueeze(1)], dim=1)
-        given = (values, following, after["reward"], after["done"], after["terminated"])
-        advantage, target = generalized_advantages(self.first.gamma, self.first.gae_lambda, *given)
-        keys = (*self.first.trunk.in_keys, "action", "action_log_prob")
-        items = {key: batch[key] for key in keys} | {"advantage": advantage, "value_target": target}
-        end = 0 if self.first.memory else 1
-        return {key: value.unflatten(0, (self.count, -1)).flatten(1, 1 + end) for key, value in items.items()}
-
-    def gradient_step(self, minibatch: dict[Any, Tensor]) -> dict[str, Tensor]:
-        """Take a gradient step of all seeds on minibatches, [seeds, items, ...]; return losses and norms, [seeds]."""
-        return update(self.first, self.stack.state, minibatch)
-
-
-def _taken(value: Tensor, items: Tensor) -> Tensor:
-    """Return items of each seed, int64 [seeds, n], of a tensor [seeds, items, ...]."""
-    first = torch.arange(len(value), device=value.device).unsqueeze(1) * value.shape[1]
-    return value.flatten(0, 1).index_select(0, (first + items).flatten()).unflatten(0, items.shape)
+    return run

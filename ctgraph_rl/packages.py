@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 from ctgraph_rl.checks import require
 
 if TYPE_CHECKING:
+    import torch
+
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 HERE = Path(__file__).resolve().parent
@@ -139,24 +141,28 @@ def is_published(curriculum: Curriculum) -> bool | None:
     return published.load(curriculum.name).fingerprint == curriculum.fingerprint
 
 
-def why_agents_learn_alone(agent: object) -> str | None:
-    """Return why agents like this one cannot learn as one batch of seeds; None if they can.
+def why_agents_learn_alone(agent: object, device: torch.device) -> str | None:
+    """Return why agents like this one cannot learn as one batch of seeds on a device; None if they can.
 
     Raises:
         ValueError: see `check_packages`.
     """
     check_packages()
-    return import_module("baselines.update.seeds").why_not_together(agent)
+    if device.type == "cpu":
+        return import_module("baselines.update.seeds").why_not_together(agent)
+    return import_module("baselines.update.captured").why_not_captured(agent)
 
 
-def agents_together(agents: Sequence[object], generators: Sequence[object]) -> Any:
-    """Return the `ctgraph_rl.learn.loop.Group` of agents, each with what it draws from.
+def agents_together(agents: Sequence[object], generators: Sequence[object], device: torch.device) -> Any:
+    """Return the `ctgraph_rl.learn.loop.Group` of agents on a device, each with what it draws from.
 
     Raises:
         ValueError: see `check_packages`.
     """
     check_packages()
-    return import_module("baselines.update.seeds").Group(agents, generators)
+    if device.type == "cpu":
+        return import_module("baselines.update.seeds").Group(agents, generators)
+    return import_module("baselines.update.captured").CapturedGroup(agents, generators)
 
 
 def class_named(module: str, name: str) -> type | None:

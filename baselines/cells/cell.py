@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ctgraph_rl.checks import TakesNumbers, require, true_or_false
+from ctgraph_rl.core.kernel import is_traced
 
 State = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
@@ -107,6 +108,11 @@ class Cell(TakesNumbers, nn.Module):
 
 MakeCell = Callable[..., Cell]
 """Return a cell for ``num_features``, ``num_outputs`` and ``num_actions``."""
+
+
+def can_branch(value: Tensor) -> bool:
+    """Return whether code may branch on values: a GPU would have to wait for them, and a stack of seeds has many."""
+    return value.is_cpu and not is_traced()
 
 
 def reset(state: Sequence[Tensor], starts: Tensor) -> State:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from baselines.cells.cell import Cell, State, zeros_like_weights
 from baselines.cells.segments import segments
+from ctgraph_rl.core.kernel import is_traced
 
 
 class GRU(Cell):
@@ -28,7 +29,12 @@ class GRU(Cell):
 
     def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
         """See `Cell`."""
-        output = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))[0].squeeze(1)
+        if is_traced():  # PyTorch's own cannot be vectorised over seeds
+            num_rows = len(inputs)
+            each = torch.arange(num_rows, device=inputs.device)
+            output = packed_gru(self.gru, inputs, each, torch.tensor([num_rows], device="cpu"), state[0])
+        else:
+            output = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))[0].squeeze(1)
         return output, (output,)
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:

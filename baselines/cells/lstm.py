@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Branches, Cell, State, zeros_like_weights
+from baselines.cells.cell import Branches, Cell, State, can_branch, zeros_like_weights
 from baselines.cells.segments import segments
 
 
@@ -28,7 +28,7 @@ class LSTM(Cell):
 
     def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
         """See `Cell`."""
-        if not inputs.is_cpu:
+        if not can_branch(inputs):
             h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), *(value.squeeze(1) for value in state))
             return h, (h.unsqueeze(1), c.unsqueeze(1))
         before = tuple(value.transpose(0, 1).contiguous() for value in state)

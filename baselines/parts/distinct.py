@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Branches, State
+from baselines.cells.cell import Branches, State, can_branch
 from baselines.cells.segments import segments
 
 
@@ -28,7 +28,7 @@ def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """
     flat = [value.flatten(1) for value in inputs]
     frames = torch.arange(len(flat[0]), device=flat[0].device)
-    if not frames.is_cpu:  # a GPU would have to wait for the search
+    if not can_branch(flat[0]):
         return frames, frames
     widths = [value.shape[1] for value in flat]
     weights = random_weights(sum(widths)).split(widths)

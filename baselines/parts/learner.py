@@ -215,12 +215,7 @@ class Learner(TakesNumbers, nn.Module):
 
     def means(self, names: Sequence[str], table: Tensor) -> dict[str, float]:
         """Return the means of a table of measurements, [names, gradient steps]; see `mean_measurements`."""
-        for wrong in (~table.isfinite()).any(dim=0).nonzero()[:1, 0]:
-            for name, value in zip(names, table[:, wrong], strict=True):
-                require_finite(name, value)
-        largest = torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max()
-        require_finite("the largest weight", largest, LARGEST_WEIGHT)
-        return dict(zip(names, table.mean(dim=1).tolist(), strict=True))
+        return finite_means(names, table, torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max())
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the optimiser's state, so that `state_dict` is complete."""
@@ -239,6 +234,19 @@ def reset_layer(module: nn.Module) -> None:
     """Draw the weights of a layer, if it has any, as PyTorch does at its construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]
+
+
+def finite_means(names: Sequence[str], table: Tensor, largest_weight: Tensor) -> dict[str, float]:
+    """Return the means of a table of measurements, [names, gradient steps].
+
+    Raises:
+        FloatingPointError: names the first number that is not finite, or the largest weight.
+    """
+    for wrong in (~table.isfinite()).any(dim=0).nonzero()[:1, 0]:
+        for name, value in zip(names, table[:, wrong], strict=True):
+            require_finite(name, value)
+    require_finite("the largest weight", largest_weight, LARGEST_WEIGHT)
+    return dict(zip(names, table.mean(dim=1).tolist(), strict=True))
 
 
 def require_finite(name: str, value: Tensor, most: float = math.inf) -> None:

@@ -16,7 +16,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, linear_layer, reset
+from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, can_branch, linear_layer, reset
 from baselines.parts.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
@@ -143,7 +143,7 @@ class RecurrentModule(TensorDictModuleBase):
         """
         inputs, groups, starts, state = self._sequences(data)
         cell = self.cell
-        faster = cell.sequence if starts.is_cpu else partial(Cell.sequence, cell)  # others may make the host wait
+        faster = cell.sequence if can_branch(starts) else partial(Cell.sequence, cell)
         return faster(inputs, groups, starts, state)
 
     def of_distinct(self, data: Data) -> tuple[Tensor, Tensor]:

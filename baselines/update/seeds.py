@@ -58,6 +58,8 @@ class Group:
         generators: of each agent, with the state of torch's global generator after the agent was built.
     """
 
+    device_generators = None
+
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
         self.agents, self.generators = list(agents), list(generators)
         self.learners = [_learner(agent) for agent in agents]
@@ -112,7 +114,7 @@ class Group:
             self._acting = Stack(self.learners)
         keys = [key for key in self.learners[0].policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
         outputs = self._act(self._acting, {key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
-        written = self._explored(outputs) if "action_value" in outputs else sampled(outputs, self.generators)
+        written = self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
         for key, value in written.items():
             data.set(key, value.flatten(0, 1))
         return data
@@ -134,6 +136,13 @@ class Group:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
         return self._compiled[graph.code]
 
+    def _sampled(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return random actions, each agent's drawn from its generator."""
+        noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
+        for row, generator in zip(noise, self.generators, strict=True):
+            row.exponential_(generator=generator)
+        return sampled(outputs, noise)
+
     def _explored(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the best actions, and where an agent explores random ones."""
         actions = outputs["action_value"].argmax(dim=-1)
@@ -153,7 +162,7 @@ class Group:
         measured = self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
         for learner, each in zip(self.learners, measured, strict=True):
             if isinstance(each, FloatingPointError):
-                _clear(learner)
+                clear(learner)
         return measured
 
     def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
@@ -269,7 +278,7 @@ def _or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str
 
 
 @torch.no_grad()
-def _clear(learner: Learner) -> None:
+def clear(learner: Learner) -> None:
     """Set the weights of an agent that has failed to zero, so that it keeps its place in the batch and raises nothing.
 
     Without it the others would be a batch of another size, whose products may be rounded otherwise.
@@ -279,21 +288,18 @@ def _clear(learner: Learner) -> None:
         parameter.zero_()
 
 
-def sampled(outputs: Mapping[str, Tensor], generators: Sequence[torch.Generator]) -> dict[str, Tensor]:
+def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
     """Draw actions from categorical distributions, as `torch.multinomial` draws one of each row.
 
     Args:
         outputs: ``log_probs``, [seeds, num_envs, num_actions], and ``state_value``.
-        generators: of each seed.
+        noise: exponential numbers, as many as log-probabilities.
 
     Returns:
         ``action`` and ``action_log_prob``, [seeds, num_envs], and ``state_value``.
     """
     log_probs = outputs["log_probs"]
-    chances, noise = log_probs.softmax(dim=-1), torch.empty_like(log_probs, memory_format=torch.contiguous_format)
-    for row, generator in zip(noise, generators, strict=True):
-        row.exponential_(generator=generator)
-    action = (chances / noise).argmax(dim=-1)
+    action = (log_probs.softmax(dim=-1) / noise).argmax(dim=-1)
     of_action = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
     return {"action": action, "action_log_prob": of_action, "state_value": outputs["state_value"]}
 

@@ -18,8 +18,9 @@ _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 _KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 _ROUNDS = 10
 
-STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL, STREAM_TASK = range(6)
-"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal."""
+STREAM_STEP, STREAM_NOISE, STREAM_IMAGES, STREAM_REWARD, STREAM_GOAL, STREAM_TASK, STREAM_AGENT = range(7)
+"""What a draw is for: a step's small draws, pixel noise, image sets, the noise of rewards, changes of the goal, of
+the task, and what agents draw."""
 _STREAM_SHIFT = 28  # 16 streams of 2**28 blocks each
 
 

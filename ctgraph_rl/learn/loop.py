@@ -90,6 +90,11 @@ class Group(Protocol):
         ...
 
     @property
+    def device_generators(self) -> Sequence[Any] | None:
+        """What each agent draws from on a GPU, with ``get_state`` and ``set_state``; None: nothing."""
+        ...
+
+    @property
     def policy(self) -> Policy:
         """Writes the actions of all rows, [agents * num_envs], those of an agent one after the other."""
         ...
@@ -117,7 +122,7 @@ class Alone:
         agent: the learner.
     """
 
-    generators = None
+    generators = device_generators = None
 
     def __init__(self, agent: Agent) -> None:
         self.agents = [agent]
@@ -330,7 +335,9 @@ class Lockstep:
         """Return the state of what an agent draws from."""
         device = self.env.device
         if self.group.generators is not None:
-            return {"random": self.group.generators[number].get_state(), "random_cuda": None}
+            draws = self.group.device_generators
+            of_device = None if draws is None else draws[number].get_state()
+            return {"random": self.group.generators[number].get_state(), "random_cuda": of_device}
         of_cuda = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
         return {"random": torch.get_rng_state(), "random_cuda": of_cuda}
 
@@ -338,6 +345,8 @@ class Lockstep:
         """Restore what `_random_state` returned."""
         if self.group.generators is not None:
             self.group.generators[number].set_state(state["random"])
+            if self.group.device_generators is not None:
+                self.group.device_generators[number].set_state(state["random_cuda"])
             return
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None:

@@ -72,9 +72,7 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
 
 def _why_one_after_the_other(job: Job) -> str | None:
     """Return why seeds of a job's configuration cannot learn as one batch; None if they can."""
-    if job.device.type != "cpu":
-        return f"those on {job.device} cannot be one batch"
-    return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent)
+    return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent, job.device)
 
 
 def _run_in_turn(runs: Sequence[Run], first: Job) -> None:
@@ -170,7 +168,8 @@ def _as_one(job: Job, curriculum: Curriculum, members: Sequence[Member]) -> Fail
         return {}
     agents, directories, generators = zip(*members, strict=True)
     seeds = directories[0].together
-    failed = train_together(curriculum, agents_together(agents, generators), seeds, job.device, directories)
+    group = agents_together(agents, generators, job.device)
+    failed = train_together(curriculum, group, seeds, job.device, directories)
     return {seeds[number]: error for number, error in failed.items()}
 
 

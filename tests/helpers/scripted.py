@@ -98,7 +98,9 @@ class ScriptedGroup:
 
     def __init__(self, count: int, policy) -> None:
         self.agents = [Told(policy, num_envs=8, num_steps=4) for _ in range(count)]
-        self.generators, self.policy = [], policy
+        self.generators = []
+        self.device_generators = None
+        self.policy = policy
 
     def start_task(self, task=None) -> None:
         pass

@@ -21,11 +21,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import baselines.parts.learner
 import curricula
 from baselines.parts.learner import Learner
-from baselines.update.update import losses_of, total_loss
-from benchmarks.agent_ladder import Seeds, built
+from baselines.update.captured import CapturedGroup
 from benchmarks.environments import configurations
 from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
-from ctgraph_rl.batch import rows
 from ctgraph_rl.core.region import Region
 from ctgraph_rl.learn import collect
 from ctgraph_rl.learn.collect import CapturedAct, in_time_order, start_of_episodes
@@ -123,6 +121,35 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
     assert {value.device for step in measured for value in step.values()} == {META}
 
 
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    others_slow([("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("+cell=gru",))], ("a2c", ())),
+)
+def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(name, cell, compose, captured, swapped, request):
+    env = CTGraphEnv([confounding(p=0.3)] * 48, kernel="off")
+    agents = [agent_of(compose, name, env, "agent.num_envs=16", *cell).to(META) for _ in range(3)]
+    for agent in agents:
+        agent.optimiser.param_groups[0] |= {"fused": False, "foreach": False}  # unknown on this device
+    group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
+    start, steps = start_of_episodes(env, group.first.initial_state), []
+    act, carried = CapturedAct(env, group.policy, start), dict(env.reset().to(META).update(start).items(True, True))
+    env.rows.to(META)
+    env._device = META
+    assert group.stack.weights
+
+    with request.getfixturevalue("alone"):
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(group.first.num_steps):
+                step, carried = act(carried)
+                steps.append(step)
+        minibatches = islice(group._minibatches(group._items(in_time_order(steps, env))), 2)
+        measured = [group.gradient_step(minibatch) for minibatch in minibatches]
+        group.stack.write()
+
+    assert {value.device for step in measured for value in step.values()} == {META}
+    assert {value.shape for step in measured for value in step.values()} == {(3,)}
+
+
 @pytest.mark.parametrize("name", ["ppo", "rl2"])
 def test_a_gpu_estimates_the_advantages_that_a_cpu_estimates(name, compose, monkeypatch):
     env = CTGraphEnv([confounding(p=0.3)] * 16)
@@ -168,31 +195,6 @@ def test_memory_that_is_used_again_and_again_changes_no_bit_of_a_run(name, bound
 
     assert lines == expected
     assert parameters_equal(agent, its)
-
-
-@pytest.mark.parametrize("name", ["ppo", "lstm_ppo"])
-def test_seeds_of_the_ladder_have_the_losses_that_each_has_alone(name, monkeypatch):
-    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
-    monkeypatch.setattr(rows, "knows", lambda *what: False)  # the kernel needs a CPU
-    learners = [built(name, confounding(p=0.3), **TINY, num_minibatches=2) for _ in range(3)]
-    group, seen = Seeds(learners, confounding(p=0.3), torch.device("cpu")), []
-    monkeypatch.setattr(group, "update", seen.append)
-
-    group.learn(next(group.batches))
-    state = group.stack.state
-    found = losses_of(group.first, state, seen[0])
-    [gradient, *_] = torch.autograd.grad(total_loss(found).sum(), state.weights)
-
-    assert len(seen) == 2
-    for i, learner in enumerate(learners):
-        expected = learner.loss({key: value[i] for key, value in seen[0].items()})
-        torch.testing.assert_close({key: value[i] for key, value in found.items()}, expected)
-        [first] = torch.autograd.grad(total_loss(expected), learner.weights[:1])
-        torch.testing.assert_close(gradient[i].mT if first.ndim == 2 else gradient[i], first)
-    before = learners[0].weights[0].clone()
-    group.gradient_step(seen[0])
-    group.stack.write()
-    assert not torch.equal(learners[0].weights[0], before)
 
 
 def test_acting_is_captured_again_where_rows_have_other_tasks(small_agent):

@@ -9,12 +9,14 @@ import pytest
 import torch
 from helpers.oracles import confounding
 from helpers.small_agents import POLICY_GRADIENTS, agent_of
+from helpers.sweeping import sweep
 
 import baselines.parts.learner
 import curricula
+from baselines.update.captured import CapturedGroup
 from benchmarks import environment_ladder as ladder
 from benchmarks.environments import configurations
-from ctgraph_rl import CTGraphEnv, Rows, Steps, learn_curriculum, make_agent, rollout
+from ctgraph_rl import CTGraphEnv, Rows, RunLog, Steps, learn_curriculum, make_agent, rollout
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.learn import collect
@@ -147,6 +149,40 @@ def test_neither_a_step_nor_a_gradient_step_waits_for_the_device(name, compose):
         batch = next(collected)
         for minibatch in agent.minibatches(batch):
             agent.gradient_step(minibatch)
+
+
+@pytest.mark.parametrize("name", ["ppo", "lstm_ppo"])
+def test_several_seeds_learn_by_graphs_what_they_learn_step_by_step_and_never_wait(name, compose, eager):
+    def learned(is_captured: bool) -> list:
+        task = confounding(p=0.3)
+        env = CTGraphEnv([task] * 3 * 64, device="cuda", check_actions=False)
+        agents = [agent_of(compose, name, env, "agent.num_envs=64").to("cuda") for _ in range(3)]
+        group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
+        if not is_captured:
+            group._region = group._usual_update
+        collected = collect.collect(env, group.policy, 10**9, group.first.num_steps, group.first.initial_state)
+        measured = [group.learn(next(collected)) for _ in range(WARM_UP + 1)]
+        if is_captured:
+            with without_waiting():
+                for minibatch in group._minibatches(group._items(next(collected))):
+                    group.gradient_step(minibatch)
+        return measured[0]
+
+    found = learned(True)
+    eager()
+    expected = learned(False)
+
+    assert [pytest.approx(each, rel=1e-4, abs=1e-6) for each in found] == expected
+
+
+def test_the_seeds_of_a_sweep_learn_as_one_job_on_a_gpu(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = ("device=cuda", "curriculum=ct2_interfering", "curriculum.num_frames=4096", "agent=ppo")
+
+    assert sweep(monkeypatch, "seed=0,1,2", "together=true", *settings, "agent.num_envs=64", "agent.num_steps=16") == 0
+
+    begun = [RunLog.begun(path) for path in sorted(tmp_path.rglob("run.jsonl"))]
+    assert [line["together"] for line in begun] == [[0, 1, 2]] * 3
 
 
 def test_a_run_learns_on_a_gpu():

@@ -1,0 +1,244 @@
+"""Several seeds as one batch on a GPU: a step of all seeds is one CUDA graph, and their gradient step is another.
+
+All operations are those of all seeds, so their number does not grow with the seeds. The weights stay stacked between
+two batches, and each agent gets its own after each batch. Each seed draws by counter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from baselines.cells.cell import PREVIOUS_ACTION
+from baselines.methods.method import AgentWithMethod
+from baselines.parts.learner import finite_means
+from baselines.parts.networks import Data, sequences_of
+from baselines.parts.policy_gradient import PolicyGradient
+from baselines.update.optimiser import has_parts
+from baselines.update.seeds import clear, sampled
+from baselines.update.stack import Stack
+from baselines.update.update import update
+from ctgraph_rl.agent import Agent
+from ctgraph_rl.core import philox
+from ctgraph_rl.core.region import Region
+
+AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch", "one_step", "reward", "advantages")
+"""Methods of `PolicyGradient` that `CapturedGroup` has in a form of its own, for all seeds."""
+
+
+def why_not_captured(agent: Agent) -> str | None:
+    """Return why agents like this one cannot act and learn as one batch on a GPU; None if they can."""
+    if isinstance(agent, AgentWithMethod):
+        return f"{type(agent.method).__name__} cannot be vectorised over seeds on a GPU"
+    name = type(agent).__name__
+    if not isinstance(agent, PolicyGradient) or not agent.capturable:
+        return f"{name} cannot be vectorised over seeds on a GPU"
+    if any(getattr(type(agent), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
+        return f"{name} learns in a way of its own"
+    if not has_parts(agent.optimiser):
+        return f"{type(agent.optimiser).__name__} with these settings cannot be vectorised over seeds"
+    return None
+
+
+class Draws:
+    """What several seeds draw from on a device, the same words on each: by counter, see `ctgraph_rl.core.philox`.
+
+    The counters stay where they are in memory, so that CUDA graphs advance them.
+
+    Args:
+        seeds: of each, in [0, 2**63).
+        device: where is drawn.
+    """
+
+    def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
+        self.seed = torch.tensor(seeds, dtype=torch.int64, device="cpu").to(device).unsqueeze(1)
+        self.tick = torch.zeros_like(self.seed)
+
+    def words(self, count: int) -> Tensor:
+        """Return so many words in [0, 2**32) of each seed, int64 [seeds, count]."""
+        block = torch.arange(-(-count // 4), device=self.tick.device)
+        row = torch.zeros_like(self.tick)
+        words = philox.draw(self.seed, row, self.tick, philox.STREAM_AGENT, block)
+        self.tick += 1
+        return torch.stack(words, dim=-1).flatten(1)[:, :count]
+
+    def exponential(self, count: int) -> Tensor:
+        """Return so many exponential numbers of each seed, float32 [seeds, count], of 23 bits and never 0."""
+        uniform = ((self.words(count) >> 9).to(torch.float32) + 0.5) * 2.0**-23
+        return -uniform.log()
+
+    def orders(self, count: int) -> Tensor:
+        """Return a random order of so many items for each seed, int64 [seeds, count]."""
+        upper, lower = self.words(2 * count).unflatten(1, (2, count)).unbind(1)
+        return (upper << 31 | lower >> 1).argsort(dim=1)
+
+
+class SeedDraws(NamedTuple):
+    """What one of several seeds draws from, with the members of a `torch.Generator` that a checkpoint needs."""
+
+    tick: Tensor
+    """The counter of `Draws`, int64 [1]."""
+
+    def get_state(self) -> Tensor:
+        """Return a copy of the state, on the CPU."""
+        return self.tick.cpu().clone()
+
+    def set_state(self, state: Tensor) -> None:
+        """Restore what `get_state` returned."""
+        self.tick.copy_(state)
+
+
+class CapturedGroup:
+    """Agents of one configuration with different seeds, which act and learn together on a GPU.
+
+    Args:
+        agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_captured` has no objection.
+        generators: of each agent, with the state of torch's global generator after the agent was built. Nothing draws
+            from them; they say the seeds.
+    """
+
+    def __init__(self, agents: Sequence[PolicyGradient], generators: Sequence[torch.Generator]) -> None:
+        self.agents = list(agents)
+        self.generators = list(generators)
+        self.first = self.agents[0]
+        device = next(self.first.parameters()).device
+        self.draws = Draws([generator.initial_seed() for generator in generators], device)
+        self.device_generators = [SeedDraws(tick) for tick in self.draws.tick]
+        self.policy = StackedPolicy(self)
+        self._stack: Stack | None = None
+        self._region = Region(self._usual_update)
+
+    @property
+    def stack(self) -> Stack:
+        """The agents' tensors, from the first step on: a saved state is restored before that."""
+        if self._stack is None:
+            self._stack = Stack(self.agents)
+        return self._stack
+
+    def start_task(self, task: int | None = None) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        for agent in self.agents:
+            agent.start_task(task)
+        if self._stack is not None:
+            self._stack.read()
+
+    def end_task(self) -> None:
+        """See `ctgraph_rl.agent.Agent`."""
+        for agent in self.agents:
+            agent.end_task()
+
+    def by_seed(self, value: Tensor) -> Tensor:
+        """Return a tensor of all rows, [seeds * rows, ...], as [seeds, rows, ...]."""
+        return value.unflatten(0, (len(self.agents), -1))
+
+    def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+        """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps].
+
+        Returns:
+            What each measured, or the error that names what is not finite.
+        """
+        items = self._items(batch)
+        steps = []
+        for _ in range(self.first.num_epochs):
+            for minibatch in self._minibatches(items):
+                steps.append(self.gradient_step(minibatch))
+        self.stack.write()
+        return self._measure(list(steps[0]), torch.stack([torch.stack(list(step.values())) for step in steps], dim=1))
+
+    @torch.no_grad()
+    def _items(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Return what the seeds learn from, [seeds, items, ...] each: frames, or with memory rows."""
+        after = batch["next"]
+        advantage, target = self.first.advantages(batch, self._next_values(batch), after["done"], after["terminated"])
+        if self.first.normalize_advantage:
+            advantage = self._normalised(advantage)
+        inputs = sequences_of(batch, [*self.first.trunk.in_keys, "action", "action_log_prob"])
+        items = {key: self.by_seed(value) for key, value in inputs.items()}
+        items |= {"advantage": self.by_seed(advantage), "value_target": self.by_seed(target)}
+        return items if self.first.memory else {key: value.flatten(1, 2) for key, value in items.items()}
+
+    def _next_values(self, batch: TensorDictBase) -> Tensor:
+        """Compute the value after each step as `PolicyGradient` does, of all seeds."""
+        values = batch["state_value"]
+        after = batch["next"]
+        ends = {key: self.by_seed(after[key]).flatten(1, 2) for key in self.first.trunk.in_keys}
+        of_ends = self.stack.one_step(ends)["state_value"].view_as(values)
+        cut = after["done"] & ~after["terminated"]
+        cut[:, -1] = True
+        return torch.where(cut, of_ends, values.roll(-1, dims=1))
+
+    def _normalised(self, advantage: Tensor) -> Tensor:
+        """Give the advantages of each seed mean 0 and standard deviation 1."""
+        of_seeds = self.by_seed(advantage)
+        mean = of_seeds.mean(dim=(1, 2, 3), keepdim=True)
+        deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
+        return ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
+
+    def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
+        """Iterate over the minibatches of one epoch, [seeds, items, ...] each."""
+        order = self.draws.orders(items["action"].shape[1])
+        for part in order.chunk(self.first.num_minibatches, dim=1):
+            yield {key: _taken(value, part) for key, value in items.items()}
+
+    def gradient_step(self, minibatch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Take a gradient step of all seeds; return losses and norms, [seeds] each."""
+        if minibatch["action"].shape[1] != self.first.minibatch_size:
+            return update(self.first, self.stack.state, minibatch)
+        measured = self._region(minibatch)
+        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
+
+    def _usual_update(self, minibatch: Data) -> dict[str, Tensor]:
+        """Take the step, compiled where the agents are."""
+        return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)
+
+    def _measure(self, names: Sequence[str], table: Tensor) -> list[dict[str, float] | FloatingPointError]:
+        """Return the means of a table of measurements, [names, gradient steps, seeds], or errors; with two waits."""
+        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
+        largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
+        measured: list[dict[str, float] | FloatingPointError] = []
+        for agent, column, its_largest in zip(self.agents, table.cpu().unbind(2), largest, strict=True):
+            try:
+                measured.append(finite_means(names, column, its_largest))
+            except FloatingPointError as error:
+                measured.append(error)
+                clear(agent)
+        if any(isinstance(each, FloatingPointError) for each in measured):
+            self.stack.read()
+        return measured
+
+
+class StackedPolicy:
+    """Writes the actions of all seeds, and what they need to learn from them.
+
+    Args:
+        group: whose agents act.
+    """
+
+    capturable = True
+
+    def __init__(self, group: CapturedGroup) -> None:
+        self.group = group
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        """Write into the data of all rows, [seeds * num_envs]."""
+        group = self.group
+        keys = group.first.trunk.in_keys
+        written = group.stack.one_step({key: group.by_seed(data[key]) for key in keys})
+        log_probs = written.pop("log_probs")
+        noise = group.draws.exponential(log_probs[0].numel()).view_as(log_probs)
+        written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
+        if PREVIOUS_ACTION in keys:
+            written["next", PREVIOUS_ACTION] = written["action"]
+        for key, value in written.items():
+            data.set(key, value.flatten(0, 1))
+        return data
+
+
+def _taken(value: Tensor, items: Tensor) -> Tensor:
+    """Return items of each seed, int64 [seeds, n], of a tensor [seeds, items, ...]."""
+    first = torch.arange(len(value), device=value.device).unsqueeze(1) * value.shape[1]
+    return value.flatten(0, 1).index_select(0, (first + items).flatten()).unflatten(0, items.shape)
