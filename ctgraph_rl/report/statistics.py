@@ -170,7 +170,7 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
     """Return the interquartile mean with a stratified bootstrap, as rliable defines both (Agarwal et al. 2021).
 
     The value is `scipy.stats.trim_mean` of a quarter at each side of all values of all tasks together. The interval has
-    the percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task anew, independently of other tasks.
+    the percentiles of `scipy.stats.bootstrap`, which draws the seeds of each task again, independently of other tasks.
     Few seeds have intervals that cover less than they say; see `interquartile_mean`.
 
     Args:

@@ -66,36 +66,6 @@ def ceiling(of: Mapping[str, Raw]) -> float:
     return float(next(iter(of.values()))[0]["ceiling_without_memory"])
 
 
-def speed_table(decisions: str) -> str:
-    """Return the median frames to the first evaluation that solves the task, on graphs with such decisions."""
-    of = columns([each for each in [*GIVEN, *TO_FIND] if each.decisions == decisions])
-    rows = [[AGENTS[name], *(median_frames(each.get(name)) for each in of.values())] for name in AGENTS]
-    heads = [f"p = {each.wait_prob}, {each.num_wait_images}" for each in of]
-    return table(["", *heads[:-1], f"{heads[-1]}, to be found"], rows)
-
-
-def median_frames(lines: Raw | None) -> str:
-    """Return the median over seeds, in thousands of frames, and how many seeds got there."""
-    if not lines:
-        return "not run"
-    from ctgraph_rl.report import statistics
-
-    times = [float(line["frames_to_90"] or math.inf) for line in lines]
-    median, reached = statistics.median_time(times).value, sum(map(math.isfinite, times))
-    return f"never ({reached})" if median is None or math.isinf(median) else f"{median / 1000:.0f} ({reached})"
-
-
-def noise_table() -> str:
-    """Return a line for each graph and agent that learned with noise: without and with it."""
-    of, rows = finished(), []
-    for noisy in NOISY:
-        plain = of.get(noisy._replace(read_noise="0"), {})
-        for name in NOISY_AGENTS:
-            entries = (entry(each.get(name)) for each in (plain, of.get(noisy, {})))
-            rows.append([f"p = {noisy.wait_prob}, {noisy.graph}", AGENTS[name], *entries])
-    return table(["", "", "without noise", f"noise up to {NOISE}"], rows)
-
-
 def with_noise() -> str:
     """Return how many of all runs with noise solve the task after training, and of those without."""
     of = finished()

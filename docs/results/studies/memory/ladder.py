@@ -20,9 +20,6 @@ RUNGS = [(depth, length) for depth in "234" for length in (("6" if depth == "2" 
 SHORT = 10
 """A policy whose episodes take fewer steps on graphs of 100 or 300 steps does not wait."""
 
-LOW = 0.2
-"""A search whose best score is below this has found no setting that learns."""
-
 
 def searched() -> dict[str, dict[tuple[str, ...], Raw]]:
     """Return the lines of the search by agent and setting, settings in the order of the file, of finished settings."""
@@ -67,12 +64,6 @@ def finished() -> dict[tuple[str, str], dict[str, Raw]]:
     return {rung: {agent: of[agent] for agent in CELLS if agent in of} for rung, of in found.items()}
 
 
-def wanted() -> list[tuple[str, list[str], dict[str, Raw]]]:
-    """Return the rungs in words, the agents that they are for, and what is finished of each."""
-    of = finished()
-    return [(f"depth {depth}, {length} steps", CELLS, of.get((depth, length), {})) for depth, length in RUNGS]
-
-
 def entry(lines: Raw | None) -> str:
     """Return the seeds that solve the task, the greedy and the training return, and the training length."""
     if not lines:
@@ -98,11 +89,6 @@ def texts() -> dict[str, str]:
     """Return the numbers and lists of the ladder within the text of the page."""
     of, search = finished(), searched()
     found = {f"ladder_2_{length}": ranking(of.get(("2", length), {})) for length in ("100", "300")}
-    low = [AGENTS[name] for name in CELLS if name in search and score(search[name][best(name)]) < LOW]
-    runs = [line for each in search.values() for lines in each.values() for line in lines]
-    found["search_low"] = ", ".join(low)
-    by_steps = {steps: [line for line in runs if line["num_steps"] == steps] for steps in ("128", "32")}
-    found["search_steps"] = " and ".join(f"{count(lines)} with {steps}" for steps, lines in by_steps.items())
     found["search_lstm"] = count(search["lstm_ppo"][best("lstm_ppo")])
     found["ladder_lstm"] = count(of.get(("2", "100"), {}).get("lstm_ppo"))
     found["stopped"] = stopped(

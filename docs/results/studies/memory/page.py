@@ -11,8 +11,8 @@ from pathlib import Path
 from string import Template
 
 from studies.memory import figures, graphs, ladder
-from studies.memory.conditions import GIVEN, NAME, NOISY, NOISY_AGENTS, SHARED, TO_FIND, UNIQUE, Condition, finished
-from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking, solved_once
+from studies.memory.conditions import GIVEN, NAME, SHARED, TO_FIND, UNIQUE, Condition, finished
+from studies.memory.runs import AGENTS, SETTINGS, count, measured, ranking
 from studies.raw import HERE, TEMPLATES, Raw, grow, lost, machines, merged
 
 LENGTHS = {
@@ -60,31 +60,19 @@ def _number(value: object) -> float:
     return float(str(value) == "True") if str(value) in ("True", "False") else float(str(value))
 
 
-def not_run() -> str:
-    """Return a list of what the page has no number of, or that it has all."""
-    of, lines = finished(), []
-    wanted = [(str(condition), list(AGENTS), of.get(condition, {})) for condition in [*GIVEN, *TO_FIND]]
-    wanted += [(str(condition), list(NOISY_AGENTS), of.get(condition, {})) for condition in NOISY]
-    for what, agents, each in [*wanted, *ladder.wanted()]:
-        missing = [AGENTS[name] for name in agents if name not in each]
-        if missing:
-            lines.append(f"- {what}: {'all' if len(missing) == len(agents) else ', '.join(missing)}.")
-    return "\n".join(["Not run yet:\n", *lines]) if lines else "All runs that were planned are on this page."
-
-
 def texts() -> dict[str, str]:
     """Return the numbers and lists within the text of the page."""
     of = finished()
     ranked = {"shared": SHARED, "find_shared": TO_FIND[0], "find_unique": TO_FIND[1]}
     found = {place: ranking(of.get(condition, {})) for place, condition in ranked.items()}
     for place, condition in (("unique", UNIQUE), ("find_unique", TO_FIND[1])):
-        one_step = of[condition]["dqn, 1 step"]
-        found |= {f"dqn_{place}": count(one_step), f"dqn_{place}_once": str(sum(solved_once(one_step)))}
         found[f"mohqa_{place}"] = count(of[condition].get("mohqa"))
     found |= {f"cut_{steps}": graphs.cut_off(steps) for steps in (8, 32, 128)}
-    for images, end in (("500", ""), ("100", "_100")):
-        on_unique = of[UNIQUE._replace(num_wait_images=images)]
-        found |= {f"{place}{end}": count(on_unique.get(name)) for place, name in LENGTHS.items()}
+    for wait_prob, middle in (("0.9", ""), ("0.5", "_half")):
+        for images, end in (("500", ""), ("100", "_100")):
+            on_unique = of[UNIQUE._replace(wait_prob=wait_prob, num_wait_images=images)]
+            for place, name in LENGTHS.items():
+                found[f"{place}{middle}{end}"] = count(on_unique.get(name))
     found["lower"], found["alike"] = graphs.distinguishable()
     found |= {"lost": graphs.lost(), "with_noise": graphs.with_noise()}
     return found | ladder.texts() | {"intervals": graphs.intervals()}
@@ -99,14 +87,10 @@ def page() -> str:
         "some_waits": graphs.return_table(GIVEN[1:5]),
         "long_waits": graphs.return_table(GIVEN[5:]),
         "to_find": graphs.return_table(TO_FIND),
-        "noise": graphs.noise_table(),
-        "speed_shared": graphs.speed_table("shared"),
-        "speed_unique": graphs.speed_table("unique"),
         "claim": graphs.claim_table(),
         "verdicts": graphs.verdict_table(),
         "search": ladder.search_table(),
         **{f"ladder_depth_{depth}": ladder.ladder_table(depth) for depth in "234"},
-        "not_run": not_run(),
     }
     return template.substitute(tables, machines=machines(NAME, ladder.NAME), **texts())
 
