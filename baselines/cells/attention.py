@@ -1,0 +1,113 @@
+"""Attention: a block of a causal transformer over the last steps of an episode.
+
+Vaswani et al. 2017 (arXiv 1706.03762), with normalised inputs of each part (Xiong et al. 2020, arXiv 2002.04745) and a
+learned bias for each head and distance in place of positions (Raffel et al. 2020, arXiv 1910.10683):
+
+    x_t = W x'_t,  n_t = norm(x_t),  a_t = sum_s softmax_s(q(n_t) . k(n_s) / sqrt(n) + bias_{t-s}) v(n_s),
+    y_t = x_t + W_o a_t,  output_t = y_t + W_2 relu(W_1 norm(y_t)),
+
+where s are the steps of the episode among the last ``num_frames``, and x' are the inputs.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
+from baselines.cells.frames import MOST_FRAMES
+from ctgraph_rl.checks import at_least_one, at_most, is_int, require
+
+
+class Attention(Cell):
+    """A block of a causal transformer whose present step attends to the last steps of its episode.
+
+    The state holds the inputs of these steps, each with a 1, and zeros for steps before the episode.
+
+    Args:
+        num_features: width of the features.
+        num_outputs: width of what it writes; a multiple of ``num_heads``.
+        num_actions: actions of the task.
+        num_frames: steps that it attends to, the present one among them.
+        num_heads: heads of attention.
+        reads: see `Cell`.
+
+    Raises:
+        ValueError: for values out of range.
+    """
+
+    state_keys = ("recurrent_state_frames",)
+    holds = "each of the last steps, by what was seen there"
+
+    def __init__(
+        self, num_features: int, num_outputs: int, num_actions: int, num_frames: int, num_heads: int, **reads: bool
+    ) -> None:
+        super().__init__(num_features, num_outputs, num_actions, **reads)
+        rule = f"num_frames must be an integer >= 2, got {num_frames!r}: one frame is cell=none"
+        require((is_int(num_frames, 2), rule), *at_most(MOST_FRAMES, num_frames=num_frames))
+        require(*at_least_one(num_heads=num_heads))
+        divided = f"hidden_size must be a multiple of num_heads={num_heads}, got {num_outputs}"
+        require((num_outputs % num_heads == 0, divided))
+        self.num_frames = num_frames
+        self.num_heads = num_heads
+        self.enter = linear_layer(self.num_inputs, num_outputs)
+        self.attended = linear_layer(num_outputs, 3 * num_outputs)
+        self.leave = linear_layer(num_outputs, num_outputs)
+        self.wider = linear_layer(num_outputs, 2 * num_outputs)
+        self.narrower = linear_layer(2 * num_outputs, num_outputs)
+        self.first_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
+        self.second_norm = nn.LayerNorm(num_outputs, dtype=torch.float32, device="cpu")
+        self.bias = nn.Parameter(torch.empty(num_heads, num_frames, dtype=torch.float32, device="cpu"))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Set the biases of distances to 0; the layers draw their own weights."""
+        nn.init.zeros_(self.bias)
+
+    def zeros(self, num_rows: int) -> State:
+        """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
+        return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
+
+    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+        """See `Cell`."""
+        present = torch.cat([inputs, torch.ones_like(inputs[:, :1])], dim=1).unsqueeze(1)
+        frames = torch.cat([state[0], present], dim=1)
+        seen = frames[..., -1] > 0
+        output = self._block(frames[..., :-1], 1, seen.unsqueeze(1))
+        return output.squeeze(1), (frames[:, 1:],)
+
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+        """See `Cell`; all steps at once, each over the frames of its episode."""
+        present = inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape)
+        frames = torch.cat([state[0][..., :-1], present], dim=1)
+        episode = torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
+        earlier = torch.where(state[0][..., -1] > 0, 0, -1)
+        of_frame = torch.cat([earlier, episode], dim=1)
+        return self._block(frames, groups.shape[1], of_frame.unsqueeze(1) == episode.unsqueeze(2))
+
+    def _block(self, frames: Tensor, num_steps: int, same: Tensor) -> Tensor:
+        """Compute the outputs of the last steps, [rows, num_steps, num_outputs].
+
+        Args:
+            frames: the inputs of all steps, [rows, frames, num_inputs].
+            num_steps: how many steps have an output.
+            same: whether a frame is of a step's episode, bool [rows, num_steps, frames].
+        """
+        entered = self.enter(frames)
+        queries, keys, values = self.attended(self.first_norm(entered)).chunk(3, dim=-1)
+        queries, keys, values = (self._by_head(each) for each in (queries[:, -num_steps:], keys, values))
+        places = torch.arange(frames.shape[1], device=frames.device)
+        distance = places[-num_steps:].unsqueeze(1) - places
+        near = (distance >= 0) & (distance < self.num_frames)
+        bias = self.bias[:, distance.clamp(0, self.num_frames - 1)]
+        scores = queries @ keys.transpose(-1, -2) / math.sqrt(queries.shape[-1]) + bias
+        scores = scores.masked_fill(~(same & near).unsqueeze(1), -torch.inf)
+        attended = (scores.softmax(dim=-1) @ values).transpose(1, 2).flatten(2)
+        left = entered[:, -num_steps:] + self.leave(attended)
+        return left + self.narrower(self.wider(self.second_norm(left)).relu())
+
+    def _by_head(self, values: Tensor) -> Tensor:
+        """Return values as [rows, num_heads, steps, width]."""
+        return values.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
