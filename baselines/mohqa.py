@@ -281,9 +281,15 @@ class MOHQA(QLearner):
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
         layers = nn.Sequential(nn.ReLU(), linear_layer(num_features, num_actions), nn.Sigmoid())
         head = TensorDictModule(layers, in_keys=["features"], out_keys=["action_value"])
-        how = {"eligibility_steps": eligibility_steps, "hebbian_share": hebbian_share, "hebbian_change": hebbian_change}
-        how |= {"hebbian_decay": hebbian_decay, "reward_baseline": reward_baseline}
-        self.hebbian = HebbianHead(num_features, num_actions, **how)
+        self.hebbian = HebbianHead(
+            num_features,
+            num_actions,
+            eligibility_steps=eligibility_steps,
+            hebbian_share=hebbian_share,
+            hebbian_change=hebbian_change,
+            hebbian_decay=hebbian_decay,
+            reward_baseline=reward_baseline,
+        )
         self.register_buffer("target_weights", self.hebbian.weights.clone())
         self.register_buffer("average", torch.zeros(num_features, dtype=torch.float32, device="cpu"))
         self.greedy = network = TensorDictSequential(trunk, head)

@@ -223,8 +223,12 @@ def beside_products(agents: list[str], rounds: int) -> str:
     return roofline.table(learners, rounds)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print the table."""
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    """Return the options of the command line.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
     names = list(dict.fromkeys(name for name, _ in PAIRS))
     parser = argparse.ArgumentParser(prog="python -m baselines.benchmark", description=__doc__)
     parser.add_argument("--agents", nargs="+", default=names, choices=names, help="who is measured")
@@ -250,6 +254,14 @@ def main(arguments: list[str] | None = None) -> None:
         (options.seeds >= 0, f"seeds must be >= 0, got {options.seeds}"),
         *positive(seconds=options.seconds, limit=options.limit),
     )
+    if options.cells == []:
+        options.cells = known
+    return options
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
+    options = _options(arguments)
     if options.startup:
         print(f"{machine()}; medians of {options.rounds} rounds\n\n{startup.table(options.rounds)}")
         return
@@ -261,12 +273,17 @@ def main(arguments: list[str] | None = None) -> None:
     if options.device:
         print(on_device(checked_device(options.device), options))
         return
+    measured = learned(options)
+    print(f"{machine()}; medians of {options.rounds} rounds and {options.seeds} seeds\n\n{table(measured)}")
+
+
+def learned(options: argparse.Namespace) -> list[Contender]:
+    """Let agents learn for as long as the options say, or until Ctrl-C; return them with their measurements."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
         missing = "Stable-Baselines3 is missing, ours are measured alone: pip install 'ctgraph_rl[benchmark]'"
         console.print(missing, markup=False, soft_wrap=True)
-    chosen = contenders(options.agents) if options.cells is None else cells(options.cells or known)
-    measured = list(chosen)
+    measured = list(contenders(options.agents) if options.cells is None else cells(options.cells))
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]
     for learner in learners:
         learner.learn()
@@ -279,7 +296,7 @@ def main(arguments: list[str] | None = None) -> None:
         work = [(seed, contender) for seed in range(options.seeds) for contender in measured]
         for seed, contender in until(left, track(work, "learning", console=console)):
             contender.solve(seed, options.max_frames)
-    print(f"{machine()}; medians of {options.rounds} rounds and {options.seeds} seeds\n\n{table(measured)}")
+    return measured
 
 
 if __name__ == "__main__":

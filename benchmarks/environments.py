@@ -297,8 +297,8 @@ def machine(device: torch.device | None = None) -> str:
     return f"{platform.processor() or platform.machine()}, {capability}, {threads} threads, torch {torch.__version__}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure and print the table."""
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    """Return the options of the command line."""
     names = list(configurations())
     parser = argparse.ArgumentParser(prog="python -m ctgraph_rl.benchmark", description=__doc__)
     parser.add_argument("--rows", type=int, nargs="+", help="batch sizes")
@@ -311,11 +311,17 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
     parser.add_argument("--limit", type=float, default=600.0, help="seconds after which no measurement begins")
     options = parser.parse_args(arguments)
+    options.rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
+    return options
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print the table."""
+    options = _options(arguments)
     if options.sizes is not None:
         require(*at_least_one(**{f"sizes[{i}]": n for i, n in enumerate(options.sizes)}))
         print(f"{machine()}\n\n{sizes.table(sizes.measured(options.sizes or sizes.SIZES))}")
         return
-    options.rows = options.rows or ([65536, 262144] if options.device else [1, 64, 1024, 16384])
     require(
         *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
         *positive(seconds=options.seconds, limit=options.limit),

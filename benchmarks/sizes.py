@@ -90,15 +90,30 @@ def write_sized_log(curriculum: Curriculum, path: Path) -> None:
     log = RunLog(path)
     trained = [[number + 1 for number in block] for block in curriculum.trained]
     config = {"seed": 0, "agent": "none"}
-    about = {"curriculum": curriculum.name, "fingerprint": curriculum.fingerprint, "config": config}
-    log.append("run", **about, schema=1, trained=trained, tasks=list(curriculum.labels))
+    log.append(
+        "run",
+        curriculum=curriculum.name,
+        fingerprint=curriculum.fingerprint,
+        config=config,
+        schema=1,
+        trained=trained,
+        tasks=list(curriculum.labels),
+    )
     for block, frames in enumerate((0, *curriculum.ends)):
         returns = torch.rand(len(curriculum.tasks), generator=draw, dtype=torch.float32, device="cpu").tolist()
         if block:
             log.append("training", block=block, frames=frames, **_means(returns[0]))
         for task, (label, value) in enumerate(zip(curriculum.labels, returns, strict=True), 1):
-            where = {"block": block, "frames": frames, "task": task, "label": label, "held_out": False}
-            log.append("evaluation", moment="after" if block else "before", **where, **_means(value))
+            log.append(
+                "evaluation",
+                moment="after" if block else "before",
+                block=block,
+                frames=frames,
+                task=task,
+                label=label,
+                held_out=False,
+                **_means(value),
+            )
     log.close()
 
 

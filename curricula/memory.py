@@ -77,9 +77,14 @@ def _with_unique_decisions(observations: Observations, graph: CTGraph) -> Observ
     (first, last), (wait, last_wait), (end, last_end) = (
         observations.ids(kind) for kind in (StateType.DECISION, StateType.WAIT, StateType.END)
     )
-    moved = {"wait_ids": (wait + more, last_wait + more), "end_ids": (end + more, last_end + more)}
-    own = {"unique_decisions": True, "unique_ends": False}
-    return replace(observations, decision_ids=(first, last + more), **moved, **own)  # type: ignore[arg-type]
+    return replace(
+        observations,
+        decision_ids=(first, last + more),
+        wait_ids=(wait + more, last_wait + more),
+        end_ids=(end + more, last_end + more),
+        unique_decisions=True,
+        unique_ends=False,
+    )
 
 
 NAMED = {"co_hard": co_hard}

@@ -74,8 +74,10 @@ class SWOKS(Detector):
         snapshot_every: int,
     ) -> None:
         super().__init__(max_labels, patience, snapshot_every)
-        counts = {"window": window, "num_windows": num_windows, "num_directions": num_directions}
-        require(*at_least_one(**counts, num_tested=num_tested, num_kept=num_kept, num_left_out=num_left_out))
+        require(
+            *at_least_one(window=window, num_windows=num_windows, num_directions=num_directions),
+            *at_least_one(num_tested=num_tested, num_kept=num_kept, num_left_out=num_left_out),
+        )
         require(
             (num_left_out >= num_tested, f"num_left_out must be at least num_tested={num_tested}, got {num_left_out}"),
             (

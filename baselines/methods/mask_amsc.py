@@ -107,9 +107,17 @@ class MaskAMSC(SelectedMasks):
         """Return the mean return of an evaluation as the curriculum has them."""
         how = self.curriculum.evaluation
         agent = self.agent
-        given: dict[str, Any] = {"greedy": how.greedy, "episodes_per_row": how.episodes_per_row, "seed": self.slot}
-        given |= {"initial_state": agent.initial_state, "device": self.weights.device, "curriculum": self.curriculum}
-        played = evaluate(agent.policy, [self.task_in(self.slot)], how.num_episodes, **given)
+        played = evaluate(
+            agent.policy,
+            [self.task_in(self.slot)],
+            how.num_episodes,
+            greedy=how.greedy,
+            episodes_per_row=how.episodes_per_row,
+            seed=self.slot,
+            initial_state=agent.initial_state,
+            device=self.weights.device,
+            curriculum=self.curriculum,
+        )
         return played["episode_reward"].mean().item()
 
     def choose(self) -> list[int]:

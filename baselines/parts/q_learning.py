@@ -136,10 +136,9 @@ class QLearner(Learner):
         compile: bool = False,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
-        counts = {"n_steps": n_steps, "batch_size": batch_size, "num_updates": num_updates, "buffer_size": buffer_size}
         require(
-            *at_least_one(**counts, target_update_interval=target_update_interval),
-            *at_least_one(annealing_num_steps=annealing_num_steps),
+            *at_least_one(n_steps=n_steps, batch_size=batch_size, num_updates=num_updates, buffer_size=buffer_size),
+            *at_least_one(target_update_interval=target_update_interval, annealing_num_steps=annealing_num_steps),
             *at_most(MOST_PASSES, num_updates=num_updates),
             *at_most(LONGEST_TARGET, n_steps=n_steps),
             *positive(gamma=gamma),

@@ -104,31 +104,22 @@ def _swap(tasks: tuple[Task, ...], each: MakeTensor) -> Swap:
 
 def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -> ObservationParams:
     observations = [task.observations for task in tasks]
-    by_node = [[x.is_unique(kind) and not x.legacy_index for kind in StateType] for x in observations]
-    views = [_num_views(task) for task in tasks]
-    starts = [bank.start[bank_key(task)] for task in tasks]
+    angles = list(map(_num_angles, tasks))
+    bank_start = each([bank.start[bank_key(task)] for task in tasks])
 
-    def first_view(i: int, kind: StateType) -> int:
-        skipped = tasks[i].graph.num_decision_states if by_node[i][kind] and kind == StateType.END else 0
-        return starts[i] + (observations[i].ids(kind)[0] - skipped) * views[i]
+    def table(of_kind: Callable[[Task, StateType], int]) -> Tensor:
+        """A number for each kind of state of each task, flattened."""
+        values = [of_kind(task, kind) for task in tasks for kind in StateType]
+        return torch.tensor(values, device=bank_start.device, dtype=torch.int64)
 
-    def num_ids(x: Any, kind: StateType) -> int:
-        return 1 if x.is_unique(kind) else x.ids(kind)[1] - x.ids(kind)[0] + 1
-
-    def table(values: list[list[int]]) -> Tensor:
-        return torch.tensor(values, device=bank_start.device, dtype=torch.int64).flatten()
-
-    bank_start = each(starts)
-    angles = max(map(_num_angles, tasks))
-    taps = [taps_of(bank.shape[-1], angle) for angle in range(angles)] if angles > 1 else []
     return ObservationParams(
         first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
-        first_view=table([[first_view(i, kind) for kind in StateType] for i in range(len(tasks))]),
-        views_per_node=table([[n * unique for unique in kinds] for n, kinds in zip(views, by_node, strict=True)]),
-        num_ids=table([[num_ids(x, kind) for kind in StateType] for x in observations]),
+        first_view=table(lambda task, kind: bank.start[bank_key(task)] + _first_view(task, kind)),
+        views_per_node=table(_views_per_node),
+        num_ids=table(_num_ids),
         bank_start=bank_start,
-        num_views=each(views),
-        num_angles=each([_num_angles(task) for task in tasks]),
+        num_views=each(list(map(_num_views, tasks))),
+        num_angles=each(angles),
         read_noise=each([x.read_noise for x in observations]),
         reward_cue=each([x.reward_cue for x in observations], torch.bool),
         cue_wraps=each([x.cue_wraps for x in observations], torch.bool),
@@ -136,11 +127,41 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
         white=each([white_level(task.images) for task in tasks], torch.float64),
         noise_start=each([bank.noise_levels.index(x.read_noise) * bank.num_noises for x in observations]),
         legacy=_legacy_index(tasks, each, table) if any(x.legacy_index for x in observations) else None,
-        taps=tuple(torch.stack(part).to(bank_start.device) for part in zip(*taps, strict=True)) if taps else None,  # type: ignore[arg-type]
+        taps=_taps(bank.shape[-1], max(angles), bank_start.device) if max(angles) > 1 else None,
     )
 
 
-def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[list[list[int]]], Tensor]) -> LegacyIndex:
+def _taps(size: int, angles: int, device: torch.device) -> Any:
+    """Return what rotates an image of a size by each angle."""
+    of_angles = [taps_of(size, angle) for angle in range(angles)]
+    return tuple(torch.stack(part).to(device) for part in zip(*of_angles, strict=True))
+
+
+def _is_by_node(task: Task, kind: StateType) -> bool:
+    """Whether each state of a kind has an image that is numbered as its node."""
+    return task.observations.is_unique(kind) and not task.observations.legacy_index
+
+
+def _first_view(task: Task, kind: StateType) -> int:
+    """Return the first view of a kind of state, counted from that of the task."""
+    skipped = task.graph.num_decision_states if kind == StateType.END and _is_by_node(task, kind) else 0
+    return (task.observations.ids(kind)[0] - skipped) * _num_views(task)
+
+
+def _views_per_node(task: Task, kind: StateType) -> int:
+    """Return how many views lie between those of two nodes; 0 where nodes have no views."""
+    return _num_views(task) * _is_by_node(task, kind)
+
+
+def _num_ids(task: Task, kind: StateType) -> int:
+    """Return how many ids a state of a kind draws from."""
+    first, last = task.observations.ids(kind)
+    return 1 if task.observations.is_unique(kind) else last - first + 1
+
+
+def _legacy_index(
+    tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[Callable[[Task, StateType], int]], Tensor]
+) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
     def level(task: Task, k: int) -> tuple[int, int]:
@@ -159,7 +180,7 @@ def _legacy_index(tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[li
     return LegacyIndex(
         level_first=each([[first for first, _ in pairs] for pairs in by_level]),
         level_shift=each([[shift for _, shift in pairs] for pairs in by_level]),
-        num_ids=table([[num_ids(task, kind) for kind in StateType] for task in tasks]),
+        num_ids=table(num_ids),
     )
 
 

@@ -148,12 +148,21 @@ def _of_the_log(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     stored = about.get("machine"), about.get("num_threads"), about.get("cpu")
     yield equal("machine", (run.machine, run.num_threads, run.cpu or None), stored, run.run)
     if run.finished:
-        said = experts_of(log)
-        alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
-        for what, key in [("curricula", "fingerprint"), *([("groups", "together")] if said else [])]:
-            expected, found = ([each.get(key) for each in some] for some in (said, alone))
-            yield equal(f"{what} of experts", expected, found, run.run)
+        yield from _of_experts(submission, run, log)
         yield from of_the_protocol(submission, run, log)
+
+
+def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
+    """Yield checks that the logs of experts are those that a log names."""
+    said = experts_of(log)
+    alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
+    keys = {"curricula": "fingerprint"}
+    if said:
+        keys["groups"] = "together"
+    for what, key in keys.items():
+        expected = [each.get(key) for each in said]
+        found = [each.get(key) for each in alone]
+        yield equal(f"{what} of experts", expected, found, run.run)
 
 
 def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:

@@ -116,8 +116,7 @@ def read_collective(path: Path | str) -> Collective:
     called = {part: str(config[part]["_target_"]).rpartition(".")[2] for part in ("agent", "method", "exchange")}
     run = {"curriculum": members[0]["curriculum"], **called, "num_members": len(members), "seed": config["seed"]}
     learned = [row for number, each in enumerate(members) for row in _learned(path, number, each)]
-    tables: dict[str, Any] = {"messages": log.of_kind("exchange"), "helps": log.of_kind("help")}
-    return Collective(path, run, config, learned, **tables)
+    return Collective(path, run, config, learned, messages=log.of_kind("exchange"), helps=log.of_kind("help"))
 
 
 def _learned(path: Path, number: int, about: Mapping[str, Any]) -> Iterator[Learned]:
@@ -135,12 +134,15 @@ def _learned(path: Path, number: int, about: Mapping[str, Any]) -> Iterator[Lear
         label = " ".join(about["labels"][task - 1] for task in trained[block - 1])
         end = own[-1]["frames"]
         final = math.fsum(last) / len(last) if last else math.nan
-        times: dict[str, Any] = {
-            "frames": end - start,
-            "frames_to_learn": min(reached, default=None),
-            "final_return": final,
-        }
-        yield Learned(number, about["seed"], block, label, **times)
+        yield Learned(
+            number,
+            about["seed"],
+            block,
+            label,
+            frames=end - start,
+            frames_to_learn=min(reached, default=None),
+            final_return=final,
+        )
         start = end
 
 

@@ -138,9 +138,14 @@ def _rendered(name: str, about: Mapping[str, Any]) -> str:
     from jinja2 import FileSystemLoader, StrictUndefined
     from jinja2.sandbox import SandboxedEnvironment
 
-    loader, style = FileSystemLoader(Path(__file__).parent), {"trim_blocks": True, "lstrip_blocks": True}
     escapes = name.endswith(".html")
-    environment = SandboxedEnvironment(loader=loader, autoescape=escapes, undefined=StrictUndefined, **style)
+    environment = SandboxedEnvironment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=escapes,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.finalize = _one_line if escapes else None
     environment.filters["line"] = lambda value: markdown_text(value)
     return environment.get_template(f"{name}.j2").render(about)

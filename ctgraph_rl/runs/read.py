@@ -190,9 +190,19 @@ def read_run(path: Path) -> Run:
         {label_of(m): m.get(name) for m in ends} for name in ("success_rate", "return_mean")
     )  # the last
     tasks = list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out")))
-    results: dict[str, Any] = {"metrics": metrics, "success": success, "returns": returns}
-    results |= {"tasks": tasks, "history": history}
-    return Run(path, about, agent, settings, seed, reason=why, **results)
+    return Run(
+        path,
+        about,
+        agent,
+        settings,
+        seed,
+        reason=why,
+        metrics=metrics,
+        success=success,
+        returns=returns,
+        tasks=tasks,
+        history=history,
+    )
 
 
 def _about(file: Path) -> dict[str, Any]:

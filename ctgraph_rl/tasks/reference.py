@@ -198,10 +198,11 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
     seed = found["image_seed"]
     images = ReferenceOneHot(count) if found["one_hot"] else ReferenceImages(count, seed, noise)
     shown = {name: found[name] for name in ("wait_ids", "decision_ids", "end_ids", "unique_waits", "unique_decisions")}
-    on_read = {"read_noise": math.floor(noise), "read_rotation": found["rotation"] - 1}
     return {
         "graph": CTGraph(found["branching_factor"], found["depth"], found["wait_prob"]),
-        "observations": Observations(**shown, **_LEGACY, **on_read),
+        "observations": Observations(
+            **shown, **_LEGACY, read_noise=math.floor(noise), read_rotation=found["rotation"] - 1
+        ),
         "images": images,
         "reward_fn": _DISTRIBUTIONS[found["distribution"]],
         **{name: found[name] for name in ("goal_reward", "fail_reward")},

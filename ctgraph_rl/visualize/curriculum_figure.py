@@ -120,5 +120,13 @@ def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: 
 def _write(axes: Any, place: Point, text: str, level: bool) -> None:
     """A goal's label below it, upright where there is little room."""
     words, rotation = (text, 0) if level else (text.replace("\n", "  "), 90)
-    style = {"ha": "center", "va": "top", "fontsize": 7, "rotation": rotation}
-    axes.annotate(words, place, xytext=(0, -9), textcoords="offset points", **style)
+    axes.annotate(
+        words,
+        place,
+        xytext=(0, -9),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize=7,
+        rotation=rotation,
+    )

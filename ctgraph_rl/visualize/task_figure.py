@@ -144,8 +144,8 @@ class _TaskPicture:
         strong = [self._is_strong(edge) for edge in found]
         widths = [self._width(edge) for edge in found]
         order = sorted(range(len(found)), key=strong.__getitem__)
-        style = {"colors": ["0" if strong[i] else GREY for i in order], "linewidths": [widths[i] for i in order]}
-        draw_lines(self.axes, [lines[i] for i in order], **style)
+        colours = ["0" if strong[i] else GREY for i in order]
+        draw_lines(self.axes, [lines[i] for i in order], colors=colours, linewidths=[widths[i] for i in order])
         row = 1.0 if self.waits else 0.5
         nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
         draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)
@@ -177,8 +177,16 @@ class _TaskPicture:
         (x, y), (end_x, end_y) = line
         words = f"{edge.action}" + (f": {numbers}" if numbers else "")
         box = {"facecolor": "1", "edgecolor": "none", "pad": 0.6}
-        style = {"fontsize": 6.5, "ha": "center", "va": "center", "bbox": box, "zorder": 2}
-        self.axes.text(x + 0.55 * (end_x - x), y + 0.55 * (end_y - y), words, **style)
+        self.axes.text(
+            x + 0.55 * (end_x - x),
+            y + 0.55 * (end_y - y),
+            words,
+            fontsize=6.5,
+            ha="center",
+            va="center",
+            bbox=box,
+            zorder=2,
+        )
 
     def _numbers(self, state: Key, actions: Sequence[int]) -> str:
         """Probability and value of some actions of a state, the best of the values; empty without room."""
@@ -211,8 +219,13 @@ class _TaskPicture:
         """A star below the goal, and the decisions below every end state of a tree that is not drawn whole."""
         size = max(7.0, min(13.0, self.size))
         drop = -0.5 * self.size - 0.6 * size
-        style = {"transform": self._moved(y=drop), "zorder": 3, "clip_on": False}
-        self.axes.plot(*self.places[END, self.goal], **style, **goal_mark(size))
+        self.axes.plot(
+            *self.places[END, self.goal],
+            transform=self._moved(y=drop),
+            zorder=3,
+            clip_on=False,
+            **goal_mark(size),
+        )
         for end in () if self.layout.is_whole else self.layout.leaves:
             under = 0, drop - 0.6 * size
             self._note(in_digits(self.graph.path(end)), self.places[END, end], under, fontsize=6, ha="center", va="top")
@@ -240,8 +253,9 @@ class _TaskPicture:
                 self._note("", place, (1.1 * self.size, 0), arrowprops=arrow, zorder=2)
                 numbers = self._numbers((kind, node), wrong)
                 side = -1 if kind == WAIT else 1  # away from branches
-                style = {"va": "top" if kind == WAIT else "bottom", "fontsize": 6, "color": colour(FAIL)}
-                self._note(numbers, place, (0.55 * self.size, 3 * side), **style)
+                beside = "top" if kind == WAIT else "bottom"
+                shift = (0.55 * self.size, 3 * side)
+                self._note(numbers, place, shift, va=beside, fontsize=6, color=colour(FAIL))
 
     def _wrong(self, state: Key) -> list[int]:
         """The actions that fail in a state, those above b among them, which a curriculum's other tasks may have."""
@@ -262,13 +276,21 @@ class _TaskPicture:
         marks = [Line2D([], [], label=kind.name.lower(), **mark(kind, 7)) for kind in kinds]
         marks.append(Line2D([], [], label="goal", **goal_mark(10)))
         if self.has_room:
-            dashes: dict[str, Any] = {"color": colour(FAIL), "linestyle": DASHES, "linewidth": 1}
-            marks.append(Line2D([], [], label="a wrong action", **dashes))
+            marks.append(Line2D([], [], label="a wrong action", color=colour(FAIL), linestyle=DASHES, linewidth=1))
         if self.has_room and self.graph.wait_prob > 0:
             marks.append(Line2D([], [], label="stays with p", markersize=6, **RING))
-        style = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.02), "fontsize": 7, "frameon": False}
-        style |= {"title": self._meaning(), "title_fontsize": 7, "handletextpad": 0.3, "columnspacing": 1.0}
-        self.axes.legend(handles=marks, ncols=len(marks), **style)
+        self.axes.legend(
+            handles=marks,
+            ncols=len(marks),
+            loc="upper center",
+            bbox_to_anchor=(0.5, 0.02),
+            fontsize=7,
+            frameon=False,
+            title=self._meaning(),
+            title_fontsize=7,
+            handletextpad=0.3,
+            columnspacing=1.0,
+        )
 
     def _meaning(self) -> str:
         """Return the meaning of numbers and widths."""

@@ -64,16 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, module in {**PAGES, **APART}.items():
         commands.add_parser(name).set_defaults(run=lambda options, module=module: _make(module))
 
-    collecting = commands.add_parser("collect", help="write a table of raw results from runs")
-    collecting.add_argument("table", choices=TABLES, help="as its experiment's name")
-    collecting.add_argument("runs", type=Path, nargs="+", help="folders with runs")
-    collecting.add_argument("--add", action="store_true", help="keep the stored cells that are not under the folders")
-    collecting.set_defaults(run=_collect)
-
-    comparing = commands.add_parser("reruns", help="compare runs with the raw results of the same cells")
-    comparing.add_argument("table", choices=[*OF_AGENTS, *OF_METHODS], help="of raw results")
-    comparing.add_argument("runs", type=Path, help="folder with runs")
-    comparing.set_defaults(run=lambda options: _module("studies.reruns").compare(options.table, options.runs))
+    _add_tables(commands)
 
     submitting = commands.add_parser("submit", help="make submissions to the board from runs of the track small")
     submitting.add_argument("runs", type=Path, help="folder with run directories")
@@ -89,6 +80,20 @@ def _parser() -> argparse.ArgumentParser:
     measuring.add_argument("--together", type=int, nargs="+", default=[64, 1024], help="seeds of one job")
     measuring.set_defaults(run=lambda options: _module("studies.gpu").measure(options))
     return parser
+
+
+def _add_tables(commands: Any) -> None:
+    """Add the commands on tables of raw results."""
+    collecting = commands.add_parser("collect", help="write a table of raw results from runs")
+    collecting.add_argument("table", choices=TABLES, help="as its experiment's name")
+    collecting.add_argument("runs", type=Path, nargs="+", help="folders with runs")
+    collecting.add_argument("--add", action="store_true", help="keep the stored cells that are not under the folders")
+    collecting.set_defaults(run=_collect)
+
+    comparing = commands.add_parser("reruns", help="compare runs with the raw results of the same cells")
+    comparing.add_argument("table", choices=[*OF_AGENTS, *OF_METHODS], help="of raw results")
+    comparing.add_argument("runs", type=Path, help="folder with runs")
+    comparing.set_defaults(run=lambda options: _module("studies.reruns").compare(options.table, options.runs))
 
 
 def _module(name: str) -> Any:

@@ -60,9 +60,11 @@ class TaskEmbeddings:
         num_directions: int,
         num_quantiles: int,
     ) -> None:
-        counts = {"num_samples": num_samples, "num_references": num_references, "num_directions": num_directions}
         require(*one_of(EMBEDDINGS, embedding=embedding))
-        require(*at_least_one(**counts, buffer_size=buffer_size, num_quantiles=num_quantiles))
+        require(
+            *at_least_one(num_samples=num_samples, num_references=num_references, num_directions=num_directions),
+            *at_least_one(buffer_size=buffer_size, num_quantiles=num_quantiles),
+        )
         message = f"buffer_size must be at least num_samples={num_samples}, or no task is embedded, got {buffer_size}"
         require((buffer_size >= num_samples, message))
         self.embedding = embedding

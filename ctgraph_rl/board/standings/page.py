@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.board.standings import formats
@@ -91,8 +91,13 @@ def html(made: Sequence[Table], problems: Sequence[Problem] = ()) -> str:
     from jinja2.sandbox import SandboxedEnvironment
 
     here = Path(__file__).parent
-    style: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "undefined": StrictUndefined}
-    environment = SandboxedEnvironment(loader=FileSystemLoader(here), autoescape=True, **style)
+    environment = SandboxedEnvironment(
+        loader=FileSystemLoader(here),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
     environment.finalize = lambda value: terminal_text(value) if type(value) is str else value
     script = (here / "board.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

@@ -105,8 +105,8 @@ def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
     """Names of tasks below, numbers of blocks beside."""
     if len(labels) <= MOST_NAMES:
         upright = 90 if len(labels) > MOST_NUMBERS else 30
-        place = {"rotation": upright, "ha": "center" if upright == 90 else "right", "rotation_mode": "default"}
-        axes.set_xticks(range(len(labels)), map(short, labels), **place)
+        side = "center" if upright == 90 else "right"
+        axes.set_xticks(range(len(labels)), map(short, labels), rotation=upright, ha=side, rotation_mode="default")
     else:
         axes.set_xlabel("task, counted from 0")
     step = 1 + rows // 20

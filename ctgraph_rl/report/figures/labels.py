@@ -52,25 +52,7 @@ def draw_labels(section: Section) -> Any:
         _part(axes, 0, (start, end), text, colour=_colour(tasks[0] if len(tasks) == 1 else None), room=section.ends[-1])
     for row, (_, run) in enumerate(runs, 1):
         spans = run.history.spans if run.history else ()
-        of_label = dict(_tasks_of_labels(spans, blocks))
-        for span in spans:
-            colour = _colour(of_label.get(span.label))
-            place = (span.start, span.end)
-            look: dict[str, Any] = {
-                "colour": colour,
-                "room": section.ends[-1],
-                "opacity": 1.0 if span.learned else NOT_LEARNED,
-            }
-            _part(axes, row, place, str(span.label), **look)
-            if span.alarm:
-                axes.plot(
-                    [span.end, span.end],
-                    [row + 0.3, row + 0.48],
-                    color="black",
-                    linestyle="-",
-                    marker="",
-                    linewidth=1.2,
-                )
+        _draw_strip(axes, row, spans, blocks, room=section.ends[-1])
     for start, _, tasks in blocks[1:]:
         if tasks != next(before for _, end, before in blocks if end == start):
             axes.axvline(start, color="black", linestyle=(0, (3, 2)), linewidth=0.6)
@@ -80,6 +62,18 @@ def draw_labels(section: Section) -> Any:
     axes.tick_params(axis="y", length=0)
     frames_axis(axes)
     return figure
+
+
+def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any], room: float) -> None:
+    """Draw the labels of a run, and a mark below each alarm."""
+    of_label = dict(_tasks_of_labels(spans, blocks))
+    for span in spans:
+        colour = _colour(of_label.get(span.label))
+        opacity = 1.0 if span.learned else NOT_LEARNED
+        _part(axes, row, (span.start, span.end), str(span.label), colour=colour, room=room, opacity=opacity)
+        if span.alarm:
+            place = [span.end, span.end]
+            axes.plot(place, [row + 0.3, row + 0.48], color="black", linestyle="-", marker="", linewidth=1.2)
 
 
 def _runs(section: Section) -> list[tuple[str, Run]]:

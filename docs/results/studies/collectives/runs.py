@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,27 +76,33 @@ def measured(log: Path) -> tuple[dict[str, Any], list[dict[str, Any]]] | None:
         "seed": collective.config["seed"],
     }
     values = {key: metrics[key]["value"] for key in ("learning_time", "share_learned", "messages", "bytes", "helps")}
-    folders = {number: log.parent / f"member_{number:03}" for number in {each.member for each in collective.learned}}
-    solved = {number: _solved(folder) for number, folder in folders.items()}
-    below = {number: _below(folder) for number, folder in folders.items()}
+    members = dict.fromkeys(each.member for each in collective.learned)
+    folders = {number: log.parent / f"member_{number:03}" for number in members}
     returns = [each.final_return for each in collective.learned]
     final = {"final_return": math.fsum(0.0 if math.isnan(value) else value for value in returns) / len(returns)}
-    blocks = [
-        {
-            **cell,
+    blocks = []
+    for number, folder in folders.items():
+        own = [each for each in collective.learned if each.member == number]
+        blocks += [{**cell, **block} for block in _blocks(folder, own)]
+    every = collective.config["evaluation"]["every"] or frames
+    values |= {**final, **_promised(log.parent, collective.helps)}
+    return {**cell, "evaluated_every": every, **values, "numbers": about["numbers"], **machine_of(about)}, blocks
+
+
+def _blocks(member: Path, learned: Sequence[Any]) -> Iterator[dict[str, Any]]:
+    """Yield the cells of each block that a member learned."""
+    solved = _solved(member)
+    below = _below(member)
+    for each in learned:
+        yield {
             "member": each.member,
             "block": each.block,
             "task": each.label,
             "frames_to_learn": "" if each.frames_to_learn is None else each.frames_to_learn,
-            "frames_to_solve": solved[each.member].get(each.block, ""),
+            "frames_to_solve": solved.get(each.block, ""),
             "final_return": "" if math.isnan(each.final_return) else round(each.final_return, 6),
-            "share_below": below[each.member].get(each.block, ""),
+            "share_below": below.get(each.block, ""),
         }
-        for each in collective.learned
-    ]
-    every = collective.config["evaluation"]["every"] or frames
-    values |= {**final, **_promised(log.parent, collective.helps)}
-    return {**cell, "evaluated_every": every, **values, "numbers": about["numbers"], **machine_of(about)}, blocks
 
 
 def _solved(member: Path) -> dict[int, int]:

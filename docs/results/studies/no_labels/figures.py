@@ -25,10 +25,7 @@ def draw_strips(path: Path) -> None:
     spans = groups(read(SPANS), "curriculum", "stay", "detector", "num_fresh", "seed")
     figure = new_figure(7.2, 0.9 + 0.17 * (len(shown) + 1))
     axes, side = figure.subplots(1, 2, width_ratios=(5, 1), sharey=True)
-    for block in range(8):
-        axes.barh(0, stay, 0.8, left=block * stay, color=COLOURS[block % 4], linewidth=0)
-        axes.text((block + 0.5) * stay, 0, str(block % 4 + 1), **_text(COLOURS[block % 4]))
-        axes.axvline(block * stay, color="0", linewidth=0.6, linestyle=(0, (3, 2)))
+    _draw_tasks(axes, stay)
     for place, (_, line) in enumerate(shown, 1):
         own = spans[MASKS, "384000", line["detector"], line["num_fresh"], line["seed"]]
         of_label = {label: _task(own, label, stay) for label in {span["label"] for span in own}}
@@ -36,23 +33,41 @@ def draw_strips(path: Path) -> None:
             _strip(axes, place, span, COLOURS[of_label[span["label"]]])
         value = float(line["average_performance"])
         side.barh(place, value, 0.7, color="0.35")
-    firsts = {name: place for place, (name, _) in reversed(list(enumerate(shown, 1)))}
+    _name_learners(axes, side, [name for name, _ in shown])
+    axes.set(xlim=(0, 8 * stay), ylim=(len(shown) + 0.5, -0.5))
+    changes = range(0, 9 * stay, 2 * stay)
+    axes.set_xticks(changes, [f"{frames / 1e6:.2f}" for frames in changes])
+    axes.tick_params(axis="both", length=0, labelsize=7)
+    axes.set_xlabel("million frames; each strip is a seed", fontsize=7)
+    _share_axis(side)
+    save_figure(figure, path)
+
+
+def _name_learners(axes: Any, side: Any, shown: list[str]) -> None:
+    """Write the name of each learner beside its strips, and a line above them."""
+    firsts = {name: place for place, name in reversed(list(enumerate(shown, 1)))}
     names = {place: LEARNERS[name] for name, place in firsts.items()}
     axes.set_yticks([0, *(place + SEEDS / 2 - 0.5 for place in names)], ["true task", *names.values()], fontsize=7)
     for place in names:
         axes.axhline(place - 0.5, color="0", linewidth=0.5)
         side.axhline(place - 0.5, color="0", linewidth=0.5)
-    axes.set(xlim=(0, 8 * stay), ylim=(len(shown) + 0.5, -0.5))
-    axes.set_xticks(
-        [block * stay for block in range(0, 9, 2)], [f"{block * stay / 1e6:.2f}" for block in range(0, 9, 2)]
-    )
-    axes.tick_params(axis="both", length=0, labelsize=7)
-    axes.set_xlabel("million frames; each strip is a seed", fontsize=7)
+
+
+def _draw_tasks(axes: Any, stay: int) -> None:
+    """Draw the true tasks and their changes."""
+    for block in range(8):
+        colour = COLOURS[block % 4]
+        axes.barh(0, stay, 0.8, left=block * stay, color=colour, linewidth=0)
+        axes.text((block + 0.5) * stay, 0, str(block % 4 + 1), **_text(colour))
+        axes.axvline(block * stay, color="0", linewidth=0.6, linestyle=(0, (3, 2)))
+
+
+def _share_axis(side: Any) -> None:
+    """Give bars of performances an axis from 0 to 1."""
     side.set(xlim=(0, 1))
     side.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
     side.tick_params(axis="both", length=0, labelsize=7)
     side.set_xlabel("average\nperformance", fontsize=7)
-    save_figure(figure, path)
 
 
 def _text(background: str) -> dict[str, Any]:

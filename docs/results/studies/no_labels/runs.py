@@ -55,20 +55,8 @@ def measured(run: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     log, curriculum = RunLog.read(run / LOG), Curriculum.from_json(run / "curriculum.json")
     about, metrics = log.of_kind("run")[0], json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     config, delay = about["config"], metrics["detection_delay"]
-    detector = config.get("detector") or {}
     bounds = bounds_of_curriculum(curriculum).known
-    which = {
-        "curriculum": curriculum.name.removesuffix(" (modified)"),
-        "stay": curriculum.blocks[0].num_frames,
-        "agent": _module(config["agent"]),
-        "method": _module(config.get("method") or {}) or "finetune",
-        "detector": _module(detector),
-        "stable_phase": detector.get("stable_phase", ""),
-        "num_fresh": detector.get("num_fresh", ""),
-        "boundaries": curriculum.protocol.boundaries,
-        "task_id": curriculum.protocol.task_id,
-        "seed": config["seed"],
-    }
+    which = _settings(curriculum, config)
     undefined = delay["undefined"] is not None and not delay["n_undefined"]
     training = log.of_kind("training")
     before = {int(line["frames"]): last["return_mean"] for last, line in pairwise(training)}
@@ -86,15 +74,36 @@ def measured(run: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         **{name: about["versions"][name] for name in ("ctgraph_rl", "torch")},
         **machine_of(about),
     }
-    spans = [
-        {
-            **which,
-            **{"start": int(s.start), "end": int(s.end), "label": s.label, "learned": s.learned, "alarm": s.alarm},
-            "return_before": round(before[int(s.end)], 6) if s.alarm else "",
-        }
-        for s in label_spans(log)
-    ]
-    return line, spans
+    return line, [{**which, **_span(span, before)} for span in label_spans(log)]
+
+
+def _settings(curriculum: Any, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cells that tell what was run."""
+    detector = config.get("detector") or {}
+    return {
+        "curriculum": curriculum.name.removesuffix(" (modified)"),
+        "stay": curriculum.blocks[0].num_frames,
+        "agent": _module(config["agent"]),
+        "method": _module(config.get("method") or {}) or "finetune",
+        "detector": _module(detector),
+        "stable_phase": detector.get("stable_phase", ""),
+        "num_fresh": detector.get("num_fresh", ""),
+        "boundaries": curriculum.protocol.boundaries,
+        "task_id": curriculum.protocol.task_id,
+        "seed": config["seed"],
+    }
+
+
+def _span(span: Any, before: Mapping[int, float]) -> dict[str, Any]:
+    """Return the cells of a span, with the mean return before its alarm."""
+    return {
+        "start": int(span.start),
+        "end": int(span.end),
+        "label": span.label,
+        "learned": span.learned,
+        "alarm": span.alarm,
+        "return_before": round(before[int(span.end)], 6) if span.alarm else "",
+    }
 
 
 def _module(part: dict[str, Any]) -> str:
