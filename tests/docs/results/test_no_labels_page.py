@@ -163,7 +163,7 @@ def test_with_longer_stays_all_detectors_keep_both_graphs_at_their_price(made):
         for key in ("frames_not_learned", "frames_rolled_back"):
             assert {round(float(line[key]) / float(line["frames"]), 2) for line in long[name]} == {0.1}
     free = {(line["frames_not_learned"], line["frames_rolled_back"], line["delays"]) for line in long["amd"]}
-    assert free == {("0.0", "0.0", "16384")} and "pays with its delay of two batches alone" in PAGE
+    assert free == {("0.0", "0.0", "16384")} and "pays with its delay of two batches only" in PAGE
 
 
 def test_what_is_said_of_ewc_on_new_images_is_what_the_pairs_show(made):
