@@ -22,6 +22,9 @@ HERE = "ctgraph_rl"
 MASTERED = 0.9
 """Share of episodes, or of the optimal value, from which on something counts as mastered."""
 
+TENSORS = ("Tensor", "Tensor | None", Tensor, Tensor | None)
+"""Annotations of tensors, as text where a module postpones them."""
+
 Arguments = ParamSpec("Arguments")
 
 
@@ -134,7 +137,7 @@ def defined(
 
     def decorate(terms: Callable[Arguments, Tensor]) -> Callable[Arguments, Metric]:
         given_as = signature(terms)
-        tensors = [name for name, each in given_as.parameters.items() if each.annotation in ("Tensor", "Tensor | None")]
+        tensors = [name for name, each in given_as.parameters.items() if each.annotation in TENSORS]
 
         @wraps(terms)
         def metric(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:

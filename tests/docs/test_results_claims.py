@@ -18,7 +18,7 @@ def words(path: str) -> str:
     return " ".join((CHECKOUT / path).read_text(encoding="utf-8").split())
 
 
-SWEEPS = (CHECKOUT / "docs/how-to/sweeps.md").read_text(encoding="utf-8")
+TOGETHER = (CHECKOUT / "docs/how-to/seeds_together.md").read_text(encoding="utf-8")
 RESULTS, LIFELONG, README = words("docs/results/baselines.md"), words("docs/results/lifelong.md"), words("README.md")
 
 
@@ -311,4 +311,4 @@ def test_seeds_together_learn_as_runs_alone_do_and_the_page_says_what_would_have
     assert sizes == {("alone", "1"), ("together", "30")}
     corrected = statistics.holm([comparison.p_value for comparison, *_ in found.values()])
     assert min(corrected) > 0.05
-    assert as_alone.page_table() in SWEEPS
+    assert as_alone.page_table() in TOGETHER

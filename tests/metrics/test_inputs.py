@@ -91,6 +91,21 @@ def late(performance: Tensor) -> Tensor:
     return performance
 
 
+def test_a_metric_of_a_module_that_does_not_postpone_annotations_takes_lists():
+    def own(performance):
+        return performance[-1]
+
+    own.__annotations__["performance"] = Tensor
+    before = dict(METRICS)
+    try:
+        metric = defined("test/own", "x", "test")(own)
+    finally:
+        METRICS.clear()
+        METRICS.update(before)
+
+    assert metric([[0.0, 0.0], [0.5, 1.0]]).value == 0.75
+
+
 @pytest.mark.parametrize(("name", "which"), [("forgetting", "test/new"), ("another_name", "chaudhry2018/f")])
 def test_a_name_and_an_id_are_those_of_one_metric(name, which):
     def terms(performance: Tensor) -> Tensor:

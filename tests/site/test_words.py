@@ -44,7 +44,7 @@ SENTENCES = {
 
 TO_COME = (
     "docs/explanation/memory.md",
-    *(f"docs/how-to/{name}.md" for name in ("sweeps", "verify")),
+    "docs/how-to/verify.md",
     *(f"docs/reference/{name}.md" for name in ("curricula", "published_experiments", "speed_table")),
 )
 """Pages that still have such turns, or whose text a script makes."""

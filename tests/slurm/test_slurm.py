@@ -216,7 +216,9 @@ def test_a_cancelled_cell_saves_and_stays_cancelled(slurm, sweep, tmp_path):
 @pytest.fixture
 def packed(slurm, checkout, console_script, tmp_path) -> None:
     """Two tasks of the page's array, with two cells each, run."""
-    script = (checkout / "docs/how-to/sweeps.md").read_text().split("<!-- packed -->\n```bash\n")[1].split("```")[0]
+    script = (
+        (checkout / "docs/how-to/large_sweeps.md").read_text().split("<!-- packed -->\n```bash\n")[1].split("```")[0]
+    )
     for old, new in {"0-999": "0-1", "100": "2", "agent=lstm_ppo": " ".join(SLOW)}.items():
         assert old in script
         script = script.replace(old, new)

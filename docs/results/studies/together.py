@@ -1,4 +1,4 @@
-"""Whether seeds that are trained together learn as runs alone do: raw results, and what docs/how-to/sweeps.md says."""
+"""Whether seeds that are trained together learn as single runs do: what docs/how-to/seeds_together.md says."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def page_table() -> str:
         first, second, least = (f"{value:,.{digits}f}" for value in values)
         p_value = f"{comparison.p_value:.2f}"
         rows.append([f"`{agent}`", MEASURES[measure], first, second, str(comparison.ties), p_value, least])
-    return table(["agent", "measure", "alone", "together", "equal seeds", "p", "found with power 0.9"], rows)
+    return table(["agent", "measure", "single runs", "together", "equal seeds", "p", "found with power 0.9"], rows)
 
 
 def make() -> None:
