@@ -5,7 +5,6 @@ What needs torch is imported where it is used: the process that hands tests to o
 
 from __future__ import annotations
 
-import copy
 import gc
 import json
 import os
@@ -14,17 +13,13 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from ctgraph_rl import packages
@@ -69,25 +64,13 @@ def one_thread() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def files_parsed_once() -> Iterator[None]:
-    """Hydra parses each yaml file once in a process; one that has changed again."""
+def hydra_reads_once() -> Iterator[None]:
+    """Hydra finds, reads and merges the files of equal choices once in a process."""
+    from helpers.hydra_once import compose_once
+
     with pytest.MonkeyPatch.context() as patch:
-        for source in (FileConfigSource, ImportlibResourcesConfigSource):
-            patch.setattr(source, "load_config", _parsed_once(source.load_config))
+        compose_once(patch)
         yield
-
-
-def _parsed_once(load_config: Callable[..., Any]) -> Callable[..., Any]:
-    parsed: dict[Any, Any] = {}
-
-    def load(source: Any, config_path: str) -> Any:
-        path = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
-        key = (path, source.provider, path.exists() and path.read_bytes())
-        if key not in parsed:
-            parsed[key] = load_config(source, config_path)
-        return copy.deepcopy(parsed[key])
-
-    return load
 
 
 @pytest.fixture(autouse=True)
@@ -98,10 +81,10 @@ def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def compose() -> Iterator[Callable[..., DictConfig]]:
-    """Composes a configuration from overrides, as the command line does; equal overrides once."""
+    """Composes a configuration from overrides, as the command line does."""
     GlobalHydra.instance().clear()
     with of_hydra(hydra.initialize_config_dir)(packages.conf_dir()):
-        yield lambda *overrides, **how: copy.deepcopy(_composed(overrides, **how))
+        yield lambda *overrides, **how: hydra.compose("config", overrides=[*overrides], **how)
 
 
 @pytest.fixture
@@ -117,23 +100,6 @@ def compile_by(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None
 
     yield set_backend
     compiled.cache_clear()
-
-
-@cache
-def _composed(overrides: Sequence[str], **how: Any) -> DictConfig:
-    """As Hydra composes them; the groups that are chosen once, however their settings are changed."""
-    parsed = OverridesParser.create().parse_overrides([*overrides])
-    settings = [each for each in parsed if not _is_group(each.key_or_group)]
-    if how or not settings or any(each.is_delete() or each.is_sweep_override() for each in parsed):
-        return hydra.compose("config", overrides=[*overrides], **how)
-    choices = tuple(each.input_line for each in parsed if each not in settings)
-    cfg = copy.deepcopy(_composed(choices))
-    ConfigLoaderImpl._apply_overrides_to_config(settings, cfg)
-    return cfg
-
-
-def _is_group(key: str) -> bool:
-    return key.startswith("hydra") or Path(packages.conf_dir(), key).is_dir()
 
 
 @pytest.fixture

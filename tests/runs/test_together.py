@@ -115,8 +115,14 @@ def test_a_group_of_an_older_numbers_version_is_noticed_where_a_run_alone_has_no
     assert code_changes({"numbers": 1, "together": [0, 1]}, now) == ["ctgraph_rl (numbers version 1 before, 2 now)"]
 
 
-@pytest.mark.parametrize("method", ["finetune", pytest.param("ewc", marks=pytest.mark.slow)])
-def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(monkeypatch, capsys, together, method):
+@pytest.mark.parametrize(
+    ("method", "finished", "others"),
+    [("finetune", [1], []), pytest.param("ewc", [1, 2], [3, 4], marks=pytest.mark.slow)],
+)
+def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(
+    monkeypatch, capsys, together, method, finished, others
+):
+    """It is stopped between batches, between saves of its seeds, and between results of its seeds."""
     settings = ("together=true", f"method={method}", *PPO)
     if method != "finetune":
         assert sweep(monkeypatch, SEEDS, *settings, "hydra.sweep.dir=whole") == 0
@@ -130,15 +136,15 @@ def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(monk
     capsys.readouterr()
     assert sweep(monkeypatch, "seed=1", *settings[1:]) == 1
     assert "was begun with the seeds [0, 1, 2] together: resume it with together=true and" in capsys.readouterr().out
-    stops = [(between_saves, 0), (between_results, 1), (between_results, 2)]
-    for place, finished in stops:
+    stops = [(between_saves, 0), *((between_results, number) for number in finished)]
+    for place, number_finished in stops:
         with monkeypatch.context() as patch:
             stop_after(patch, *place)
             assert sweep(patch, SEEDS, *settings) == 130
-        assert [(run / "metrics.json").exists() for run in runs()] == [number < finished for number in range(3)]
-    assert sweep(monkeypatch, "seed=0,1,2,3,4", *settings) == 0
+        assert [(run / "metrics.json").exists() for run in runs()] == [seed < number_finished for seed in range(3)]
+    assert sweep(monkeypatch, ",".join([SEEDS, *map(str, others)]), *settings) == 0
 
-    assert [first_line(run)["together"] for run in runs()] == 3 * [[0, 1, 2]] + 2 * [[3, 4]]
+    assert [first_line(run)["together"] for run in runs()] == 3 * [[0, 1, 2]] + len(others) * [others]
     assert all(same(one, other) for one, other in zip(runs()[:3], whole, strict=True))
     assert all((run / "restarts.jsonl").exists() for run in runs()[:3])
 
