@@ -73,6 +73,14 @@ def hydra_reads_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_waiting_for_the_disk() -> Iterator[None]:
+    """No file of a test needs to survive a loss of power; tests of this count the calls."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda number: None)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """Restore the variable that a run sets, so that no test leaves it to processes of another."""

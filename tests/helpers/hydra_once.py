@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.defaults_list import DefaultsList
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
@@ -52,8 +53,15 @@ def compose_once(patch: pytest.MonkeyPatch) -> None:
             merged[id(defaults)] = compose_from_defaults_list(loader, defaults, repo)
         return copy.deepcopy(merged[id(defaults)])
 
+    patch.setattr(CachingConfigRepository, "__init__", _of_one_delegate)
     patch.setattr(config_loader_impl, "create_defaults_list", list_once)
     patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
+
+
+def _of_one_delegate(repo: CachingConfigRepository, delegate: Any) -> None:
+    """As Hydra's, with a shallow copy of what it asks: it replaces the list of sources and changes none of them."""
+    repo.delegate = copy.copy(delegate)
+    repo.cache = {}
 
 
 def _chooses(repo: Any, override: Any) -> bool:
