@@ -66,7 +66,7 @@ def one_thread() -> None:
 @pytest.fixture(autouse=True, scope="session")
 def hydra_reads_once() -> Iterator[None]:
     """Hydra finds, reads and merges the files of equal choices once in a process."""
-    from helpers.hydra_once import compose_once
+    from helpers.sweeping import compose_once
 
     with pytest.MonkeyPatch.context() as patch:
         compose_once(patch)

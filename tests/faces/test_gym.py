@@ -103,6 +103,7 @@ def test_an_id_of_an_earlier_version_is_refused():
         gymnasium.make("ctgraph/CT-POSR-B1-v0")
 
 
+@pytest.mark.slow
 def test_an_id_after_its_module_needs_no_import_and_no_torchrl(checkout, tmp_path):
     code = (
         "import gymnasium, sys; print(gymnasium.make('ctgraph_rl.gym:ctgraph/CT-SU-B1-v0').action_space); "

@@ -44,7 +44,11 @@ def without_time(measurements) -> list[dict]:
 
 
 @pytest.mark.parametrize(
-    ("agent", "method", "method_settings"), [("ppo", None, {}), ("a2c", "ewc", {"coeff": 7.5, "num_samples": 64})]
+    ("agent", "method", "method_settings"),
+    [
+        pytest.param("ppo", None, {}, marks=pytest.mark.slow),
+        ("a2c", "ewc", {"coeff": 7.5, "num_samples": 64}),
+    ],
 )
 def test_three_lines_of_python_give_the_bits_of_the_command_line(tmp_path, agent, method, method_settings):
     changes = [f"agent.{key}={value}" for key, value in {**SMALL, "learning_rate": 0.01}.items()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from baselines.update import seeds as together
 from baselines.update.seeds import Group
 from baselines.update.stack import Stack
 from baselines.update.update import losses_of, total_loss, unstacked, update, with_tensors
-from ctgraph_rl import Block, Curriculum, RunLog, learn_curriculum
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.stacked import learn_together, why_not_together
 from ctgraph_rl.runs.config import target
 from ctgraph_rl.runs.train import new_agent, with_method
@@ -33,8 +34,12 @@ EACH = [*((name, "finetune") for name in BATCHED), *(("ppo", method) for method 
 
 SOME = [("a2c", "mask_lc"), ("ppo", "ewc"), ("ppo_published", "mask_lc"), ("prioritized dqn", "finetune")]
 
-CURRICULUM = of(Block(ONE, 80), Block(THREE, 120), Block(ONE, 56), task_id="at_boundaries")
+CURRICULUM = of(Block(ONE, 48), Block(THREE, 72), Block(ONE, 24), task_id="at_boundaries")
 """Blocks of no whole number of batches, which are of 32 frames, and a task that returns."""
+
+LESS_EVALUATED = replace(CURRICULUM, evaluation=Evaluation(1, greedy=False, before=False))
+
+ONE_BATCH_EACH = replace(LESS_EVALUATED, blocks=tuple(Block(task, 32) for task in (ONE, THREE, ONE)))
 
 
 class Together(NamedTuple):
@@ -117,7 +122,7 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
 def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
     make, monkeypatch, name, method
 ):
-    its, found = make(name, method), []
+    its, found = make(name, method, curriculum=LESS_EVALUATED), []
     start, update = Group.start_task, Group._update
 
     def started(group, task=None):
@@ -175,7 +180,8 @@ def wide(value: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize(("name", "method"), others_slow(EACH, ("a2c", "finetune"), ("dqn", "finetune")))
 def test_each_seed_ends_near_its_run_alone(make, name, method):
-    its = make(name, method, *["agent.target_update_interval=1"] * ("dqn" in name))  # within the first batch
+    soon = ["agent.target_update_interval=1"] * ("dqn" in name)  # within the first batch
+    its = make(name, method, *soon, curriculum=ONE_BATCH_EACH)
 
     group, logs = its.learn()
 
@@ -262,7 +268,7 @@ def test_large_minibatches_and_compiled_methods_are_learned_one_seed_after_the_o
 ):
     compile_by("eager")
     monkeypatch.setattr(together, "LARGEST_MINIBATCH", largest)
-    its = make(name, method, *settings)
+    its = make(name, method, *settings, curriculum=ONE_BATCH_EACH)
 
     group, logs = its.learn(SEEDS[:2])
 
@@ -315,7 +321,7 @@ def spoil(monkeypatch, numbers=(1,)) -> None:
 
     def spoiled(group, batch):
         batches.append(batch)
-        for number in numbers if len(batches) == 4 else ():
+        for number in numbers if len(batches) == 3 else ():
             group.learners[number].weights[0].data.fill_(torch.nan)
         return learn(group, batch)
 
@@ -335,18 +341,18 @@ def test_a_seed_that_is_not_finite_fails_alone_and_changes_no_bit_of_another(mak
 
     assert list(failed) == [1]
     assert re.match(
-        r"seed 3: (loss_\w+|the largest weight) is nan in block 2 after 112 frames; the run stops here", str(failed[1])
+        r"seed 3: (loss_\w+|the largest weight) is nan in block 2 after 80 frames; the run stops here", str(failed[1])
     )
     for number in (0, 2):
         assert equal(states(group)[number], states(spoiled)[number])
         assert lines(logs[number]) == lines(spoiled_logs[number])
     assert lines(spoiled_logs[1]) == lines(logs[1])[: len(lines(spoiled_logs[1]))]
-    assert all(line["frames"] < 112 for line in lines(spoiled_logs[1]))
+    assert all(line["frames"] < 80 for line in lines(spoiled_logs[1]))
     resumed_logs = [
-        RunLog.resume(tmp_path / f"{seed}.jsonl", state["log"]) for seed, state in zip(SEEDS, kept[5], strict=True)
+        RunLog.resume(tmp_path / f"{seed}.jsonl", state["log"]) for seed, state in zip(SEEDS, kept[3], strict=True)
     ]
     resumed = its.group()
-    again = learn_together(CURRICULUM, resumed, SEEDS, resumed_logs, saved=kept[5])
+    again = learn_together(CURRICULUM, resumed, SEEDS, resumed_logs, saved=kept[3])
     assert str(again[1]) == str(failed[1])
     assert equal(states(resumed), states(spoiled))
 
@@ -358,7 +364,7 @@ def test_a_group_of_which_every_seed_has_failed_stops(make, monkeypatch):
     failed = learn_together(CURRICULUM, its.group(), SEEDS, logs)
 
     assert list(failed) == [0, 1, 2]
-    assert all(lines(log)[-1]["frames"] < 112 for log in logs)
+    assert all(lines(log)[-1]["frames"] < 80 for log in logs)
 
 
 def test_what_cannot_be_one_batch_says_why(compose):

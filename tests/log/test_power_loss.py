@@ -280,7 +280,7 @@ def check(watched, name: str, count: int, tmp_path: Path, monkeypatch) -> None:
 
 
 def test_a_run_whose_machine_stopped_ends_as_if_it_had_not(watched, tmp_path, monkeypatch):
-    check(watched, "checkpoints", CASES["checkpoints"] // 5, tmp_path, monkeypatch)
+    check(watched, "checkpoints", CASES["checkpoints"] // 10, tmp_path, monkeypatch)
 
 
 @pytest.mark.slow

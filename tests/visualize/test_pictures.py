@@ -323,6 +323,7 @@ def test_the_pages_pictures_are_made_by_its_commands_and_small():
     assert max(stored.values()) < 60_000
 
 
+@pytest.mark.slow
 def test_a_backend_that_is_not_there_matters_to_no_figure(tmp_path):
     program = (
         "import os, sys\nfrom ctgraph_rl.report.style import new_figure, require_packages, style\n"

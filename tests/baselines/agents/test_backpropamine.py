@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from helpers.small_agents import batches, learnt_from
+from helpers.small_agents import batches, learnt_from, others_slow
 from torch import nn
 
 from baselines.cells.backpropamine import MODULATIONS, Backpropamine
@@ -160,7 +160,7 @@ def recalled(made: Backpropamine, num_updates: int, num_blanks: int = 6) -> floa
     return loss.item()
 
 
-@every_modulation
+@pytest.mark.parametrize("modulation", others_slow(MODULATIONS, "retroactive"))
 def test_plastic_weights_recall_a_symbol_after_blanks_where_slow_weights_are_fixed(modulation):
     assert recalled(cell(8, modulation=modulation), 150) < 0.1
 

@@ -15,6 +15,7 @@ from helpers.small_agents import (
     TASKS,
     Tiny,
     batches,
+    others_slow,
     same,
     seen,
     small,
@@ -43,6 +44,8 @@ KEEPS = {method.__name__: method for method in (*MASKS, Scratch)} | {
 }
 
 every_mask = pytest.mark.parametrize("method", MASKS)
+
+every_family = pytest.mark.parametrize("name", others_slow(KEEPS, "MaskLC", "Scratch", "PackNet", "CKARL"))
 
 
 def said(attached: AgentWithMethod, number: int, data: Any) -> dict[Any, Tensor]:
@@ -133,7 +136,7 @@ def test_an_earlier_tasks_outputs_stay_bit_equal_while_others_are_learned(compos
     assert not same(others[0], others[1]) and not same(others[1], others[2])
 
 
-@pytest.mark.parametrize("name", KEEPS)
+@every_family
 def test_a_task_that_comes_again_goes_on_with_what_it_had(compose, name):
     attached = with_method(compose, "ppo", KEEPS[name]())
     stay(attached, 0)
@@ -150,7 +153,7 @@ def test_a_task_that_comes_again_goes_on_with_what_it_had(compose, name):
     assert same(weights_for(attached, 1), other)
 
 
-@pytest.mark.parametrize("name", KEEPS)
+@every_family
 def test_a_task_that_never_began_is_acted_in_as_the_first(compose, name):
     attached = with_method(compose, "ppo", KEEPS[name]())
     before = weights_for(attached, 2)
@@ -163,7 +166,7 @@ def test_a_task_that_never_began_is_acted_in_as_the_first(compose, name):
     assert same(unseen, first) and not same(unseen, second)
 
 
-@pytest.mark.parametrize("name", KEEPS)
+@every_family
 def test_a_task_beyond_those_of_the_curriculum_is_refused(compose, name):
     attached = with_method(compose, "ppo", KEEPS[name](), (ONE, TWO))
     for number in (0, 1, 0):
