@@ -72,8 +72,9 @@ def _parser() -> argparse.ArgumentParser:
     submitting.add_argument("--given", default="", help="ends the names of submissions, such as -at_boundaries")
     submitting.set_defaults(run=_submit)
 
-    measuring = commands.add_parser("gpu", help="measure a GPU within half an hour, into gpu.json and its page")
-    measuring.add_argument("--minutes", type=float, default=28.0, help="of all parts; the tests have at most a third")
+    measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
+    measuring.add_argument("--minutes", type=float, default=4.0, help="of a call; the next one goes on")
+    measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")
     measuring.add_argument("--seconds", type=float, default=1.0, help="least time of a measurement")
     measuring.add_argument("--rows", type=int, nargs="+", default=[65536, 262144], help="of the environment")
     measuring.add_argument("--envs", type=int, nargs="+", default=[256, 4096, 65536], help="of one agent")

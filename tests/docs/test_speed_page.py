@@ -12,10 +12,8 @@ from helpers.paths import CHECKOUT
 
 from benchmarks import environment_ladder as ladder
 from benchmarks import environments as benchmark
-from ctgraph_rl import CTGraphEnv, Rows, Steps, rollout
-from ctgraph_rl.core import reading
+from ctgraph_rl import Rows, Steps, rollout
 from ctgraph_rl.core.dynamics import words_of
-from ctgraph_rl.tasks.configurations import ct_co_b1
 
 PAGE = CHECKOUT / "docs" / "how-to" / "go_fast.md"
 
@@ -183,55 +181,62 @@ def test_what_the_page_says_of_gpus_in_words_was_measured(gpu):
     assert f"{said}, and PPO trains on {ppo:.0f} million" in readme
 
 
-def test_a_report_of_a_gpu_has_its_parts_as_they_were_measured_and_the_time_of_many_seeds(gpu, monkeypatch):
+@pytest.fixture
+def two_rungs(gpu, monkeypatch) -> list[str]:
+    """Rungs of learning, the last one of seeds as one job, and one of the environment; the names of those measured."""
+    measured: list[str] = []
     monkeypatch.setattr(gpu, "TESTS", ("-c", "print('FAILED one'); print('1 failed')"))
-    for module, rung in {gpu.ladder: gpu.ladder.COPY, gpu.learning: "lstm_ppo, 1,024 seeds as one job"}.items():
-        made = [ladder.Rung(rung, "SU", 2, lambda: lambda: 7, 1e6)]
-        monkeypatch.setattr(module, "rungs", lambda *what, made=made: made)
-    options = argparse.Namespace(minutes=0.2, seconds=0.001, rows=[2], envs=[2], together=[2])
+    names = {gpu.ladder: (gpu.ladder.COPY,), gpu.learning: ("ppo, captured", "lstm_ppo, 1,024 seeds as one job")}
+    for module, ways in names.items():
+        monkeypatch.setattr(
+            module,
+            "rungs",
+            lambda *what, ways=ways: [ladder.Rung(way, "SU", 2, lambda: lambda: 7, 1e6) for way in ways],
+        )
+    measure = ladder.measure
 
-    report = dict(gpu.parts(torch.device("cpu"), options))
+    def noted(rung, *how):
+        measured.append(rung.name)
+        measure(rung, *how)
+
+    monkeypatch.setattr(gpu.ladder, "measure", noted)
+    return measured
+
+
+OPTIONS = argparse.Namespace(minutes=0.4, seconds=0.001, rows=[2], envs=[2], together=[2], commit="abc")
+
+
+def test_a_report_of_a_gpu_has_its_parts_the_most_important_first_and_the_time_of_many_seeds(gpu, two_rungs):
+    report = dict(gpu.parts(torch.device("cpu"), OPTIONS, {}))
     text = gpu.section(json.loads(json.dumps(report)))
 
+    assert two_rungs == ["lstm_ppo, 1,024 seeds as one job", "ppo, captured", gpu.ladder.COPY]
+    assert [row["way"] for row in report["learning"]] == ["ppo, captured", "lstm_ppo, 1,024 seeds as one job"]
     assert report["tests"] == {"exit_code": 0, "said": "1 failed", "failed": ["FAILED one"]}
-    assert "Tests marked `cuda`: 1 failed." in text
+    assert "commit abc." in text and "Tests marked `cuda`: 1 failed." in text
     assert re.search(r"1,024 seeds of the main job as one job: [\d.e+-]+ minutes of learning, computed", text)
     assert gpu.section({name: report[name] for name in ("machine", "commit")}).startswith("Measured on")
 
 
-def test_the_benchmark_measures_co_with_waiting_and_rotation_and_both_with_noise():
-    tasks = benchmark.configurations()
+def test_a_report_of_a_gpu_goes_on_where_it_stopped_unless_the_commit_is_another(gpu, two_rungs):
+    report = json.loads(json.dumps(dict(gpu.parts(torch.device("cpu"), OPTIONS, {}))))
+    del report["learning"][0], report["environment"]
+    kept = report["learning"][0]
+    two_rungs.clear()
 
-    assert list(tasks) == ["SU", "CO", "SU, noise 10", "CO, noise 10"]
-    assert (tasks["CO"].graph.wait_prob, tasks["CO"].observations.read_rotation) == (0.5, 10)
-    assert [task.observations.read_noise for task in tasks.values()] == [0, 0, 10, 10]
+    again = dict(gpu.parts(torch.device("cpu"), OPTIONS, report))
+    goes_on = list(two_rungs)
+    dict(gpu.parts(torch.device("cpu"), OPTIONS, {**report, "commit": "other"}))
 
-
-def test_a_noise_bank_repeats_each_of_its_noises_and_no_other():
-    task = benchmark.configurations()["SU, noise 10"]
-    rows = Rows([task] * 2000, noise_bank=8)
-    steps = rollout(rows, torch.zeros(1, 2000, dtype=torch.int64), Steps.empty(rows, 1))
-
-    known = reading.add_saturating(
-        task.images.bank(0)[:1].expand(8, -1, -1, -1), reading.noise_bank((10,), 8, (1, 12, 12))
-    )
-    counts = (steps.observation[0].flatten(1).unsqueeze(1) == known.flatten(1)).all(-1).sum(0)
-
-    assert counts.sum() == 2000
-    assert ((counts - 250).abs() < 5 * 250**0.5).all()
+    assert goes_on == ["ppo, captured", gpu.ladder.COPY]
+    assert again["learning"][1] == kept and again["tests"] == report["tests"]
+    assert len(two_rungs) == 2 + 3
 
 
-def test_noise_of_a_bank_saturates_and_follows_each_rows_amplitude():
-    task = benchmark.configurations()["SU, noise 10"]
-    images = torch.tensor([[250, 3]], dtype=torch.uint8)
+def test_no_measurement_of_a_gpu_begins_after_the_time_of_a_call(gpu, two_rungs):
+    late = argparse.Namespace(**{**vars(OPTIONS), "minutes": 0.0})
 
-    assert reading.add_saturating(images, torch.tensor([[10, 10]], dtype=torch.uint8)).tolist() == [[255, 13]]
-    assert reading.noise_bank((0, 200), 50, (1, 8, 8))[:50].max() == 0
-    assert reading.noise_bank((0, 200), 50, (1, 8, 8))[50:].max() == 200
-    env = CTGraphEnv([task, benchmark.configurations()["SU"]], noise_bank=4)
-    assert torch.equal(env.reset()["observation"][1], task.images.bank(0)[0])
+    report = dict(gpu.parts(torch.device("cpu"), late, {"commit": "abc"}))
 
-
-def test_a_noise_bank_of_no_number_is_refused():
-    with pytest.raises(ValueError, match=r"noise_bank must be an integer in 0..2\*\*31, got -1"):
-        Rows([ct_co_b1()], noise_bank=-1)
+    assert two_rungs == [] and report["learning"] == []
+    assert report["tests"]["exit_code"] is None

@@ -1,7 +1,8 @@
-"""Measures a GPU within half an hour, in a checkout on a machine with one.
+"""Measures a GPU in calls of four minutes, in a checkout on a machine with one.
 
-It runs the tests marked ``cuda`` and the ladders of the environment and of learning, writes gpu.json after each part,
-and the section on GPUs of docs/reference/speed_table.md from it. Commit both. Ctrl-C ends a part with what it has.
+It runs the tests marked ``cuda`` and the ladders of learning and of the environment, the most important rungs first,
+and writes gpu.json after each. Given again at the same commit on the same kind of GPU, it goes on where it stopped.
+At its end it writes the section on GPUs of docs/reference/speed_table.md. Commit both.
 Where there is no GPU, it writes the section alone, from the gpu.json that is there.
 """
 
@@ -13,8 +14,8 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from types import SimpleNamespace
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,34 +31,79 @@ TESTS = ("-m", "pytest", "-q", "-m", "cuda", "-n", "0", "tests/learn/test_cuda.p
 SECTION = re.compile(r"(?<=<!-- gpu -->\n).*?(?=<!-- end of gpu -->)", re.DOTALL)
 
 
+SHARE = 0.75
+"""Of the minutes of a call; no measurement begins after it, so that the last one ends in time."""
+
+
 def measure(options: argparse.Namespace) -> None:
     """Measure, and write the file and the page."""
-    if torch.cuda.is_available():
-        report: dict[str, Any] = {}
-        for name, part in parts(torch.device("cuda"), options):
-            report[name] = part
-            FILE.write_text(json.dumps(report, indent=1) + "\n")
     found = json.loads(FILE.read_text()) if FILE.exists() else None
+    if torch.cuda.is_available():
+        before = found or {}
+        found = {}
+        for name, part in parts(torch.device("cuda"), options, before):
+            found[name] = part
+            FILE.write_text(json.dumps(found, indent=1) + "\n")
     PAGE.write_text(with_section(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")
 
 
-def parts(device: torch.device, options: argparse.Namespace) -> Iterator[tuple[str, Any]]:
-    """Yield the parts of the report by name, as they are measured."""
-    start, seconds = time.perf_counter(), 60 * options.minutes
+def parts(device: torch.device, options: argparse.Namespace, before: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the parts of the report by name, each again after every measurement; the most important first.
 
-    def left(share: float) -> SimpleNamespace:
-        """Return how long to measure: at most this share of the time that is left."""
-        return SimpleNamespace(
-            rounds=3, seconds=options.seconds, limit=share * (seconds - (time.perf_counter() - start))
-        )
-
-    yield "machine", {"device": machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
-    yield "commit", said("git", "describe", "--always", "--dirty", "--abbrev=12")
-    yield "tests", tested(seconds / 3)
-    environment = ladder.rungs(device, options.rows, configurations())
-    yield "environment", ladder.found(ladder.climbed(environment, left(0.4), device))
+    Args:
+        device: what is measured.
+        options: of the command line.
+        before: the report of an earlier call, which is continued if it is of the same commit and device.
+    """
+    end = time.perf_counter() + SHARE * 60 * options.minutes
+    about = {"device": machine(device), "driver": said("nvidia-smi", *DRIVER), "versions": versions()}
+    commit = options.commit or present_commit()
+    known = before if before.get("commit") == commit and before.get("machine") == about else {}
+    yield "machine", about
+    yield "commit", commit
+    finished = known.get("tests", {}).get("exit_code") is not None
+    yield "tests", known["tests"] if finished else tested(end - time.perf_counter())
     agents = list(learning.rungs(device, options.envs, options.together))
-    yield "learning", ladder.found(ladder.climbed(agents, left(0.9), device), learning.ENVIRONMENT)
+    environment = ladder.rungs(device, options.rows, configurations())
+    for name, rungs, yardstick in (
+        ("learning", agents, learning.ENVIRONMENT),
+        ("environment", environment, ladder.COPY),
+    ):
+        left = continued(rungs, known.get(name, []))
+        yield name, ladder.found(rungs, yardstick)
+        for rung in sorted(left, key=importance):
+            if time.perf_counter() > end:
+                break
+            ladder.measure(rung, 3, options.seconds, device)
+            yield name, ladder.found(rungs, yardstick)
+
+
+def importance(rung: ladder.Rung) -> tuple[bool, int]:
+    """Return what rungs are sorted by: seeds as one job first, then those with few environments."""
+    return "seeds as one job" not in rung.name, rung.num_rows
+
+
+def continued(rungs: Sequence[ladder.Rung], rows: Sequence[Mapping[str, Any]]) -> list[ladder.Rung]:
+    """Give rungs what an earlier call measured of them; return those that are left to measure."""
+    measured = {(row["way"], row["task"], row["rows"]): row for row in rows}
+    left = []
+    for rung in rungs:
+        row = measured.get((rung.name, rung.task, rung.num_rows))
+        if row is None:
+            left.append(rung)
+        elif "failure" in row:
+            rung.failure = row["failure"]
+        else:
+            rung.speeds = [row["per_second"]] * row["rounds"]
+    return left
+
+
+def present_commit() -> str:
+    """Return the commit of the checkout, marked where files differ from it other than those written here."""
+    commit = said("git", "rev-parse", "--short=12", "HEAD")
+    changed = said("git", "status", "--porcelain", "--untracked-files=no").splitlines()
+    others = [line for line in changed if Path(line[3:]).name not in (FILE.name, PAGE.name)]
+    return f"{commit}-dirty" if others else commit
 
 
 DRIVER = ("--query-gpu=driver_version", "--format=csv,noheader")
