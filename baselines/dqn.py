@@ -18,7 +18,8 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, encoder, num_actions_of, require_weights
+from baselines.parts.networks import Data, num_actions_of, require_weights
+from baselines.parts.networks import encoder as make_encoder
 from baselines.parts.prioritized import LARGEST_ALPHA
 from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
@@ -37,6 +38,7 @@ class DQN(QLearner):
         priority_alpha: how strongly the TD error decides what is replayed; 0 is uniform (Schaul et al. 2016, arXiv
             1511.05952).
         priority_beta: how much of that the loss corrects, in [0, 1].
+        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
         settings: the arguments of `QLearner`. Where different states show the same image, a one-step target is the
             same after every decision, so nothing is learned about decisions: ``n_steps`` helps.
     """
@@ -54,6 +56,7 @@ class DQN(QLearner):
         double: bool,
         priority_alpha: float,
         priority_beta: float,
+        encoder: str = "mlp",
         **settings: Any,
     ) -> None:
         require(
@@ -77,7 +80,7 @@ class DQN(QLearner):
         ]
         head = nn.Sequential(*layers)
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
-        features = encoder(observation_spec, hidden_size)
+        features = make_encoder(observation_spec, hidden_size, kind=encoder)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)
         self.dqn = DQNLoss(self.greedy, delay_value=True, double_dqn=double, action_space=action_spec)
         self.set_networks(self.greedy, self.dqn, action_spec, learning_rate)

@@ -36,7 +36,8 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, EncoderModule, encoder, guided, num_actions_of, require_weights
+from baselines.parts.networks import Data, EncoderModule, guided, num_actions_of, require_weights
+from baselines.parts.networks import encoder as make_encoder
 from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
@@ -233,6 +234,7 @@ class MOHQA(QLearner):
         average_decay: d, of the running average of phi.
         noise_std: standard deviation of the noise while acting.
         noise_share: probability of a feature to get noise.
+        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
         settings: the arguments of `QLearner`.
     """
 
@@ -259,6 +261,7 @@ class MOHQA(QLearner):
         average_decay: float,
         noise_std: float,
         noise_share: float,
+        encoder: str = "mlp",
         **settings: Any,
     ) -> None:
         require(
@@ -276,7 +279,7 @@ class MOHQA(QLearner):
         super().__init__(gamma=gamma, **settings)
         self.gamma = gamma
         self.predict_sum = predict_sum
-        inner = encoder(observation_spec, hidden_size)
+        inner = make_encoder(observation_spec, hidden_size, kind=encoder)
         projected = Projected(inner.module, hidden_size, num_features)
         trunk = EncoderModule(projected, in_keys=inner.in_keys, out_keys=["features"])
         layers = nn.Sequential(nn.ReLU(), linear_layer(num_features, num_actions), nn.Sigmoid())

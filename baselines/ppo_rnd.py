@@ -188,7 +188,7 @@ class PPORND(PPO):
         shape = (spec.shape.numel(), width, num_features)
         self.novelty = Novelty(*shape, high=high, num_envs=self.num_envs, gamma=bonus_gamma)
         self.bonus_critic = TensorDictSequential(
-            encoder(observation_spec, width, settings["num_layers"]), critic("features", width)
+            encoder(observation_spec, width, settings["num_layers"], kind=self.encoder), critic("features", width)
         )
         self.bonus_learning_rate = bonus_learning_rate
         self._make_bonus_optimiser()

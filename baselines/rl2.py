@@ -105,7 +105,15 @@ class RL2(PPO):
     ) -> TrialTrunk:
         """Build a recurrent trunk that also reads the last action and reward."""
         num_actions = num_actions_of(action_spec)
-        trunk = recurrent(observation_spec, hidden_size, num_layers, num_actions, self.cell, previous=num_actions + 1)
+        trunk = recurrent(
+            observation_spec,
+            hidden_size,
+            num_layers,
+            num_actions,
+            make_cell=self.cell,
+            kind=self.encoder,
+            previous=num_actions + 1,
+        )
         message = "reads_action and reads_reward must be false, as RL2 reads its last action and reward itself"
         require((not trunk.own_keys, message))
         return TrialTrunk(trunk, num_actions, self.trial_episodes)

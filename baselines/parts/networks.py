@@ -18,7 +18,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
 from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, can_branch, linear_layer, reset
 from baselines.parts.distinct import distinct, histories, renumbered
-from ctgraph_rl.checks import require, require_memory
+from ctgraph_rl.checks import one_of, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 from ctgraph_rl.learn.guide import GUIDED_ACTION
 
@@ -27,6 +27,11 @@ Data = Mapping[Any, Tensor]
 
 GROUP = "group"
 """The key of numbers of frames, int64, the same for frames with the same inputs; see `EncoderModule.groups`."""
+
+
+ENCODERS = ("mlp", "cnn")
+TILE = 4
+NUM_CHANNELS = 16
 
 
 class Place(NamedTuple):
@@ -46,6 +51,36 @@ def places(root: nn.Module, tensors: Sequence[Tensor]) -> list[Place]:
     return [found[id(tensor)] for tensor in tensors]
 
 
+class Convolutions(nn.Module):
+    """Two convolutions with ReLU: of 4 x 4 pixels at a stride of 4, then of 3 x 3 of their outputs with zeros around.
+
+    Each is a linear layer over patches: methods and stacks treat its weights as those of any linear layer.
+
+    Args:
+        shape: channels, rows and columns of an image; rows and columns are multiples of 4.
+    """
+
+    def __init__(self, shape: torch.Size) -> None:
+        super().__init__()
+        whole = len(shape) == 3 and all(side % TILE == 0 for side in shape[1:])
+        rule = f"encoder must be mlp for observations of shape {tuple(shape)}"
+        require((whole, f"{rule}: cnn reads images whose sides are multiples of {TILE} pixels"))
+        self.shape = shape
+        self.first = linear_layer(shape[0] * TILE**2, NUM_CHANNELS)
+        self.second = linear_layer(9 * NUM_CHANNELS, NUM_CHANNELS)
+        self.num_features = NUM_CHANNELS * shape[1:].numel() // TILE**2
+
+    def forward(self, flat: Tensor) -> Tensor:
+        """Map flat images, [..., pixels], to [..., num_features]."""
+        channels, rows, columns = self.shape
+        tiled = flat.unflatten(-1, (channels, rows // TILE, TILE, columns // TILE, TILE))
+        tiles = tiled.movedim((-4, -2), (-5, -4)).flatten(-3)
+        found = nn.functional.pad(self.first(tiles).relu(), (0, 0, 1, 1, 1, 1))
+        heights = [found[..., i : i + rows // TILE, :, :] for i in range(3)]
+        patches = [height[..., j : j + columns // TILE, :] for height in heights for j in range(3)]
+        return self.second(torch.cat(patches, dim=-1)).relu().flatten(-3)
+
+
 class Encoder(nn.Module):
     """Observations to features: scale uint8 to [0, 1], flatten, linear layers with ReLU.
 
@@ -55,14 +90,24 @@ class Encoder(nn.Module):
         num_features: width of every layer.
         num_layers: linear layers, at least 1.
         num_extra: width of further inputs, such as a one-hot task id.
+        kind: ``mlp``, or ``cnn`` with `Convolutions` before the linear layers.
     """
 
     def __init__(
-        self, shape: torch.Size, high: float, num_features: int, num_layers: int = 1, num_extra: int = 0
+        self,
+        shape: torch.Size,
+        high: float,
+        num_features: int,
+        num_layers: int = 1,
+        num_extra: int = 0,
+        kind: str = "mlp",
     ) -> None:
         super().__init__()
+        require(*one_of(ENCODERS, encoder=kind))
         self.event_dims, self.scale = len(shape), 1 / high
-        self.linear = linear_layer(shape.numel() + num_extra, num_features)
+        self.convolutions = Convolutions(shape) if kind == "cnn" else None
+        num_inputs = shape.numel() if self.convolutions is None else self.convolutions.num_features
+        self.linear = linear_layer(num_inputs + num_extra, num_features)
         layers = [
             layer for _ in range(num_layers - 1) for layer in (linear_layer(num_features, num_features), nn.ReLU())
         ]
@@ -72,6 +117,7 @@ class Encoder(nn.Module):
         """Map uint8 [..., *shape] and further inputs, [..., n] each, to [..., num_features] of the weights' dtype."""
         dtype = self.linear.weight.dtype
         flat = observation.flatten(-self.event_dims).to(dtype) * self.scale
+        flat = flat if self.convolutions is None else self.convolutions(flat)
         flat = torch.cat([flat, *(values.to(dtype) for values in extra)], dim=-1) if extra else flat
         return self.further(self.linear(flat).relu())
 
@@ -246,19 +292,22 @@ def highest(spec: TensorSpec) -> float:
     return 1.0 if spec.dtype.is_floating_point else spec.space.high.max().item()
 
 
-def encoder(observation_spec: Composite, num_features: int, num_layers: int = 1, **extra: int) -> EncoderModule:
+def encoder(
+    observation_spec: Composite, num_features: int, num_layers: int = 1, kind: str = "mlp", **extra: int
+) -> EncoderModule:
     """Build an encoder that reads ``observation`` and, if the environment has it, ``task_id``; it writes ``features``.
 
     Args:
         observation_spec: the environment's, without batch dimensions.
         num_features: width of the features.
         num_layers: linear layers.
+        kind: ``mlp`` or ``cnn``.
         extra: further keys to read, with their widths.
     """
     spec = observation_spec["observation"]
     if "task_id" in observation_spec.keys():  # noqa: SIM118, a Composite is no dict
         extra = {"task_id": observation_spec["task_id"].shape.numel(), **extra}
-    module = Encoder(spec.shape, highest(spec), num_features, num_layers, sum(extra.values()))
+    module = Encoder(spec.shape, highest(spec), num_features, num_layers, num_extra=sum(extra.values()), kind=kind)
     return EncoderModule(module, in_keys=["observation", *extra], out_keys=["features"])
 
 
@@ -268,11 +317,12 @@ def recurrent(
     num_layers: int,
     num_actions: int,
     make_cell: MakeCell,
+    kind: str = "mlp",
     **extra: int,
 ) -> RecurrentModule:
     """Build an `encoder` with a cell of the same width; it writes ``memory``, and its state under the cell's keys."""
     cell = make_cell(num_features, num_features, num_actions)  # first, as the order decides the weights of a seed
-    return RecurrentModule(encoder(observation_spec, num_features, num_layers, **extra), cell)
+    return RecurrentModule(encoder(observation_spec, num_features, num_layers, kind=kind, **extra), cell)
 
 
 def linear(in_key: str, num_features: int, out_key: str, num_outputs: int) -> TensorDictModule:

@@ -22,7 +22,6 @@ from baselines.parts.networks import (
     actor,
     copied_action,
     critic,
-    encoder,
     entropy,
     log_probabilities,
     make_orthogonal,
@@ -31,6 +30,7 @@ from baselines.parts.networks import (
     require_weights,
     sequences_of,
 )
+from baselines.parts.networks import encoder as make_encoder
 from baselines.update.optimiser import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
 from ctgraph_rl.core.device import torchs_defaults
@@ -72,6 +72,7 @@ class PolicyGradient(Learner):
         deduplicate: compute frames of a minibatch with the same inputs once, with memory those with the same history:
             faster on a CPU where observations have no pixel noise and minibatches are large. Sums are rounded in
             another order. A GPU computes all frames.
+        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
     """
 
     num_epochs = num_minibatches = 1
@@ -96,6 +97,7 @@ class PolicyGradient(Learner):
         orthogonal_init: bool = False,
         cell: MakeCell | None = None,
         deduplicate: bool = False,
+        encoder: str = "mlp",
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm, compile)
         require(
@@ -116,6 +118,7 @@ class PolicyGradient(Learner):
         require((self.memory or cell is None, no_cell))
         self.cell = LSTM if cell is None else cell
         self.deduplicate = deduplicate
+        self.encoder = encoder
         require_weights(observation_spec, hidden_size, num_layers, num_actions_of(action_spec) + 1, self.memory)
         self.gamma = gamma
         self.gae_lambda = gae_lambda
@@ -142,8 +145,9 @@ class PolicyGradient(Learner):
     ) -> TensorDictModuleBase:
         """Build the layers before the heads, which with memory end in a cell."""
         if not self.memory:
-            return encoder(observation_spec, hidden_size, num_layers)
-        return recurrent(observation_spec, hidden_size, num_layers, num_actions_of(action_spec), self.cell)
+            return make_encoder(observation_spec, hidden_size, num_layers, kind=self.encoder)
+        num_actions = num_actions_of(action_spec)
+        return recurrent(observation_spec, hidden_size, num_layers, num_actions, make_cell=self.cell, kind=self.encoder)
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return zeros for the cell's state; an empty state without memory."""

@@ -98,6 +98,7 @@ class RecurrentQ(QLearner):
         hidden_size: width of features and cell.
         learning_rate: of Adam.
         cell: what remembers, a class of `baselines.cells` or a partial of one.
+        encoder: ``mlp``, or ``cnn`` with two convolutions before the first layer, for images.
         settings: the arguments of `QLearner`; batches are sequences of ``num_steps`` steps.
     """
 
@@ -111,6 +112,7 @@ class RecurrentQ(QLearner):
         hidden_size: int,
         learning_rate: float,
         cell: MakeCell = LSTM,
+        encoder: str = "mlp",
         **settings: Any,
     ) -> None:
         num_steps = settings["num_steps"]
@@ -126,7 +128,8 @@ class RecurrentQ(QLearner):
         pairs = num_steps * self.num_quantiles**2
         require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
-        self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions_of(action_spec), cell)
+        num_actions = num_actions_of(action_spec)
+        self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions, make_cell=cell, kind=encoder)
         unstored = [key for key in self.trunk.state_keys if key.startswith(UNSTORED)]
         message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {unstored}"
         require((not unstored, f"{message}: use agent=lstm_ppo"))

@@ -36,9 +36,10 @@ POLICY_GRADIENT = ("a2c.A2C", "reinforce.Reinforce", "ppo.PPO", "ppo_count.PPOCo
 
 ADDED: dict[str, dict[str, Any]] = {
     "run": {"portable": False, "protocol.guide_frames": None, "evaluation.adapt_episodes": None},
-    **{f"baselines.{agent}": {"deduplicate": False} for agent in POLICY_GRADIENT},
-    **{f"baselines.{agent}": {"cell": LSTM} for agent in WITH_CELL[2:]},
-    **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False} for agent in WITH_CELL[:2]},
+    **{f"baselines.{agent}": {"encoder": "mlp"} for agent in ("dqn.DQN", "mohqa.MOHQA")},
+    **{f"baselines.{agent}": {"deduplicate": False, "encoder": "mlp"} for agent in POLICY_GRADIENT},
+    **{f"baselines.{agent}": {"cell": LSTM, "encoder": "mlp"} for agent in WITH_CELL[2:]},
+    **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False, "encoder": "mlp"} for agent in WITH_CELL[:2]},
     **{f"baselines.methods.mask_{name.lower()}.Mask{name}": {"backbone_seed": None} for name in ("RI", "LC", "BLC")},
     "curricula.from_axes": {
         "read_noise": 0,
