@@ -95,7 +95,7 @@ def test_the_best_fixed_sequence_is_optimal_without_waits_and_reaches_the_goal_w
     assert len(re.findall("CT-", number)) == len(TASKS) and verdict == "**agrees**"
 
 
-def test_each_sentence_that_is_not_run_has_a_command():
-    waiting = [row for row in rows() if row[-1] == "**not run yet**"]
+def test_each_test_that_is_not_run_has_a_command():
+    waiting = [row for row in rows() if "not run yet" in " ".join(row)]
 
     assert len(re.findall(r"^```bash$", PAGE.split("## Commands")[1], flags=re.M)) == len(waiting)
