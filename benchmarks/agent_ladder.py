@@ -1,7 +1,7 @@
 """How fast agents learn on one device: ``python -m baselines.benchmark --device cuda``.
 
 PPO and LSTM-PPO learn as in a run: step by step, captured, and PPO compiled as well. Many seeds learn as one job, with
-stacked weights. The yardstick is the environment alone, with given actions, on the same device and in the same run.
+stacked weights. The yardstick is the environment with given actions, on the same device and in the same run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ctgraph_rl.packages import class_named, conf_dir
 from ctgraph_rl.tasks.configurations import ct_fo_b1, ct_su_b1
 from ctgraph_rl.tasks.task import Task
 
-ENVIRONMENT = "environment alone"
+ENVIRONMENT = "environment only"
 
 TASKS = {
     "ppo": ("CT-FO-B1", ct_fo_b1((1, 2))),

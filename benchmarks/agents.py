@@ -1,15 +1,15 @@
-"""How fast agents learn, beside Stable-Baselines3: ``python -m baselines.benchmark``.
+"""How fast agents learn, beside Stable-Baselines3: python -m baselines.benchmark.
 
 Every agent learns with the settings of its yaml file on 256 rows, Stable-Baselines3's with the same ones as far as it
-has them: on `ctgraph_rl.sb3.SB3VecEnv`, and on what its ``make_vec_env`` makes of the single environment; and with its
+has them: on ctgraph_rl.sb3.SB3VecEnv, and on what its make_vec_env makes of the single environment; and with its
 own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
 slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
 it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core. ``--cells`` measures LSTM-PPO with each cell in place of the LSTM, alone. Ctrl-C ends a measurement, and what was
+core. --cells measures LSTM-PPO with each cell in place of the LSTM, alone. Ctrl-C ends a measurement, and what was
 measured until then is printed.
 
-``--device cuda`` measures `benchmarks.agent_ladder` instead, ``--startup`` how long a run takes to its first step,
-beside the bare imports of torch and torchrl; ``--roofline`` how fast its matrix products are, which bound it.
+--device cuda measures benchmarks.agent_ladder instead, --startup how long a run takes to its first step,
+beside the bare imports of torch and torchrl; --roofline how fast its matrix products are, which bound it.
 """
 
 from __future__ import annotations

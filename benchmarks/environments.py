@@ -1,4 +1,4 @@
-"""How fast the environment runs, with ``--device cuda`` on a GPU, and with ``--sizes`` what reading costs.
+"""How fast the environment runs, with --device cuda on a GPU, and with --sizes what reading costs.
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
 table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of

@@ -1,6 +1,6 @@
 """Compares two runs: equal, equal up to rounding, or different, since when and in what.
 
-``ctgraph-rl compare A B`` compares all measurements but their times, and the weights of the agents. The exit code is 0
+ctgraph-rl compare A B compares all measurements but their times, and the weights of the agents. The exit code is 0
 for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for what is no run.
 """
 

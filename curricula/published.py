@@ -224,7 +224,7 @@ MISSING = (
     Missing(
         "the goals of penn_a_swap",
         "which goals the authors' trials had",
-        "they were drawn again in every generation; penn_a_swap draws by the same rule from a seed of its own",
+        "they were drawn again in every generation; penn_a_swap draws by the same rule from another seed",
     ),
 )
 """Sequences that cannot be recovered, and why; nothing here is guessed."""

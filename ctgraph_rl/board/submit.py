@@ -1,6 +1,6 @@
-"""``ctgraph-rl submit RUNS --to DIR`` makes a submission of finished runs: a folder of files that anybody can check.
+"""ctgraph-rl submit RUNS --to DIR makes a submission of finished runs: a folder of files that anybody can check.
 
-``ctgraph-rl submit --template > method.yaml`` prints what an author says about a method, to fill in once.
+ctgraph-rl submit --template > method.yaml prints what an author says about a method, to fill in once.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""``ctgraph-rl collectives RUN_OR_FOLDER... [--out FOLDER]`` writes a page on runs with ``exchange=NAME``.
+"""ctgraph-rl collectives RUN_OR_FOLDER... [--out FOLDER] writes a page on runs with exchange=NAME.
 
 It has a table of learning time, returns and messages of each collective, a figure of learning time over the number of
-members, and who helped whom; the same as tidy CSV files. Members are runs like any other: ``ctgraph-rl report``.
+members, and who helped whom; the same as tidy CSV files. Members are runs like any other: ctgraph-rl report.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """A run in another program's format.
 
-``--format parquet`` writes the tidy tables of a run as Parquet and CSV, see `ctgraph_rl.log.tables`.
+--format parquet writes the tidy tables of a run as Parquet and CSV, see ctgraph_rl.log.tables.
 
-``ctgraph-rl export RUN --format l2logger --out DIR`` writes what l2metrics reads: log format 1.1 of l2logger.
-A training interval, and an evaluation of a task, is one experience with its mean return as ``reward``. Time stamps
+ctgraph-rl export RUN --format l2logger --out DIR writes what l2metrics reads: log format 1.1 of l2logger.
+A training interval, and an evaluation of a task, is one experience with its mean return as reward. Time stamps
 count experiences, so that equal runs give equal files; a runtime that is taken from them means nothing.
 """
 

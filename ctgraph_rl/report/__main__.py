@@ -1,4 +1,4 @@
-"""``ctgraph-rl report RUN_OR_FOLDER... [--out FOLDER]`` writes a page of figures and tables of all runs."""
+"""ctgraph-rl report RUN_OR_FOLDER... [--out FOLDER] writes a page of figures and tables of all runs."""
 
 from __future__ import annotations
 

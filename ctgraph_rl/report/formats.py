@@ -24,16 +24,16 @@ NOT_MODIFIED: Modified = {}
 WIDTH = 80
 """Characters of a line on a terminal."""
 
-MEANS = "mean [95 % interval]"
-_EXACT = "solved seeds and median times [exact 95 % interval]"
+MEANS = "mean [95 % CI]"
+_EXACT = "solved seeds and median times [exact 95 % CI]"
 LEGEND = f"{MEANS}, {_EXACT}"
 
 LEGENDS = {
     "exact": LEGEND,
-    "t": f"mean [Student's 95 % interval], {_EXACT}",
+    "t": f"mean [Student's 95 % CI], {_EXACT}",
     "std": f"mean ± standard deviation over seeds, {_EXACT}",
-    "iqm": f"interquartile mean [bootstrap 95 % interval], {_EXACT}",
-    "seeds": "each run alone",
+    "iqm": f"interquartile mean [bootstrap 95 % CI], {_EXACT}",
+    "seeds": "single runs",
 }
 """What the numbers of a table are, by `ctgraph_rl.report.results.STATISTICS`, and of a table of single runs."""
 

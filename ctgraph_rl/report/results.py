@@ -1,10 +1,10 @@
 """Many runs as one table: each agent on each curriculum, with intervals over seeds.
 
-``ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--statistics std] [--per-seed] [--csv FILE]``
+ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--statistics std] [--per-seed] [--csv FILE]
 
 Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
-undefined metric is counted, as in n = 9/10. What cannot be read is named and left out, and runs of one configuration
-whose code has changed in between are shown apart; the exit code is then 1.
+undefined metric is counted, as in n = 9/10. The exit code is 1 if a run cannot be read, or if the code of one
+configuration has changed between runs: they are named, and the latter shown separately.
 """
 
 from __future__ import annotations

@@ -315,8 +315,8 @@ def test_the_ladder_of_a_device_has_both_agents_and_seeds_together(capsys, monke
 
     lines = [line.split("|") for line in capsys.readouterr().out.splitlines()[4:]]
     assert [line[3].strip() for line in lines] == [
-        *("environment alone", "ppo, step by step", "ppo, captured", "ppo, compiled and captured"),
-        *("ppo, 2 seeds as one job", "environment alone", "lstm_ppo, step by step", "lstm_ppo, captured"),
+        *("environment only", "ppo, step by step", "ppo, captured", "ppo, compiled and captured"),
+        *("ppo, 2 seeds as one job", "environment only", "lstm_ppo, step by step", "lstm_ppo, captured"),
         "lstm_ppo, 2 seeds as one job",
     ]
 

@@ -191,7 +191,7 @@ def test_the_table_is_printed_and_written(tmp_path, monkeypatch, capsys):
 
     shown = capsys.readouterr().out
     assert "    average performance   0.81 [0.02, 1.61]    n = 2\n" in shown
-    assert "mean [95 % interval], solved seeds and median times [exact 95 % interval]" in shown
+    assert "mean [95 % CI], solved seeds and median times [exact 95 % CI]" in shown
     test = "sign-flip p = 0.5, Holm 0.5: not distinguishable with 2 seeds"
     sentence = f"better in 2, equal in 0, worse in 0; {test}; 4 seeds find a difference of 0.25"
     assert sentence in " ".join(shown.split())

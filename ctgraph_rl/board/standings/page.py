@@ -1,8 +1,8 @@
-"""``ctgraph-rl board DIR... --out FOLDER`` writes a page with tables of submissions, and the same for programs.
+"""ctgraph-rl board DIR... --out FOLDER writes a page with tables of submissions, and the same for programs.
 
-``board.html`` needs nothing else and no network; ``board.md`` and ``tables.tex`` are the same tables; ``board.json``,
-``entries.csv`` and ``scores.csv`` hold their numbers, ``croissant.json`` describes the CSV files, and
-``model-index.yaml`` is the results file that model hubs read. The exit code is 1 if something was left out.
+board.html needs nothing else and no network; board.md and tables.tex are the same tables; board.json,
+entries.csv and scores.csv hold their numbers, croissant.json describes the CSV files, and
+model-index.yaml is the results file that model hubs read. The exit code is 1 if something was left out.
 """
 
 from __future__ import annotations
