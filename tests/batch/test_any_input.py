@@ -250,7 +250,7 @@ def broken(draw: Any) -> tuple[Any, dict[str, Any]]:
     return target, {name: draw(st.sampled_from(ILLEGAL[name])) for name in names}
 
 
-@examples(250)
+@examples(125)
 @given(broken())
 def test_every_broken_field_is_named_with_its_value_in_one_value_error(target_and_values):
     target, values = target_and_values

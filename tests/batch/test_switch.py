@@ -18,6 +18,7 @@ from helpers.oracles import (
     scripts,
     surjective,
 )
+from helpers.small_agents import others_slow
 from helpers.task_families import RICH, env_of, started, switching
 from tensordict import TensorDict
 from torch import Tensor
@@ -132,7 +133,7 @@ def drive(kind: str, env: CTGraphEnv, actions: Tensor) -> TensorDict:
     return torch.stack(steps, dim=1)
 
 
-@pytest.mark.parametrize("switch", [*PER_ROW, *TOGETHER])
+@pytest.mark.parametrize("switch", others_slow([*PER_ROW, *TOGETHER], *PER_ROW, TOGETHER[0]))
 def test_every_way_of_starting_episodes_gives_the_same_data(switch):
     actions = scripts(36, 6, num_actions=4)
 
@@ -217,7 +218,7 @@ def half_way(switch: Switch | None, pending: bool) -> CTGraphEnv:
 HALF_WAY = [(None, True), *((switch, pending) for switch in (*PER_ROW, *TOGETHER[1:]) for pending in (False, True))]
 
 
-@pytest.mark.parametrize(("switch", "pending"), HALF_WAY)
+@pytest.mark.parametrize(("switch", "pending"), others_slow(HALF_WAY, *HALF_WAY[::2]))
 def test_a_checkpoint_in_the_middle_of_a_change_is_continued_bit_for_bit(switch, pending):
     env, other = half_way(switch, pending), env_of(RICH, None, seed=8)
     if switch is not None:

@@ -369,11 +369,16 @@ def test_every_transform_of_torchrl_is_tested_or_has_a_reason():
     assert len(known) == len(set(known))
 
 
+@pytest.fixture(scope="module")
+def bare() -> Data:
+    """The data without a transform."""
+    return make_env().rollout(len(ACTIONS), actions=list(ACTIONS), break_when_any_done=False)
+
+
 @pytest.mark.parametrize("name", OF_THE_ENVIRONMENT)
-def test_a_transform_does_to_the_data_what_it_says_and_nothing_else(name):
+def test_a_transform_does_to_the_data_what_it_says_and_nothing_else(bare, name):
     make, holds, changed = OF_THE_ENVIRONMENT[name]
     env = TransformedEnv(make_env(), make())
-    bare = make_env().rollout(len(ACTIONS), actions=list(ACTIONS), break_when_any_done=False)
     actions = [action.view(env.batch_size) for action in ACTIONS]
     if name == "DTypeCastTransform":
         actions = [action.int() for action in actions]
