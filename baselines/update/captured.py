@@ -186,7 +186,8 @@ class CapturedGroup:
 
     def gradient_step(self, minibatch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Take a gradient step of all seeds; return losses and norms, [seeds] each."""
-        if minibatch["action"].shape[1] != self.first.minibatch_size:
+        is_usual = minibatch["action"].shape[1] == self.first.minibatch_size
+        if not is_usual or not self._region.takes(minibatch):
             return update(self.first, self.stack.state, minibatch)
         measured = self._region(minibatch)
         return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))

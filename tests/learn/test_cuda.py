@@ -159,7 +159,7 @@ def test_several_seeds_learn_by_graphs_what_they_learn_step_by_step_and_never_wa
         agents = [agent_of(compose, name, env, "agent.num_envs=64").to("cuda") for _ in range(3)]
         group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
         if not is_captured:
-            group._region = group._usual_update
+            group.gradient_step = group._usual_update
         collected = collect.collect(env, group.policy, 10**9, group.first.num_steps, group.first.initial_state)
         measured = [group.learn(next(collected)) for _ in range(WARM_UP + 1)]
         if is_captured:
