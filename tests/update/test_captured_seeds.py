@@ -111,6 +111,17 @@ def test_draws_go_on_from_a_saved_state(make):
     assert group.draws.seed.flatten().tolist() == [*THREE_SEEDS]
 
 
+def test_what_changes_an_agent_at_the_start_of_a_task_changes_what_acts(make):
+    group = make("a2c")
+    assert group.stack.weights
+
+    with torch.no_grad():
+        group.agents[1].weights[1].fill_(0.5)
+    group.start_task(0)
+
+    assert (group.stack.kept[group.stack.weights[1]][1] == 0.5).all()
+
+
 @pytest.mark.parametrize(
     ("name", "overrides"),
     others_slow(
