@@ -16,7 +16,7 @@ import yaml
 
 from baselines.parts.policy_gradient import PolicyGradient
 from baselines.update.captured import CapturedGroup
-from benchmarks.environment_ladder import WAYS, Run, Rung
+from benchmarks.environment_ladder import WAYS, Rung, TimedRun
 from ctgraph_rl.batch.specs import specs_of
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import collect
@@ -83,7 +83,7 @@ def built(name: str, task: Task, **changes: Any) -> PolicyGradient:
 
 def learning(
     name: str, task: Task, num_envs: int, device: torch.device, captured: bool = True, compile: bool = False
-) -> Run:
+) -> TimedRun:
     """Return a run of one agent: it learns from a batch."""
     changes = {"num_envs": num_envs, **({"compile": True} if compile else {})}
     agent = built(name, task, **changes).to(device)
@@ -101,7 +101,7 @@ def learning(
     return run
 
 
-def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> Run:
+def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
     """Return a run of many seeds of an agent, as ``together=true`` trains them: each learns from a batch of its own."""
     agents = [built(name, task).to(device) for _ in range(num_seeds)]
     generators = [torch.Generator(device="cpu").manual_seed(seed) for seed in range(num_seeds)]

@@ -28,7 +28,7 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from baselines.parts.catalogue import Entry, catalogue
+from baselines.parts.catalogue import CatalogueEntry, catalogue
 from benchmarks import agent_ladder, roofline, startup
 from benchmarks.environment_ladder import climbed, found, until
 from benchmarks.environment_ladder import table as ladder_table
@@ -105,7 +105,7 @@ class Contender:
         self.solved.append(None)
 
 
-def agent_named(name: str) -> Entry:
+def agent_named(name: str) -> CatalogueEntry:
     """Return the class and hyperparameters of an agent."""
     return next(entry for entry in catalogue("agent") if entry.name == name)
 

@@ -29,7 +29,7 @@ from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.task import Task
 
 T = TypeVar("T")
-Run = Callable[[], int]
+TimedRun = Callable[[], int]
 """Runs for a while, and returns the number of observations."""
 
 NUM_STEPS = 32
@@ -47,7 +47,7 @@ class Rung:
     name: str
     task: str
     num_rows: int
-    make: Callable[[], Run]
+    make: Callable[[], TimedRun]
     goal: float = 0.0  # observations a second; 0: none
     speeds: list[float] = field(default_factory=list)
     failure: str = ""
@@ -66,7 +66,7 @@ def rungs(device: torch.device, num_rows: Sequence[int], tasks: Mapping[str, Tas
     return measured
 
 
-def _copy(num_rows: int, size: Sequence[int], device: torch.device) -> Run:
+def _copy(num_rows: int, size: Sequence[int], device: torch.device) -> TimedRun:
     source = torch.randint(0, 255, (NUM_STEPS, num_rows, *size), dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
 
@@ -77,7 +77,7 @@ def _copy(num_rows: int, size: Sequence[int], device: torch.device) -> Run:
     return run
 
 
-def _torchrl(tasks: Sequence[Task], device: torch.device) -> Run:
+def _torchrl(tasks: Sequence[Task], device: torch.device) -> TimedRun:
     env = CTGraphEnv(tasks, device=device, check_actions=False, info=False, kernel="off")
 
     def run() -> int:
@@ -88,7 +88,7 @@ def _torchrl(tasks: Sequence[Task], device: torch.device) -> Run:
     return run
 
 
-def _eager(tasks: Sequence[Task], device: torch.device) -> Run:
+def _eager(tasks: Sequence[Task], device: torch.device) -> TimedRun:
     rows, steps, actions = _prepared(tasks, device)
 
     def run() -> int:
@@ -98,7 +98,7 @@ def _eager(tasks: Sequence[Task], device: torch.device) -> Run:
     return run
 
 
-def _captured(tasks: Sequence[Task], device: torch.device) -> Run:
+def _captured(tasks: Sequence[Task], device: torch.device) -> TimedRun:
     rows, steps, actions = _prepared(tasks, device)
 
     def taken(given: dict[Any, Tensor]) -> dict[Any, Tensor]:
@@ -109,7 +109,7 @@ def _captured(tasks: Sequence[Task], device: torch.device) -> Run:
     return _replayed(Region(taken), rows, actions)
 
 
-def _fused(tasks: Sequence[Task], device: torch.device) -> Run:
+def _fused(tasks: Sequence[Task], device: torch.device) -> TimedRun:
     rows, steps, actions = _prepared(tasks, device)
     step = torch.compile(write_step, fullgraph=True, dynamic=False)
     draws = torch.compile(dynamics.words_of, fullgraph=True, dynamic=False)
@@ -174,7 +174,7 @@ def write_step(
     return tuple(after), words
 
 
-WAYS: dict[str, Callable[[Sequence[Task], torch.device], Run]] = {
+WAYS: dict[str, Callable[[Sequence[Task], torch.device], TimedRun]] = {
     "TorchRL rollout": _torchrl,
     "rollout": _eager,
     "rollout, captured": _captured,
@@ -188,7 +188,7 @@ def _prepared(tasks: Sequence[Task], device: torch.device) -> tuple[Rows, Steps,
     return rows, Steps.empty(rows, NUM_STEPS), torch.randint(0, 3, (NUM_STEPS, len(tasks)), device=device)
 
 
-def _replayed(region: Region, rows: Rows, actions: Tensor) -> Run:
+def _replayed(region: Region, rows: Rows, actions: Tensor) -> TimedRun:
     """Return a run of a region that takes the states of rows and returns those that steps led to."""
 
     def run() -> int:
@@ -229,7 +229,7 @@ def measure(rung: Rung, rounds: int, seconds: float, device: torch.device) -> No
         rung.failure = f"{type(error).__name__}: {error}".splitlines()[0]
 
 
-def _speed(run: Run, at_once: int, seconds: float, device: torch.device) -> float:
+def _speed(run: TimedRun, at_once: int, seconds: float, device: torch.device) -> float:
     """Return observations a second; the device is waited for after so many runs at once."""
     count = 0
     start = finished(device)

@@ -70,7 +70,7 @@ def _with_noise(task: Task) -> Task:
 
 
 @dataclass
-class Contender:
+class Way:
     """One way to step."""
 
     name: str
@@ -242,12 +242,12 @@ def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
     yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
 
 
-def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Contender]:
+def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Way]:
     """Everything that is measured, in the order of the table."""
-    found: list[Contender] = []
+    found: list[Way] = []
 
     def add(configuration: str, n: int, ways: Iterator[tuple[str, Callable[[], int]]]) -> None:
-        found.extend(Contender(name, configuration, n, run, []) for name, run in ways)
+        found.extend(Way(name, configuration, n, run, []) for name, run in ways)
 
     tasks = configurations()
     ways = tuple(SUFFIX)[: 1 + with_kernel]
@@ -266,7 +266,7 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
     return found
 
 
-def table(measured: list[Contender]) -> str:
+def table(measured: list[Way]) -> str:
     """Medians in Markdown, with their spread over the rounds and their ratios to the yardsticks of the same rows."""
     lines = ["| rows | task | way | M obs/s | spread | / memcpy | / trivial |", "|---|---|---|---|---|---|---|"]
     median = {(one.num_rows, one.configuration, one.name): statistics.median(one.speeds) for one in measured}

@@ -85,15 +85,15 @@ class Agent(Protocol):
         ...
 
 
-class Detector(Protocol):
+class DetectorLike(Protocol):
     """A detector of task changes, which gives tasks labels. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 
-    def labelling(self, method: Method) -> Method:
+    def labelling(self, method: MethodLike) -> MethodLike:
         """Return a method whose task ids and boundaries are this detector's."""
         ...
 
 
-class Method(Protocol):
+class MethodLike(Protocol):
     """A lifelong-learning method: it changes how an agent learns. `ctgraph_rl.run` builds it as ``Class(**yaml)``."""
 
     def prepare(self, curriculum: Curriculum) -> Curriculum:

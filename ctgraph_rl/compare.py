@@ -39,7 +39,7 @@ PARTS = {
 }
 """Keys of a log's first line by what they say; all others, but for the settings, say what the code was."""
 
-Line = Mapping[str, Any]
+LogLine = Mapping[str, Any]
 
 
 class Compared(NamedTuple):
@@ -73,7 +73,7 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *_groups_of_experts(*logs), *notes])
 
 
-def _measured(line: Line) -> Line:
+def _measured(line: LogLine) -> LogLine:
     """Return what was measured, without the time and the seeds that experts were trained with."""
     line = without_time(line)
     if line["kind"] != "experts" or not isinstance(line.get("experts"), list):
@@ -107,7 +107,7 @@ def _log(path: Path) -> RunLog:
     return log
 
 
-def _verdict(found: Sequence[Sequence[Line]], bound: float) -> tuple[int, str]:
+def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str]:
     """Return the exit code and a sentence about the measurements."""
     pairs = list(zip(*found, strict=False))
     unequal = next((number for number, pair in enumerate(pairs) if pair[0] != pair[1]), None)
@@ -128,13 +128,13 @@ def _verdict(found: Sequence[Sequence[Line]], bound: float) -> tuple[int, str]:
     return DIFFERENT, f"different since {since}{more}"
 
 
-def _fields(one: Line, other: Line) -> Iterator[tuple[str, Any, Any]]:
+def _fields(one: LogLine, other: LogLine) -> Iterator[tuple[str, Any, Any]]:
     """Yield the fields of two lines with both values; None where a line lacks one."""
     for key in {**one, **other}:
         yield key, one.get(key), other.get(key)
 
 
-def _scale(found: Sequence[Sequence[Line]]) -> dict[str, float]:
+def _scale(found: Sequence[Sequence[LogLine]]) -> dict[str, float]:
     """Return the largest size that the numbers of each field have in both runs."""
     scale: dict[str, float] = {}
     for line in (line for lines in found for line in lines):
@@ -150,7 +150,7 @@ def _close(key: str, one: Any, other: Any, bound: float, scale: Mapping[str, flo
     return one == other or (are_floats and abs(one - other) <= bound * scale[key])
 
 
-def _where(line: Line) -> str:
+def _where(line: LogLine) -> str:
     """Return which measurement a line is."""
     label = f" of {line['label']}" if "label" in line else ""
     block = f" in block {line['block']}" if "block" in line else ""
@@ -205,7 +205,7 @@ def _same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and bool(one == other)
 
 
-def _origins(one: Line, other: Line) -> list[str]:
+def _origins(one: LogLine, other: LogLine) -> list[str]:
     """Return a line for what the runs were: settings, curriculum, code and machine."""
     settings = [{**ADDED.get("run", {}), **dict(flat(as_before(line.get("config") or {})))} for line in (one, other)]
     known = {key for keys in PARTS.values() for key in keys} | {"kind", "seconds", "config"}

@@ -32,7 +32,7 @@ from ctgraph_rl.tasks.protocol import MOST_ROWS
 from ctgraph_rl.tasks.task import Task
 
 Frame = NDArray[np.uint8] | str
-Array = NDArray[Any]
+NumpyArray = NDArray[Any]
 
 _RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
 
@@ -145,7 +145,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         return frames[0] if frames else None
 
 
-class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
+class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
     """A batch of CT-graphs, equal step for step to `gymnasium.vector.SyncVectorEnv` of as many `CTGraphGymEnv`.
 
     Row i has the random stream of its own seed, ``seed + i`` or ``seed[i]``. What is returned is not changed later.
@@ -235,7 +235,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], Array]):
         return with_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
 
     @torch.inference_mode()
-    def step(self, actions: NDArray[np.int64]) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: NDArray[np.int64]) -> tuple[Any, NumpyArray, NumpyArray, NumpyArray, dict[str, Any]]:
         """One step of all rows with actions, integers [N] in 0..b.
 
         Raises:

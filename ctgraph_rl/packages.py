@@ -161,7 +161,7 @@ def agents_together(agents: Sequence[object], generators: Sequence[object], devi
     """
     check_packages()
     if device.type == "cpu":
-        return import_module("baselines.update.seeds").Group(agents, generators)
+        return import_module("baselines.update.seeds").SeedGroup(agents, generators)
     return import_module("baselines.update.captured").CapturedGroup(agents, generators)
 
 

@@ -16,7 +16,7 @@ from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.order import Tasks, sequence
 
-Pool = Sequence[tuple[int, int]]
+GoalPool = Sequence[tuple[int, int]]
 """(image seed, depth) of each environment whose goals the labs number one after the other."""
 
 MASK_EVALUATION = Evaluation(num_episodes=10, greedy=True, every=5120)
@@ -103,7 +103,7 @@ def words(listing: str) -> list[tuple[int, str]]:
     return [(int(seed), path) for seed, path in pairs]
 
 
-def pool_ids(tasks: Iterable[tuple[int, str]], pool: Pool) -> list[int]:
+def pool_ids(tasks: Iterable[tuple[int, str]], pool: GoalPool) -> list[int]:
     """The labs' number of each task: environments one after the other, goals in lexicographic order."""
     first: dict[tuple[int, int], int] = {}
     total = 0

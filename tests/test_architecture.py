@@ -85,6 +85,30 @@ CATALOGUES = ("baselines.methods", "curricula")
 LONG_FILES: dict[str, str] = {}
 """Files of more than 500 lines, and why."""
 
+CLASSES_OF_ONE_NAME = {"Trained": "a loaded run, which ctgraph_rl exports, and blocks of tasks, which metrics export"}
+"""Names of several public classes, and why."""
+
+MODULES_OF_ONE_NAME = {
+    "adaptation": "a setting of evaluations: its metrics, its figure, and named sequences that need it",
+    "bounds": "of returns: as metrics take them, and as reports find them",
+    "ceilings": "of performance: of a track, and the metrics",
+    "environments": "speed of the environments, and the tests that theirs inherit; both are said after a folder",
+    "formats": "of the board's tables and of a report's",
+    "gym": "the environment that users import, and sequences of Gymnasium's tasks",
+    "job": "of a run, and of a collective",
+    "labels": "that learners give: in a log, as metrics, and as a figure",
+    "masks": "of weights, and the sequences of the papers on them",
+    "memory": "bytes of images, and sequences that need a memory",
+    "method": "what methods derive from, and the facts of a submitted one",
+    "page": "of the board and of a report",
+    "rules": "of a track and of learning",
+    "seeds": "as one batch: the learners, and the runs",
+    "segments": "of a batch between episodes: for cells, and for the loop",
+    "style": "of figures: of reports in print, and of pictures of tasks",
+    "tables": "of the board, and of a log",
+}
+"""Names of several modules, each said after its folder, and why."""
+
 ANY_NUMBER = ("require", "groups")
 """Functions whose arguments are alike, and as many as there are."""
 
@@ -135,6 +159,18 @@ def test_a_function_has_at_most_400_tokens():
     modules = [*modules_of_packages(), *modules_of_results()]
 
     assert architecture.long_functions(modules, 400) == []
+
+
+def test_keywords_stand_at_the_call_and_not_in_a_dict_made_for_it():
+    assert architecture.starred_dicts([*modules_of_packages(), *modules_of_results()]) == []
+
+
+def test_a_public_class_name_exists_once():
+    assert set(architecture.classes_defined_twice(modules_of_packages())) == set(CLASSES_OF_ONE_NAME)
+
+
+def test_a_module_name_exists_once():
+    assert set(architecture.modules_of_one_name(modules_of_packages())) == set(MODULES_OF_ONE_NAME)
 
 
 def test_a_call_has_at_most_five_positional_arguments():

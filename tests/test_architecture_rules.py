@@ -187,6 +187,29 @@ def test_our_imports_inside_functions_are_found():
     ]
 
 
+@pytest.mark.parametrize(
+    ("lines", "is_found"),
+    [
+        (["how = {'a': 1}", "g(**how)"], True),
+        (["how: dict = {'a': 1}", "g(0, **how)"], True),
+        (["how = {'a': 1}", "how['b'] = 2", "g(**how)"], False),
+        (["how = {name: 1}", "g(**how)"], False),
+        (["g(**how)"], False),
+    ],
+)
+def test_a_dict_of_literal_keys_that_is_made_to_be_starred_is_found(lines, is_found):
+    found = modules(a="\n    ".join(["def f(how):", *lines]))
+
+    assert architecture.starred_dicts(found) == (["ctgraph_rl.a.f"] if is_found else [])
+
+
+def test_names_of_two_classes_or_modules_are_found():
+    found = modules(log__a="class Run: ...\nclass _Own: ...", board__a="Run = dict\nRUN = 1\nclass _Own: ...")
+
+    assert architecture.classes_defined_twice(found) == {"Run": ["ctgraph_rl.log.a", "ctgraph_rl.board.a"]}
+    assert architecture.modules_of_one_name(found) == {"a": ["ctgraph_rl.log.a", "ctgraph_rl.board.a"]}
+
+
 @pytest.mark.parametrize(("sentences", "fine"), [(1, False), (2, True), (3, True), (4, False)])
 def test_a_folder_needs_two_or_three_sentences(sentences, fine):
     text = f'"""{" ".join(["It has `a.b`."] * sentences)}"""'

@@ -17,7 +17,7 @@ import torch
 from helpers.reference_files import SHIPPED_2023
 from helpers.stopped_runs import Slow, limited
 
-from baselines.parts.catalogue import Entry, catalogue
+from baselines.parts.catalogue import CatalogueEntry, catalogue
 from ctgraph_rl import (
     Block,
     CTGraph,
@@ -119,7 +119,7 @@ def gym_steps(make: Callable[..., Any], **arguments: Any) -> None:
 
 
 @cache
-def entries(group: str) -> tuple[Entry, ...]:
+def entries(group: str) -> tuple[CatalogueEntry, ...]:
     """All agents, or all methods."""
     return tuple(catalogue(group))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
 from baselines.cells.lstm import LSTM
 from baselines.cells.scan import linear_scan, max_scan
 from ctgraph_rl.checks import one_of, require, true_or_false
@@ -55,24 +55,24 @@ class AMRL(Cell):
         own = ("recurrent_state_max",) if self.is_max else ("recurrent_state_sum", "recurrent_state_count")
         self.state_keys = (*LSTM.state_keys, *own)
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros: of the LSTM, and the maxima, [num_rows, num_outputs // 2], or sums and a count."""
         widths = [self.num_outputs // 2, 1][: 1 if self.is_max else 2]
         return (*self.inner.zeros(num_rows), *(zeros_like_weights(self, num_rows, width) for width in widths))
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         memory, inner = self.inner.step(inputs, state[:2])
         x, y = memory.chunk(2, dim=-1)
         aggregate, after = self._aggregate(x.unsqueeze(1), x.new_zeros(len(x), 1, dtype=torch.bool), state[2:])
         return self._output(aggregate[:, 0], y), (*inner, *after)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; the aggregates are scans."""
         x, y = self.inner.sequence(inputs, groups, starts, state[:2]).chunk(2, dim=-1)
         return self._output(self._aggregate(x, starts, state[2:])[0], y)
 
-    def _aggregate(self, x: Tensor, starts: Tensor, state: State) -> tuple[Tensor, State]:
+    def _aggregate(self, x: Tensor, starts: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """Return the aggregates of [rows, steps, n] at each step, and the state after the last one."""
         if self.is_max:
             first = torch.maximum(state[0].unsqueeze(1), x[:, :1])

@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
 from baselines.cells.frames import MOST_FRAMES
 from ctgraph_rl.checks import at_least_one, at_most, is_int, require
 
@@ -66,11 +66,11 @@ class Attention(Cell):
         """Set the biases of distances to 0; the layers draw their own weights."""
         nn.init.zeros_(self.bias)
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs + 1], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs + 1),)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         present = torch.cat([inputs, torch.ones_like(inputs[:, :1])], dim=1).unsqueeze(1)
         frames = torch.cat([state[0], present], dim=1)
@@ -78,7 +78,7 @@ class Attention(Cell):
         output = self._block(frames[..., :-1], 1, seen.unsqueeze(1))
         return output.squeeze(1), (frames[:, 1:],)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; all steps at once, each over the frames of its episode."""
         present = inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape)
         frames = torch.cat([state[0][..., :-1], present], dim=1)

@@ -24,8 +24,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
-from baselines.cells.plastic_sequence import Plastic, PlasticSequence, Steps, columns_times
+from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
+from baselines.cells.plastic_sequence import Plastic, PlasticSequence, PlasticSteps, columns_times
 from ctgraph_rl.checks import one_of, require
 
 LARGEST_FAST_WEIGHT = 2.0
@@ -70,22 +70,22 @@ class Backpropamine(Cell):
         if self.modulation != "simple":
             nn.init.constant_(self.rate, 0.01)
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return the units, [num_rows, H], and the fast weights, [num_rows, H, H] each."""
         size = self.num_outputs
         matrices = (zeros_like_weights(self, num_rows, size, size) for _ in self.state_keys[1:])
         return (zeros_like_weights(self, num_rows, size), *matrices)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         return self._step(self.input(inputs), state)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; inputs are multiplied with their weights once a group."""
         given = self.input(inputs).index_select(0, groups.T.flatten()).unflatten(0, groups.T.shape)
         resets = [start.nonzero().squeeze(-1) for start in starts.unbind(1)]
         resets[0] = resets[0][:0]  # zero already
-        steps = Steps(self._step, LARGEST_FAST_WEIGHT, resets)
+        steps = PlasticSteps(self._step, LARGEST_FAST_WEIGHT, resets)
         return PlasticSequence.apply(steps, given, *self._plastic(), *state)
 
     def _plastic(self) -> Plastic:
@@ -95,7 +95,7 @@ class Backpropamine(Cell):
         others = (weights for layer in layers for weights in (layer.weight, layer.bias))
         return Plastic(self.recurrent, self.plasticity, rate, *others)
 
-    def _step(self, given: Tensor, state: State, product: Tensor | None = None) -> tuple[Tensor, State]:
+    def _step(self, given: Tensor, state: CellState, product: Tensor | None = None) -> tuple[Tensor, CellState]:
         """Take a step from the inputs times their weights, [rows, H]; ``product`` is overwritten."""
         before, hebb, *trace = state
         fast = columns_times(before, torch.mul(self.plasticity, hebb, out=product))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ctgraph_rl.checks import TakesNumbers, require, true_or_false
 from ctgraph_rl.core.kernel import is_traced
 
-State = tuple[Tensor, ...]
+CellState = tuple[Tensor, ...]
 """The parts of a cell's state, [rows, ...] each, in the order of its ``state_keys``."""
 
 Branches = Sequence[tuple[Tensor, Tensor]]
@@ -61,15 +61,15 @@ class Cell(TakesNumbers, nn.Module):
         self.num_inputs = num_features + num_actions * reads_action + reads_reward
         self.num_outputs, self.num_actions = num_outputs, num_actions
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return the state at the start of an episode, which is zero, [num_rows, ...] each."""
         return ()
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """Compute the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
         raise NotImplementedError
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """Compute the outputs at all steps; the state is reset to zero before a step at which an episode starts.
 
         Args:
@@ -87,7 +87,7 @@ class Cell(TakesNumbers, nn.Module):
             outputs.append(output)
         return torch.stack(outputs, dim=1)
 
-    def tree(self, inputs: Tensor, branches: Branches, state: State) -> Tensor:
+    def tree(self, inputs: Tensor, branches: Branches, state: CellState) -> Tensor:
         """Compute the outputs at the ends of different histories; see `baselines.parts.distinct.histories`.
 
         Args:
@@ -115,7 +115,7 @@ def can_branch(value: Tensor) -> bool:
     return value.is_cpu and not is_traced()
 
 
-def reset(state: Sequence[Tensor], starts: Tensor) -> State:
+def reset(state: Sequence[Tensor], starts: Tensor) -> CellState:
     """Return a state that is zero in the rows where an episode starts, bool [rows]."""
     return tuple(torch.where(starts.view(-1, *[1] * (value.ndim - 1)), 0.0, value) for value in state)
 

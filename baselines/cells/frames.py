@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
 from ctgraph_rl.checks import at_most, is_int, require
 
 MOST_FRAMES = 1000
@@ -36,16 +36,16 @@ class Frames(Cell):
         self.num_frames = num_frames
         self.linear = linear_layer(num_frames * self.num_inputs, num_outputs)
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros in place of earlier inputs, [num_rows, num_frames - 1, num_inputs], oldest first."""
         return (zeros_like_weights(self, num_rows, self.num_frames - 1, self.num_inputs),)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         window = torch.cat([state[0], inputs.unsqueeze(1)], dim=1)
         return self.linear(window.flatten(1)).relu(), (window[:, 1:],)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; a frame counts if no episode has started since."""
         frames = torch.cat([state[0], inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape)], dim=1)
         episode = torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, State, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, zeros_like_weights
 from baselines.cells.segments import segments
 from ctgraph_rl.core.kernel import is_traced
 
@@ -23,11 +23,11 @@ class GRU(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros, [num_rows, num_outputs]."""
         return (zeros_like_weights(self, num_rows, self.num_outputs),)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
             num_rows = len(inputs)
@@ -37,7 +37,7 @@ class GRU(Cell):
             output = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))[0].squeeze(1)
         return output, (output,)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; each segment between two resets is a sequence, and the GRU runs over all of them at once."""
         found = segments(starts)
         frames = groups.flatten()[found.frames]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Branches, Cell, State, can_branch, zeros_like_weights
+from baselines.cells.cell import Branches, Cell, CellState, can_branch, zeros_like_weights
 from baselines.cells.segments import segments
 
 
@@ -22,11 +22,11 @@ class LSTM(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.lstm = nn.LSTM(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros, [num_rows, 1, num_outputs], for both parts of the state."""
         return tuple(zeros_like_weights(self, num_rows, 1, self.num_outputs) for _ in self.state_keys)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         if not can_branch(inputs):
             h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), *(value.squeeze(1) for value in state))
@@ -35,7 +35,7 @@ class LSTM(Cell):
         output, after = self.lstm(inputs.unsqueeze(1), before)
         return output.squeeze(1), tuple(value.transpose(0, 1) for value in after)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
         if not starts[:, 1:].any():
             before = tuple(value.transpose(0, 1).contiguous() for value in state)
@@ -45,7 +45,7 @@ class LSTM(Cell):
         memory = packed_lstm(self.lstm, inputs, groups.flatten()[found.frames], found.sizes, (h, c))
         return found.unpacked(memory).unflatten(0, starts.shape)
 
-    def tree(self, inputs: Tensor, branches: Branches, state: State) -> Tensor:
+    def tree(self, inputs: Tensor, branches: Branches, state: CellState) -> Tensor:
         """See `Cell`; with one product of features and weights for each group."""
         given, (h, c), memory = lstm_inputs(self.lstm, inputs), (value.squeeze(1) for value in state), []
         for shorter, groups in branches:
@@ -55,7 +55,7 @@ class LSTM(Cell):
         return torch.cat(memory)
 
 
-def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, state: State) -> Tensor:
+def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, state: CellState) -> Tensor:
     """Run an LSTM of one layer over packed sequences, with one product of features and weights for each group.
 
     PyTorch's own backward pass writes a tensor of all frames at each step.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, State, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
 from baselines.cells.scan import linear_scan
 
 
@@ -23,17 +23,17 @@ class MinGRU(Cell):
         self.gate = linear_layer(self.num_inputs, num_outputs)
         self.candidate = linear_layer(self.num_inputs, num_outputs)
 
-    def zeros(self, num_rows: int) -> State:
+    def zeros(self, num_rows: int) -> CellState:
         """Return zeros, [num_rows, num_outputs]."""
         return (zeros_like_weights(self, num_rows, self.num_outputs),)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         carry, given = self._parts(inputs)
         output = carry * state[0] + given
         return output, (output,)
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; a scan, in which a reset is a carry of 0."""
         carry, given = (
             part.index_select(0, groups.flatten()).unflatten(0, groups.shape) for part in self._parts(inputs)

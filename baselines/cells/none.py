@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from baselines.cells.cell import Cell, State, linear_layer
+from baselines.cells.cell import Cell, CellState, linear_layer
 
 
 class NoMemory(Cell):
@@ -17,10 +17,10 @@ class NoMemory(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.linear = linear_layer(self.num_inputs, num_outputs)
 
-    def step(self, inputs: Tensor, state: State) -> tuple[Tensor, State]:
+    def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         return self.linear(inputs).relu(), ()
 
-    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: State) -> Tensor:
+    def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`."""
         return self.linear(inputs).relu().index_select(0, groups.flatten()).unflatten(0, groups.shape)

@@ -15,13 +15,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from baselines.cells.cell import State
+from baselines.cells.cell import CellState
 
 
-class Steps(NamedTuple):
+class PlasticSteps(NamedTuple):
     """How the steps of a sequence are taken."""
 
-    step: Callable[[Tensor, State, Tensor], tuple[Tensor, State]]
+    step: Callable[[Tensor, CellState, Tensor], tuple[Tensor, CellState]]
     """Computes the units and the next state from the inputs times their weights, [rows, H], and a state; the third
     argument is overwritten, [rows, H, H]."""
 
@@ -65,7 +65,7 @@ class PlasticSequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, steps: Steps, given: Tensor, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, steps: PlasticSteps, given: Tensor, *tensors: Tensor) -> Tensor:
         """See `PlasticSequence`."""
         weights = tensors[: len(Plastic._fields)]
         state = tensors[len(Plastic._fields) :]
@@ -108,7 +108,7 @@ class PlasticGradient:
         state: after the last step.
     """
 
-    def __init__(self, weights: Plastic, bound: float, units: Tensor, state: State) -> None:
+    def __init__(self, weights: Plastic, bound: float, units: Tensor, state: CellState) -> None:
         self._weights = weights
         self._bound = bound
         self._units = units
@@ -129,7 +129,7 @@ class PlasticGradient:
             self._eta = linear(self._modulation, weights.fan_out, weights.fan_out_bias)
             self._through_eta = (1 - self._modulation.square()) * weights.modulator
 
-    def step(self, t: int, by_units: Tensor, state: State, after: State) -> None:
+    def step(self, t: int, by_units: Tensor, state: CellState, after: CellState) -> None:
         """Go back through a step.
 
         Args:
@@ -160,7 +160,7 @@ class PlasticGradient:
         modulator = (inner.T @ self._units.flatten(0, 1), inner.sum(dim=0), by_eta.T @ modulation, by_eta.sum(dim=0))
         return Plastic(recurrent, plasticity, None if self._weights.rate is None else self._rate, *modulator)
 
-    def _through_change(self, t: int, by_units: Tensor, state: State) -> tuple[Tensor, Tensor]:
+    def _through_change(self, t: int, by_units: Tensor, state: CellState) -> tuple[Tensor, Tensor]:
         """Go back through the change of the fast weights; return the gradient by the units after and before it."""
         before = state[0]
         units = self._units[t]

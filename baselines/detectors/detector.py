@@ -10,7 +10,7 @@ from baselines.methods.parts.self_labelled import SelfLabelled
 from ctgraph_rl.checks import TakesNumbers, at_least_one, at_most, is_int, require
 
 if TYPE_CHECKING:
-    from ctgraph_rl.agent import Method
+    from ctgraph_rl.agent import MethodLike
     from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -53,8 +53,8 @@ class Detector(TakesNumbers):
         self.patience = patience
         self.snapshot_every = snapshot_every
 
-    def labelling(self, method: Method) -> SelfLabelled:
-        """Return a method that labels tasks by this detector; see `ctgraph_rl.agent.Detector`."""
+    def labelling(self, method: MethodLike) -> SelfLabelled:
+        """Return a method that labels tasks by this detector; see `ctgraph_rl.agent.DetectorLike`."""
         return SelfLabelled(method, self)
 
     def tell(self, curriculum: Curriculum) -> None:

@@ -41,7 +41,7 @@ class Exchange(TakesNumbers):
         self.kinds: Mapping[str, Fields] = {}
 
     def settings_of(self, member: int) -> Mapping[str, Any]:
-        """Return none; see `ctgraph_rl.learn.collective.Exchange`, as for all methods."""
+        """Return none; see `ctgraph_rl.learn.collective.ExchangeLike`, as for all methods."""
         return {}
 
     def connect(self, agents: Sequence[Agent]) -> None:

@@ -105,7 +105,7 @@ class Mosaic(MaskExchange):
         room = min(method.max_received for method in self.methods)
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
         self.num_actions = max(method.num_actions for method in self.methods)
-        self.known: list[Known] = [Known() for _ in agents]
+        self.known: list[KnownMask] = [KnownMask() for _ in agents]
         about: Fields = {"task": TASK_ID, "reward": Number()}
         scores = Array((len(self.methods[0].weights),))
         self.kinds = {
@@ -121,7 +121,7 @@ class Mosaic(MaskExchange):
         task = self.task_of(member)
         known = self.known[member]
         if known.task != task:
-            known = self.known[member] = Known(task)
+            known = self.known[member] = KnownMask(task)
         known.see(batch, self.buffer_size)
         if len(known.recent["action"]) < self.num_samples:
             return
@@ -197,12 +197,12 @@ class Mosaic(MaskExchange):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
-        self.known = [Known(**each) for each in state["known"]]
+        self.known = [KnownMask(**each) for each in state["known"]]
         self.generator.set_state(state["random"])
 
 
 @dataclass
-class Known:
+class KnownMask:
     """What a member knows of its task: the id, the embedding z and the last transitions, oldest first."""
 
     task: int | None = None

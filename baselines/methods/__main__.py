@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from baselines.parts.catalogue import Entry, catalogue
+from baselines.parts.catalogue import CatalogueEntry, catalogue
 
 
-def needs_ids(method: Entry) -> str:
+def needs_ids(method: CatalogueEntry) -> str:
     """Return when a method needs task ids: ``yes``, ``no`` or with which setting."""
     return "yes" if method.facts["needs_task_id"] else "heads=multi" if "heads" in method.settings else "no"
 

@@ -14,7 +14,7 @@ from ctgraph_rl.packages import class_named, conf_dir
 ROOT = Path(__file__).resolve().parents[2]
 
 
-class Entry(NamedTuple):
+class CatalogueEntry(NamedTuple):
     """A yaml file and the class that it names."""
 
     name: str
@@ -34,7 +34,7 @@ class Entry(NamedTuple):
         return constants(self.target)
 
 
-def catalogue(group: str) -> Iterator[Entry]:
+def catalogue(group: str) -> Iterator[CatalogueEntry]:
     """Yield an entry for each yaml file in ``conf/GROUP``, except those that only change values of another one."""
     for path in sorted(Path(conf_dir(), group).glob("*.yaml")):
         text = path.read_text(encoding="utf-8")
@@ -43,7 +43,7 @@ def catalogue(group: str) -> Iterator[Entry]:
             target = settings.pop("_target_")
             settings.pop("_partial_", None)
             comments = [line for line in text.splitlines() if not line.startswith("# @package")]
-            yield Entry(path.stem, target, settings, comments[0].removeprefix("# "))
+            yield CatalogueEntry(path.stem, target, settings, comments[0].removeprefix("# "))
 
 
 def constants(target: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Branches, State, can_branch
+from baselines.cells.cell import Branches, CellState, can_branch
 from baselines.cells.segments import segments
 
 
@@ -58,7 +58,7 @@ def random_weights(count: int) -> Tensor:
 class Histories(NamedTuple):
     """The different histories of sequences: a tree, in which each continues one that is a step shorter."""
 
-    initial: State
+    initial: CellState
     """The different states before a first step, [num_states, ...] each."""
 
     branches: Branches
@@ -68,7 +68,7 @@ class Histories(NamedTuple):
     """The history of each frame, int64 [rows, steps]; the shortest have the first numbers."""
 
 
-def histories(groups: Tensor, starts: Tensor, state: State) -> Histories:
+def histories(groups: Tensor, starts: Tensor, state: CellState) -> Histories:
     """Return the different histories of sequences, each from a reset or the first step on.
 
     Args:

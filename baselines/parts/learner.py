@@ -16,7 +16,7 @@ from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, Place, places
 from baselines.update.compiled import compiled
 from baselines.update.optimiser import parts_of
-from baselines.update.update import State, Update, update
+from baselines.update.update import Update, UpdateState, update
 from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
@@ -196,9 +196,9 @@ class Learner(TakesNumbers, nn.Module):
         return (self.compiled_step or update)(self, self.update_state, batch)
 
     @property
-    def update_state(self) -> State:
+    def update_state(self) -> UpdateState:
         """What an update of this learner changes."""
-        return State(self.weights, parts_of(self.optimiser))
+        return UpdateState(self.weights, parts_of(self.optimiser))
 
     @property
     def is_captured(self) -> bool:

@@ -16,7 +16,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator, recurrent_mode
 
-from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, MakeCell, State, can_branch, linear_layer, reset
+from baselines.cells.cell import PREVIOUS_ACTION, REWARD, Cell, CellState, MakeCell, can_branch, linear_layer, reset
 from baselines.parts.distinct import distinct, histories, renumbered
 from ctgraph_rl.checks import one_of, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
@@ -207,7 +207,7 @@ class RecurrentModule(TensorDictModuleBase):
         seen = [data[key].flatten(0, 1) for key in self.encoder.in_keys]
         return seen, [value.flatten(0, 1) for value in self._own(data)]
 
-    def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, State]:
+    def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
         """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
         encoder, starts, read = self.encoder, data["is_init"].squeeze(-1), self._read(data)
         examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*chain(*read)])

@@ -48,7 +48,7 @@ def why_not_together(agent: Agent) -> str | None:
     return None
 
 
-class Group:
+class SeedGroup:
     """Agents of one configuration with different seeds, which act and learn together.
 
     Each draws from a generator of its own, in the order in which it draws from torch's global one when alone.

@@ -14,7 +14,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from baselines.parts.learner import Learner
 from baselines.parts.networks import Data
 from baselines.update.optimiser import Parts, parts_of
-from baselines.update.update import State, over_seeds, stacked, unstacked
+from baselines.update.update import UpdateState, over_seeds, stacked, unstacked
 
 
 def named_tensors(learner: Learner) -> dict[str, Tensor]:
@@ -93,12 +93,12 @@ class Stack:
         return [list(states) for states in zip(*(each.state for each in parts), strict=True)]
 
     @property
-    def state(self) -> State:
+    def state(self) -> UpdateState:
         """What an update of all learners changes."""
         weights = [self.kept[name] for name in self.weights]
         own = cast(Parts, parts_of(self.learners[0].optimiser))
         optimiser = own._replace(parameters=[self.kept[name] for name in self.trained], state=self.moments)
-        return State(weights, optimiser, self._named(self.kept), self.turned, self.others)
+        return UpdateState(weights, optimiser, self._named(self.kept), self.turned, self.others)
 
     def _named(self, kept: dict[str, Tensor]) -> dict[str, Tensor]:
         return {name: kept[first] for name, first in self.first_name.items()}

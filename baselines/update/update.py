@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from baselines.parts.learner import Learner
 
 
-class State(NamedTuple):
+class UpdateState(NamedTuple):
     """What an update reads and writes in place: the tensors of one learner, or those of several seeds."""
 
     weights: Sequence[Tensor]
@@ -35,10 +35,10 @@ class State(NamedTuple):
     """Of several seeds what `Learner.other_weights` returns, [seeds, ...] each."""
 
 
-Update = Callable[["Learner", State, Data], dict[str, Tensor]]
+Update = Callable[["Learner", UpdateState, Data], dict[str, Tensor]]
 
 
-def update(learner: Learner, state: State, batch: Data) -> dict[str, Tensor]:
+def update(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
     It has no branch on data and depends on its arguments alone. With several seeds these are minibatches [seeds, items,
@@ -56,14 +56,14 @@ def update(learner: Learner, state: State, batch: Data) -> dict[str, Tensor]:
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
 
-def losses_of(learner: Learner, state: State, batch: Data) -> dict[str, Tensor]:
+def losses_of(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
     """Compute the agent's losses and the method's penalties, of each seed where there are several."""
     if state.tensors is None:
         return learner.losses(batch)
     return over_seeds(learner, _losses, state, batch, state.others)
 
 
-def over_seeds(learner: Learner, function: Callable[..., Any], state: State, *given: Any) -> Any:
+def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
     """Compute a function of a learner and further tensors for each seed."""
 
     def of_one(tensors: dict[str, Tensor], *its: Any) -> Any:
@@ -72,7 +72,7 @@ def over_seeds(learner: Learner, function: Callable[..., Any], state: State, *gi
     return vmap(of_one)(_seen(state), *given)
 
 
-def with_tensors(learner: Learner, state: State, function: Callable[..., Any], *given: Any) -> Any:
+def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
     """Compute a function of a learner that has the tensors of a state, those of all seeds at once."""
     if state.tensors is None:
         return function(learner, *given)
@@ -83,13 +83,13 @@ def _losses(learner: Learner, batch: Data, others: Data) -> dict[str, Tensor]:
     return learner.losses(batch, others)
 
 
-def _seen(state: State) -> dict[str, Tensor]:
+def _seen(state: UpdateState) -> dict[str, Tensor]:
     """Return the tensors of several seeds as the networks see them."""
     tensors = state.tensors or {}
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 
 
-def _descend(learner: Learner, state: State, gradients: Sequence[Tensor]) -> Tensor:
+def _descend(learner: Learner, state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
     """Take the optimiser's step; return the norm of the gradients, of each seed where there are several."""
     is_stacked = state.tensors is not None
     if is_stacked:

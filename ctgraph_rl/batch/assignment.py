@@ -58,7 +58,7 @@ def goal_leaves(tasks: Sequence[Task], goals: Iterable[Sequence[int]]) -> list[i
     return [replace(task, goal=tuple(goal)).goal_leaf for task, goal in zip(tasks, goals, strict=True)]
 
 
-Place = tuple[Tensor, Tensor, Tensor]
+EpisodePlace = tuple[Tensor, Tensor, Tensor]
 """The rows' seeds, numbers and ticks, which decide their draws."""
 
 
@@ -93,14 +93,14 @@ class Assignment(NamedTuple):
             task=self.choices.index_select(0, choice), choice=choice, episodes=torch.zeros_like(choice)
         )
 
-    def begin(self, mask: Tensor, place: Place) -> Assignment:
+    def begin(self, mask: Tensor, place: EpisodePlace) -> Assignment:
         """Return the assignment of the rows when those of a mask, bool [N], start an episode."""
         following = self._replace(episodes=self.episodes + mask)
         if self.switch is not None:
             following = following._replace(choice=self._next_choice(self.switch, following.episodes, place))
         return following._replace(task=torch.where(mask, following.chosen, self.task))
 
-    def _next_choice(self, switch: Switch, episodes: Tensor, place: Place) -> Tensor:
+    def _next_choice(self, switch: Switch, episodes: Tensor, place: EpisodePlace) -> Tensor:
         """Return the choices after so many episodes; the switch's clock is that of a row, or of all together."""
         if switch.together:
             clock, past = ((n.sum() // len(n) - 1).expand_as(n) for n in (episodes, self.episodes))

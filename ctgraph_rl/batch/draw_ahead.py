@@ -15,7 +15,7 @@ MAX_WORDS = 2**14
 MAX_TICKS = 256
 
 
-class Draws:
+class DrawsAhead:
     """The draws of rows, see `dynamics.Words`, for the ticks that they are at and those that follow.
 
     A step that is compiled makes its own draws: a table would need another graph for each tick of it.

@@ -52,7 +52,7 @@ class Mark(NamedTuple):
 
 
 Pixels = NDArray[np.uint8]
-Line = tuple[Mark, Mark]
+MarkLine = tuple[Mark, Mark]
 Places = dict[int, Mark]
 
 
@@ -169,7 +169,7 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
     return canvas, marks, waits
 
 
-def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Line]:
+def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[MarkLine]:
     """Add every node of a small tree, each level spread over the width. No branch is a stub."""
     b = graph.branching_factor
     for level in range(graph.depth + 1):
@@ -181,7 +181,7 @@ def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Lin
     return []
 
 
-def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[Line]:
+def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tuple[int, ...]) -> list[MarkLine]:
     """Add the paths to two nodes, one column that parts where they do. Returns stubs for the other branches."""
     b = graph.branching_factor
     home = marks[HOME_KEY]
@@ -202,7 +202,7 @@ def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tu
     return stubs
 
 
-def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> list[Line]:
+def _stubs(b: int, parent: Mark, children: Places, gap: float, fan: float) -> list[MarkLine]:
     """Short lines towards the branches that are not drawn, in their order among those that are."""
     known: list[float] = list(children) or [(b - 1) / 2]
     places = [child.x for child in children.values()] or [parent.x]
@@ -218,7 +218,7 @@ def _middle(a: Mark, z: Mark) -> Mark:
     return Mark((a.x + z.x) / 2, (a.y + z.y) / 2, 0.6 * min(a.radius, z.radius))
 
 
-def _cross(mark: Mark, reach: float) -> list[Line]:
+def _cross(mark: Mark, reach: float) -> list[MarkLine]:
     return [(Mark(mark.x - x, mark.y - reach, 0), Mark(mark.x + x, mark.y + reach, 0)) for x in (-reach, reach)]
 
 
@@ -252,7 +252,7 @@ def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
         _fill(canvas, np.array([mark[:2] for mark in marks if mark.radius == radius]), _ring(-1, radius), colour)
 
 
-def _lines(canvas: Pixels, lines: list[Line], width: float, colour: int) -> None:
+def _lines(canvas: Pixels, lines: list[MarkLine], width: float, colour: int) -> None:
     ends = np.array(lines)[..., :2]
     steps = math.ceil(SCALE * abs(ends[:, 1] - ends[:, 0]).max()) + 1
     points = ends[:, 0] + np.linspace(0, 1, steps)[:, None, None] * (ends[:, 1] - ends[:, 0])

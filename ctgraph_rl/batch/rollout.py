@@ -16,7 +16,7 @@ from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState
 from ctgraph_rl.core.tree import is_done
 
-Policy = Callable[[Tensor, Tensor], Tensor]
+TensorPolicy = Callable[[Tensor, Tensor], Tensor]
 """What acts: (observation uint8 [N, *shape], is_init bool [N]) -> action int64 [N]."""
 
 
@@ -51,7 +51,7 @@ class Steps(NamedTuple):
 
 
 @torch.no_grad()
-def rollout(rows: Rows, policy: Policy | Tensor, steps: Steps, kernel: str = "auto") -> Steps:
+def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str = "auto") -> Steps:
     """Fill buffers with steps, from where the rows are; rows that have not begun or are finished start first.
 
     The steps are those that `CTGraphEnv` and the Gymnasium environments take with the same seeds and actions, bit for
@@ -98,7 +98,7 @@ def _uses_kernel(rows: Rows, kernel: str) -> bool:
     return kernel == "required" or (kernel == "auto" and rows.uses_kernel)
 
 
-def _native(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
+def _native(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState:
     """Fill buffers by the C kernel; the states that the last step led to."""
     start = rows.state
     state = rows.native.run(start, mask=rows.is_done, observation=steps.observation[0])
@@ -122,7 +122,7 @@ def _fill(rows: Rows, state: RowState, steps: Steps, part: slice) -> RowState:
     return state
 
 
-def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
+def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState:
     """Fill buffers by the tensor engine; the states that the last step led to."""
     params = rows.params
     uses = rows.uses
@@ -151,7 +151,7 @@ def _tensors(rows: Rows, policy: Policy | Tensor, steps: Steps) -> RowState:
     return state
 
 
-def _chosen(rows: Rows, policy: Policy, steps: Steps, t: int, start: RowState) -> Tensor:
+def _chosen(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, start: RowState) -> Tensor:
     """Return the actions of a policy at step t; it must leave the rows as they are at the start."""
     params = rows.params
     action = policy(steps.observation[t], steps.is_init[t])

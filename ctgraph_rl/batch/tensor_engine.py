@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ctgraph_rl.batch.draw_ahead import Draws
+from ctgraph_rl.batch.draw_ahead import DrawsAhead
 from ctgraph_rl.batch.params import Tables
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.dynamics import RowState, Shown
@@ -20,13 +20,13 @@ class TensorEngine:
 
     params: RowParams
     uses: Uses
-    _draws: Draws
+    _draws: DrawsAhead
 
     def bind(self, params: RowParams, tables: Tables) -> None:
         """Take parameters; draws made ahead stay as long as they are those of the rows' streams and uses."""
         draws = getattr(self, "_draws", None)
         if draws is None or not draws.serve(params, tables.uses):
-            self._draws = Draws(params, tables.uses)
+            self._draws = DrawsAhead(params, tables.uses)
         self.params = params
         self.uses = tables.uses
 

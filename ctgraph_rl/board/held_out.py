@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl.board.rerun import Cell, Result, check_of_scores, job_of, score_name, score_of
+from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, score_name, score_of
 from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
 from ctgraph_rl.disk import made_folder, write_whole
@@ -46,7 +46,7 @@ def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]
     return tuple(seeds)[:count]
 
 
-def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[Cell]:
+def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
     """Return what is learned: a seed each, with images and goals of its own, and the submitted configuration.
 
     Args:
@@ -62,11 +62,11 @@ def held_out_cells(submission: Submission, number: int, count: int, folder: Path
         curriculum = other_curriculum(submission.curriculum, f"{submission.digest} {number} {seed}")
         write_whole(own / CURRICULUM, file_text(curriculum.to_json()))
         job = job_of(submission, (seed,), first, own / CURRICULUM)
-        cells.append(Cell(own, job, (), curriculum, seconds=first.seconds))
+        cells.append(RerunCell(own, job, (), curriculum, seconds=first.seconds))
     return cells
 
 
-def held_out_checks(submission: Submission, results: Sequence[tuple[Cell, Result]]) -> Iterator[Check]:
+def held_out_checks(submission: Submission, results: Sequence[tuple[RerunCell, Rerun]]) -> Iterator[Check]:
     """Yield a check for each run that failed, those of the protocol of the others, and that of their scores.
 
     Args:

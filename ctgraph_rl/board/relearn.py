@@ -24,7 +24,7 @@ from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
-class Job(NamedTuple):
+class Relearning(NamedTuple):
     """What a process learns, as plain values."""
 
     seeds: Sequence[int]
@@ -40,7 +40,7 @@ class Job(NamedTuple):
         write_whole(path, json.dumps(self._asdict()))
 
     @classmethod
-    def read(cls, path: Path) -> Job:
+    def read(cls, path: Path) -> Relearning:
         """Read what `write` wrote."""
         return cls(**json.loads(path.read_text(encoding="utf-8")))
 
@@ -50,7 +50,7 @@ def run_dir_of(folder: Path, seed: int) -> Path:
     return folder / f"seed{seed}"
 
 
-def learn_again(job: Job, folder: Path) -> None:
+def learn_again(job: Relearning, folder: Path) -> None:
     """Learn every seed of a job into a run directory within a folder.
 
     Raises:
@@ -79,14 +79,14 @@ def configuration(stored: Mapping[str, Any]) -> DictConfig:
     return DictConfig(settings)
 
 
-def _settings(job: Job, seed: int) -> dict[str, Any]:
+def _settings(job: Relearning, seed: int) -> dict[str, Any]:
     """Return the settings of a seed, with the curriculum of the job's file if it has one."""
     target = "ctgraph_rl.tasks.curriculum.Curriculum.from_json"
     own = {} if job.curriculum is None else {"curriculum": {"_target_": target, "path_or_dict": job.curriculum}}
     return {**job.config, "seed": seed, **own}
 
 
-def _call(job: Job, run_dir: Path) -> None:
+def _call(job: Relearning, run_dir: Path) -> None:
     """Call the entry point of a learner that is not ours."""
     module, _, name = str(job.entry_point).partition(":")
     function = getattr(import_module(module), name, None)
@@ -100,4 +100,4 @@ def _call(job: Job, run_dir: Path) -> None:
 
 
 if __name__ == "__main__":
-    learn_again(Job.read(Path(sys.argv[1])), Path.cwd())
+    learn_again(Relearning.read(Path(sys.argv[1])), Path.cwd())

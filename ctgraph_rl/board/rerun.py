@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
-from ctgraph_rl.board.relearn import Job, run_dir_of
+from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rescore import Check, equal
 from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compared
@@ -56,11 +56,11 @@ OWN_VERSION = ("ctgraph_rl", "python")
 """Versions that may differ between equal bits; the numbers version says when those of this package do."""
 
 
-class Cell(NamedTuple):
+class RerunCell(NamedTuple):
     """What one process learns again."""
 
     folder: Path  # of the process
-    job: Job
+    job: Relearning
     runs: tuple[SubmittedRun, ...]  # that it repeats; none for held-out seeds
     curriculum: Curriculum
     seconds: float  # that the submitted runs took
@@ -86,7 +86,7 @@ class Cell(NamedTuple):
         return sum(map(_frames, self.run_dirs))
 
 
-class Result(NamedTuple):
+class Rerun(NamedTuple):
     """What a seed that was learned again has left."""
 
     log: RunLog | None
@@ -112,7 +112,7 @@ def draw(submission: Submission, number: int, count: int) -> tuple[SubmittedRun,
     return tuple(sorted(submission.runs, key=place)[:count])
 
 
-def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path) -> list[Cell]:
+def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path) -> list[RerunCell]:
     """Return what is learned again for drawn runs: each group of seeds once.
 
     Args:
@@ -124,11 +124,11 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
     return [_cell(submission, seeds, folder / f"seed{'-'.join(map(str, seeds))}") for seeds in groups]
 
 
-def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> Cell:
+def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> RerunCell:
     """Return what is learned again for the seeds of a group, or for one that was alone."""
     runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
     job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
-    return Cell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))
+    return RerunCell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))
 
 
 def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
@@ -143,7 +143,9 @@ def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> 
     return tuple(found)
 
 
-def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, curriculum: Path | None = None) -> Job:
+def job_of(
+    submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, curriculum: Path | None = None
+) -> Relearning:
     """Return the job of seeds with the submitted configuration.
 
     Args:
@@ -159,11 +161,11 @@ def job_of(submission: Submission, seeds: tuple[int, ...], run: SubmittedRun, cu
     given = submission.path.resolve() / "curriculum.json" if entry is not None and curriculum is None else curriculum
     path = None if given is None else str(given)
     together = bool(run.group) and len(seeds) > 1
-    return Job(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
+    return Relearning(seeds, together, submission.config, run.num_threads, entry_point=entry, curriculum=path)
 
 
 def learn_again(
-    cell: Cell,
+    cell: RerunCell,
     limits: Limits,
     isolated: Isolation,
     paths: Sequence[Path] = (),
@@ -199,7 +201,7 @@ def _remove(run_dir: Path) -> None:
         raise ValueError(f"{run_dir} has too many folders within each other to remove: rm -r it yourself") from None
 
 
-def _with_its_curriculum(cell: Cell) -> Job:
+def _with_its_curriculum(cell: RerunCell) -> Relearning:
     """Return the job of a cell with the file of its curriculum in the cell's folder, where its process sees it."""
     if cell.job.curriculum is None:
         return cell.job
@@ -213,7 +215,7 @@ def is_portable(config: Mapping[str, Any]) -> bool:
     return config.get("portable") is True
 
 
-def result_of(cell: Cell, seed: int, outcome: Outcome) -> Result:
+def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
     """Read what a seed has left; what cannot be read is a failure."""
     run_dir = run_dir_of(cell.folder, seed)
     try:
@@ -225,9 +227,9 @@ def result_of(cell: Cell, seed: int, outcome: Outcome) -> Result:
         has_agent = (run_dir / AGENT).exists()
         state = read_plain(content_of(run_dir / AGENT)) if has_agent else None
         agent, size = (sum_of_state(state), num_bytes_of(state)) if has_agent else ("", None)
-        return Result(log, agent, None, size, _experts(cell.folder.resolve(), log))
+        return Rerun(log, agent, None, size, _experts(cell.folder.resolve(), log))
     except (ValueError, OSError) as error:
-        return Result(None, "", str(error))
+        return Rerun(None, "", str(error))
 
 
 def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
@@ -238,13 +240,13 @@ def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
     return tuple(map(RunLog.read, paths))
 
 
-def _failed(run_dir: Path, outcome: Outcome) -> Result:
+def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
     """Return that a seed has no results, and why."""
     with suppress(OSError, ValueError):
         reason = read_text(run_dir / FAILURE, MOST_BYTES_OF_A_REASON).strip()
         alone = outcome.stopped is None and not reason.startswith(NOT_OF_THE_RUN)
-        return Result(None, "", reason, failed_alone=alone)
-    return Result(None, "", outcome.failure or f"it left no {METRICS}")
+        return Rerun(None, "", reason, failed_alone=alone)
+    return Rerun(None, "", outcome.failure or f"it left no {METRICS}")
 
 
 def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list[str]:
@@ -274,7 +276,7 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
     return reasons + [f"{part} {before} there, {own} here" for part, before, own in pairs if before != own]
 
 
-def checks_of(run: SubmittedRun, submitted: RunLog, result: Result, experts: Sequence[RunLog] = ()) -> list[Check]:
+def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = ()) -> list[Check]:
     """Compare a submitted run with what was learned again, bit by bit.
 
     A run that cannot be finished here, and a failed one that does not fail by itself, decide nothing: the machine or a
@@ -355,7 +357,7 @@ def check_of_scores(submission: Submission, found: Sequence[float], what: str, l
     return Check(what, expected, str(difference), passed, level=level, note=note)
 
 
-def verified(submission: Submission, results: Mapping[SubmittedRun, Result], other_bits: Sequence[str]) -> list[Check]:
+def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], other_bits: Sequence[str]) -> list[Check]:
     """Return the checks of all runs that were learned again.
 
     Bits are compared first. Where they differ and are not promised, the scores of these runs are tested instead.

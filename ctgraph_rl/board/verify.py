@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
-from ctgraph_rl.board.rerun import RERUN, Cell, cells_of, draw, learn_again, result_of, verified, why_other_bits
+from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again, result_of, verified, why_other_bits
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
@@ -64,13 +64,13 @@ class Plan(NamedTuple):
     submission: Submission
     number: int
     level: str
-    reruns: list[Cell]
-    held_out: list[Cell]
+    reruns: list[RerunCell]
+    held_out: list[RerunCell]
     other_bits: list[str]  # why bits are not promised on this machine
     folder: Path
 
     @property
-    def cells(self) -> list[Cell]:
+    def cells(self) -> list[RerunCell]:
         """All processes, in order."""
         return [*self.reruns, *self.held_out]
 
@@ -84,7 +84,7 @@ class Means(NamedTuple):
     disk: float  # GB
     paths: tuple[Path, ...]  # folders with code
 
-    def limits(self, cell: Cell) -> Limits:
+    def limits(self, cell: RerunCell) -> Limits:
         """Return the limits of a process."""
         usual = max(LEAST_SECONDS, math.ceil(min(TIMES * cell.seconds, MOST_HOURS * 3600)))
         seconds = usual if self.hours is None else self.hours * 3600

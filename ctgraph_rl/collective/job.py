@@ -15,7 +15,7 @@ import torch
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, FILES, described, read_collective, write_summary
 from ctgraph_rl.disk import made_folder
-from ctgraph_rl.learn.collective import Exchange, Member, learn_collective
+from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder, members_of
 from ctgraph_rl.log.provenance import code_changes, versions
@@ -98,7 +98,7 @@ def _is_finished(runs: Runs, run_dir: Path) -> bool:
     return all(finished) and (run_dir / METRICS).exists()
 
 
-def _learn(cfg: Any, runs: Runs, exchange: Exchange, run_dir: Path, *, interrupt: Interrupt) -> None:
+def _learn(cfg: Any, runs: Runs, exchange: ExchangeLike, run_dir: Path, *, interrupt: Interrupt) -> None:
     """Build the objects of all members, let them learn, and write the results."""
     checkpoints = Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
     jobs, random = _jobs(runs, interrupt)

@@ -168,7 +168,7 @@ def observe(state: RowState, words: Words, params: RowParams, uses: Uses) -> Ten
     return read(look(state, words, params, uses), state, params, uses)
 
 
-class Seen(NamedTuple):
+class SeenState(NamedTuple):
     """The views that rows see, not yet read from the bank; int64."""
 
     rows: Tensor  # of the bank
@@ -176,7 +176,7 @@ class Seen(NamedTuple):
     noise: Tensor  # start of the noise, or its row in the noise bank
 
 
-def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
+def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> SeenState:
     """Choose each row's view, and draw what is not in the bank; arguments as above."""
     x = params.x
     rows = bank_rows(state, words[2], params.x, uses)
@@ -188,7 +188,7 @@ def look(state: RowState, words: Words, params: RowParams, uses: Uses) -> Seen:
     if uses.pixel_noise:
         upper, lower, *_ = draw(params.seed, params.row, state.tick, STREAM_NOISE)
         noise = x.noise_start + randint(upper, uses.noise_bank) if uses.noise_bank else (upper << 32) | lower
-    return Seen(rows, angle, noise)
+    return SeenState(rows, angle, noise)
 
 
 def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses: Uses) -> Tensor:
@@ -206,7 +206,7 @@ def bank_rows(state: State | RowState, word: Tensor, x: ObservationParams, uses:
     return rows
 
 
-def read(seen: Seen, state: RowState, params: RowParams, uses: Uses) -> Tensor:
+def read(seen: SeenState, state: RowState, params: RowParams, uses: Uses) -> Tensor:
     """Return the images of what is seen: from the bank, with noise, late rotation and reward cue; uint8 [N, *shape]."""
     x = params.x
     images = params.bank.index_select(0, seen.rows)

@@ -18,7 +18,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import at_least_one, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.lifelong import OfferCheckpoint
-from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, State, run_loop, saved_state_fits
+from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, SavedState, run_loop, saved_state_fits
 from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT, Fields, Mail, Message
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -33,7 +33,7 @@ class Help(NamedTuple):
     """Numbers to log by name, such as the sender's return."""
 
 
-class Exchange(Protocol):
+class ExchangeLike(Protocol):
     """What learners of a collective tell each other, such as `baselines.exchanges.l2d2c.L2D2C`.
 
     It draws nothing from torch's global generator.
@@ -104,7 +104,7 @@ class Member:
 @takes_numbers
 def learn_collective(
     members: Sequence[Member],
-    exchange: Exchange,
+    exchange: ExchangeLike,
     seed: int = 0,
     log: RunLog | None = None,
     progress: Progress | None = None,
@@ -148,7 +148,7 @@ def learn_collective(
     return log
 
 
-def _check(members: Sequence[Member], exchange: Exchange) -> None:
+def _check(members: Sequence[Member], exchange: ExchangeLike) -> None:
     """Refuse members that are too many, too few, or not apart."""
     count = len(members)
     agents = {id(each.agent) for each in members}
@@ -165,7 +165,7 @@ def _check(members: Sequence[Member], exchange: Exchange) -> None:
 class _Learner:
     """A member that learns batch by batch, with a state of torch's global generator that is only its own."""
 
-    def __init__(self, number: int, member: Member, device: torch.device, saved: State | None) -> None:
+    def __init__(self, number: int, member: Member, device: torch.device, saved: SavedState | None) -> None:
         self.number = number
         self.member = member
         self.device = device
@@ -237,7 +237,7 @@ def _cuda_stream(seed: int, device: torch.device) -> Tensor | None:
 class _Collective:
     """All members, and what is between them."""
 
-    def __init__(self, members: Sequence[Member], exchange: Exchange, mail: Mail, log: RunLog) -> None:
+    def __init__(self, members: Sequence[Member], exchange: ExchangeLike, mail: Mail, log: RunLog) -> None:
         self.members = members
         self.exchange = exchange
         self.mail = mail

@@ -24,7 +24,7 @@ from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, gu
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-State = Mapping[str, Any]
+SavedState = Mapping[str, Any]
 """All that the rest of a member's run depends on, as tensors and plain values."""
 
 
@@ -74,7 +74,7 @@ class Coupling(Protocol):
 
 
 class Group(Protocol):
-    """Learners that act and learn as one, such as `Alone` and `baselines.update.seeds.Group`.
+    """Learners that act and learn as one, such as `Alone` and `baselines.update.seeds.SeedGroup`.
 
     Between two calls each agent is as if it had learned alone.
     """
@@ -173,7 +173,7 @@ class Lockstep:
         logs: Sequence[RunLog],
         *,
         device: torch.device,
-        saved: Sequence[State] | None = None,
+        saved: Sequence[SavedState] | None = None,
     ) -> None:
         check_rows(curriculum, group.agents[0].num_envs)
         check_ids(curriculum, group.agents[0])
@@ -225,7 +225,7 @@ class Lockstep:
         """Let all learn from the next batch; False at the end, and where all have failed."""
         return next(self._batches, False)
 
-    def _learn_batches(self, saved: Sequence[State] | None) -> Iterator[bool]:
+    def _learn_batches(self, saved: Sequence[SavedState] | None) -> Iterator[bool]:
         """Learn block by block, a batch at each step; evaluate at the moments that the curriculum says."""
         if len(self.failed) == len(self.logs):
             return
@@ -314,7 +314,7 @@ class Lockstep:
             states.append(state)
         return states
 
-    def _restore(self, saved: Sequence[State]) -> TensorDictBase:
+    def _restore(self, saved: Sequence[SavedState]) -> TensorDictBase:
         """Restore saved states; return the data that the next step starts from."""
         self._restore_agents(saved)
         with saved_state_fits():
@@ -323,7 +323,7 @@ class Lockstep:
         data = [TensorDict(state["carried"], rows, device=self.env.device) for state in saved]
         return data[0] if len(data) == 1 else torch.cat(data)
 
-    def _restore_agents(self, saved: Sequence[State]) -> None:
+    def _restore_agents(self, saved: Sequence[SavedState]) -> None:
         """Restore the agents of saved states, and what they draw from."""
         with saved_state_fits():
             for agent, state in zip(self.group.agents, saved, strict=True):
@@ -341,7 +341,7 @@ class Lockstep:
         of_cuda = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
         return {"random": torch.get_rng_state(), "random_cuda": of_cuda}
 
-    def _set_random_state(self, number: int, state: State) -> None:
+    def _set_random_state(self, number: int, state: SavedState) -> None:
         """Restore what `_random_state` returned."""
         if self.group.generators is not None:
             self.group.generators[number].set_state(state["random"])

@@ -9,7 +9,7 @@ import torch
 
 from ctgraph_rl.checks import takes_numbers
 from ctgraph_rl.core.device import checked_device
-from ctgraph_rl.learn.loop import Group, Lockstep, Progress, State, run_loop
+from ctgraph_rl.learn.loop import Group, Lockstep, Progress, SavedState, run_loop
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import are_graphs
@@ -38,7 +38,7 @@ def learn_together(
     progress: Progress | None = None,
     *,
     device: torch.device | str = "cpu",
-    saved: Sequence[State] | None = None,
+    saved: Sequence[SavedState] | None = None,
     checkpoint: OfferCheckpoints | None = None,
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.

@@ -17,22 +17,22 @@ class Known(NamedTuple):
     failure_is_lowest: bool  # whether no return is below that of a failure
 
 
-Bounds = tuple[float, float]
-BoundsOf = Callable[[Known], Bounds]
+LowAndHigh = tuple[float, float]
+BoundsOf = Callable[[Known], LowAndHigh]
 """What a metric says of its values: their bounds, infinite where there are none."""
 
 
-def unbounded(known: Known) -> Bounds:
+def unbounded(known: Known) -> LowAndHigh:
     """Return the bounds of anything."""
     return -math.inf, math.inf
 
 
-def not_negative(known: Known) -> Bounds:
+def not_negative(known: Known) -> LowAndHigh:
     """Return the bounds of ratios and of what is lost against the best."""
     return 0.0, math.inf
 
 
-def at_most_1(known: Known) -> Bounds:
+def at_most_1(known: Known) -> LowAndHigh:
     """Return the bounds of a share of what there was to gain."""
     return -math.inf, 1.0
 
@@ -42,55 +42,55 @@ def between(low: float, high: float) -> BoundsOf:
     return lambda known: (low, high)
 
 
-def of_performance(known: Known) -> Bounds:
+def of_performance(known: Known) -> LowAndHigh:
     """Return the bounds of means of performance."""
     return known.low, known.high
 
 
-def of_changes(known: Known) -> Bounds:
+def of_changes(known: Known) -> LowAndHigh:
     """Return the bounds of differences of two performances."""
     return known.low - known.high, known.high - known.low
 
 
-def of_changes_but_one(known: Known) -> Bounds:
+def of_changes_but_one(known: Known) -> LowAndHigh:
     """Return the bounds of means over tasks of such differences, of which that of one task is 0."""
     share = (known.tasks - 1) / known.tasks
     return share * (known.low - known.high) if share else 0.0, share * (known.high - known.low) if share else 0.0
 
 
-def of_gains(known: Known) -> Bounds:
+def of_gains(known: Known) -> LowAndHigh:
     """Return the bounds of the part of a change that is not negative."""
     return 0.0, known.high - known.low
 
 
-def of_remembering(known: Known) -> Bounds:
+def of_remembering(known: Known) -> LowAndHigh:
     """Return the bounds of 1 less the size of a loss."""
     return 1 + known.low - known.high, 1.0
 
 
-def of_scaled_changes(known: Known) -> Bounds:
+def of_scaled_changes(known: Known) -> LowAndHigh:
     """Return the bounds of changes that are divided by the largest size of a performance."""
     largest = 1.0 if known.low >= 0 or known.high <= 0 else 2.0
     return -largest, largest
 
 
-def of_lost_shares(known: Known) -> Bounds:
+def of_lost_shares(known: Known) -> LowAndHigh:
     """Return the bounds of the share of the best performance that is lost."""
     return 0.0, 1.0 if known.low >= 0 else math.inf
 
 
-def of_sums(known: Known) -> Bounds:
+def of_sums(known: Known) -> LowAndHigh:
     """Return the bounds of a sum of performance over tasks."""
     return known.tasks * known.low, known.tasks * known.high
 
 
-def of_sums_over_time(known: Known) -> Bounds:
+def of_sums_over_time(known: Known) -> LowAndHigh:
     """Return the bounds of a sum of performance over tasks and evaluations."""
     count = known.tasks * known.evaluations
     return count * known.low, count * known.high
 
 
-def of_counts(known: Known) -> Bounds:
+def of_counts(known: Known) -> LowAndHigh:
     """Return the bounds of a number of tasks."""
     return 0.0, float(known.tasks)
 

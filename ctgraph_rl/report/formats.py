@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.log.escape import markdown_text, terminal_text
-from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table
+from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell
 from ctgraph_rl.report.latex import latex as latex_table
 
 if TYPE_CHECKING:
@@ -75,18 +75,18 @@ def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
             for agent in dict.fromkeys(row.shown for row in its)
         }
         lines = [
-            (agent, (Cell(n), *(_as_cell(cells.get((agent, measure)), notes) for measure in measures)))
+            (agent, (TableCell(n), *(_as_cell(cells.get((agent, measure)), notes) for measure in measures)))
             for agent, n in agents.items()
         ]
         yield Matrix(curriculum, ("n", *measures), lines, notes)
 
 
-def _as_cell(row: Row | None, notes: Sequence[str]) -> Cell:
+def _as_cell(row: Row | None, notes: Sequence[str]) -> TableCell:
     """Return a row as a cell of the table of agents and measures."""
     if row is None:
-        return Cell("-")
+        return TableCell("-")
     value, _, interval = str(row.estimate).partition(" n = ")[0].partition(" ")
-    return Cell(value, interval, notes.index(row.note) + 1 if row.note else 0)
+    return TableCell(value, interval, notes.index(row.note) + 1 if row.note else 0)
 
 
 def _seeds(rows: Sequence[Row]) -> str:
@@ -129,7 +129,7 @@ class Matrix(NamedTuple):
 
     curriculum: str
     head: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[Cell]]]
+    rows: Sequence[tuple[str, Sequence[TableCell]]]
     notes: Sequence[str]
 
 

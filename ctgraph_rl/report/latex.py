@@ -36,7 +36,7 @@ MOST_LINES = 40
 """Lines of numbers in a table."""
 
 
-class Cell(NamedTuple):
+class TableCell(NamedTuple):
     """A value with its interval, each as text, and the number of its note, from 1; 0 for none."""
 
     value: str
@@ -51,7 +51,7 @@ class Table(NamedTuple):
     label: str
     first: str
     head: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[Cell]]]
+    rows: Sequence[tuple[str, Sequence[TableCell]]]
     notes: Sequence[str] = ()
 
 
@@ -72,7 +72,7 @@ def _columns(table: Table) -> int:
 
 
 def _float(
-    table: Table, rows: Sequence[tuple[str, Sequence[Cell]]], parts: Sequence[tuple[int, int]], number: int
+    table: Table, rows: Sequence[tuple[str, Sequence[TableCell]]], parts: Sequence[tuple[int, int]], number: int
 ) -> str:
     """Return one table with its parts."""
     again = f" (part {number})" if number > 1 else ""
@@ -88,7 +88,7 @@ def _float(
     return "\n".join([*head, "\n\\par\\medskip\n".join(bodies), *notes, r"\end{table}"])
 
 
-def _tabular(table: Table, rows: Sequence[tuple[str, Sequence[Cell]]], part: tuple[int, int]) -> str:
+def _tabular(table: Table, rows: Sequence[tuple[str, Sequence[TableCell]]], part: tuple[int, int]) -> str:
     """Return some columns of a table, scaled down where they are wider than a line."""
     start, end = part
     heads = [latex_text(table.first), *map(_heading, table.head[start:end])]
@@ -114,7 +114,7 @@ def _heading(name: str) -> str:
     return shown if len(lines) < 2 else rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{shown}\end{{tabular}}"
 
 
-def _lines(name: str, cells: Sequence[Cell]) -> Iterator[str]:
+def _lines(name: str, cells: Sequence[TableCell]) -> Iterator[str]:
     """Yield the line of a row's values, and that of their intervals where there are any."""
     yield " & ".join([latex_text(name), *map(_value, cells)]) + r" \\"
     if any(cell.interval for cell in cells):
@@ -122,7 +122,7 @@ def _lines(name: str, cells: Sequence[Cell]) -> Iterator[str]:
         yield " & ".join(["", *intervals]) + r" \\"
 
 
-def _value(cell: Cell) -> str:
+def _value(cell: TableCell) -> str:
     """Return a value; the letter of its note takes no room, so that decimal points stay below each other."""
     mark = rf"\rlap{{\textsuperscript{{{letters(cell.note)}}}}}" if cell.note else ""
     return signed(cell.value) + mark

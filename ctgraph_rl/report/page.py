@@ -18,9 +18,9 @@ from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
-from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, Table, latex
+from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, latex
 from ctgraph_rl.report.names import displayed
-from ctgraph_rl.report.sections import Matrix, Result, Section, sections
+from ctgraph_rl.report.sections import Estimates, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages
 from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
@@ -231,7 +231,7 @@ def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
         yield Numbers(title, ("block", *section.labels), list(_cells(matrix, first, len(result.finished))))
 
 
-def _cells(matrix: Matrix, first: int, n: int) -> Iterator[tuple[str, ...]]:
+def _cells(matrix: Estimates, first: int, n: int) -> Iterator[tuple[str, ...]]:
     for block, row in enumerate(matrix, first):
         yield (str(block), *(_cell(estimate, n) for estimate in row))
 
@@ -282,7 +282,7 @@ def _latex(parts: Sequence[Part]) -> str:
     return "\n\n".join(found) + "\n"
 
 
-def _named_cells(numbers: Numbers) -> list[tuple[str, list[Cell]]]:
+def _named_cells(numbers: Numbers) -> list[tuple[str, list[TableCell]]]:
     """Return the rows of a matrix, each with its name and its cells."""
     split = [(name, [cell.partition(" ") for cell in cells]) for name, *cells in numbers.rows]
-    return [(name, [Cell(value, interval) for value, _, interval in cells]) for name, cells in split]
+    return [(name, [TableCell(value, interval) for value, _, interval in cells]) for name, cells in split]

@@ -21,7 +21,7 @@ from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
 from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped
 
-Matrix = list[list[Estimate]]
+Estimates = list[list[Estimate]]
 """Estimates over seeds, [blocks][tasks]."""
 
 
@@ -69,16 +69,16 @@ class Result:
         all_there = len(self.finished) == len(self.by_seed)
         return f"{len(self.finished)}" if all_there else f"{len(self.finished)}/{len(self.by_seed)}"
 
-    def performance(self) -> Matrix:
+    def performance(self) -> Estimates:
         """Mean return on each task before training and after each block."""
         return self._over_seeds([each.performance for each in _histories(self.finished)], self.bounds.of_task)
 
-    def transfer(self) -> Matrix:
+    def transfer(self) -> Estimates:
         """Changes of each task by each block: differences of successive rows of the performance matrix."""
         changes = [_differences(history.performance) for history in _histories(self.finished)]
         return self._over_seeds(changes, self.bounds.of_change)
 
-    def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Matrix:
+    def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Estimates:
         missing = [None] * (len(self.by_seed) - len(matrices))
         shape = max(map(len, matrices), default=0), max((len(row) for rows in matrices for row in rows), default=0)
         labels = next((history.labels for history in _histories(self.finished)), ())

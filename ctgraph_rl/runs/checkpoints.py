@@ -34,7 +34,7 @@ KEPT = 2
 SECONDS = 300.0
 """Time between two checkpoints within a block, where nothing else is said."""
 
-State = Mapping[str, Any]
+RunState = Mapping[str, Any]
 """What is saved: tensors and plain Python values, nested; ``frames`` is the number of frames of the run so far."""
 
 
@@ -68,7 +68,7 @@ class Checkpoints:
         self.interrupt = Interrupt() if interrupt is None else interrupt
         self._last: float | None = None
 
-    def offer(self, state: Callable[[], State], at_block_end: bool) -> None:
+    def offer(self, state: Callable[[], RunState], at_block_end: bool) -> None:
         """Save if it is time, called after every update.
 
         The first one is saved at once, so that a full disk, or a state that cannot be read back, stops a run early.
@@ -83,7 +83,7 @@ class Checkpoints:
         """Return whether it is time to save."""
         return at_block_end or self._last is None or time.monotonic() - self._last >= self.seconds
 
-    def save(self, state: State) -> None:
+    def save(self, state: RunState) -> None:
         """Write a checkpoint, then remove the oldest, and broken ones that a run has gone back behind.
 
         Raises:
@@ -126,7 +126,7 @@ class Checkpoints:
         files = self.files()
         return _frames(files[0]) if files else None
 
-    def newest(self) -> State | None:
+    def newest(self) -> RunState | None:
         """Return the newest sound checkpoint, None without one; warn of a broken one and skip it.
 
         Raises:
@@ -155,7 +155,7 @@ class Checkpoints:
             part.unlink(missing_ok=True)
 
 
-def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[State]], at_block_end: bool) -> None:
+def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[RunState]], at_block_end: bool) -> None:
     """Save the states of runs that learn together as `Checkpoints.offer` does: all of them or none."""
     first = checkpoints[0]
     stop = first.interrupt.is_asked
@@ -166,7 +166,7 @@ def offer_all(checkpoints: Sequence[Checkpoints], states: Callable[[], Sequence[
         first.interrupt.exit()
 
 
-def newest_of_all(checkpoints: Sequence[Checkpoints]) -> list[State] | None:
+def newest_of_all(checkpoints: Sequence[Checkpoints]) -> list[RunState] | None:
     """Return the newest states of runs that learn together, all after as many frames; None if one has no checkpoint.
 
     Raises:
@@ -182,7 +182,7 @@ def newest_of_all(checkpoints: Sequence[Checkpoints]) -> list[State] | None:
     return [state if state["frames"] == frames else decoded(each.path_of(frames)) for each, state in pairs]
 
 
-def encoded(state: State) -> bytes:
+def encoded(state: RunState) -> bytes:
     """Return the bytes of a checkpoint.
 
     Raises:
@@ -198,7 +198,7 @@ def encoded(state: State) -> bytes:
     return json.dumps(header).encode() + b"\n" + content
 
 
-def decoded(path: Path) -> State:
+def decoded(path: Path) -> RunState:
     """Read a checkpoint, its tensors on the CPU.
 
     Raises:

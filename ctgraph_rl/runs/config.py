@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import did_you_mean, is_int, nearest, positive, require
+from ctgraph_rl.checks import Function, did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
 from ctgraph_rl.portable import check_portable
@@ -66,7 +66,6 @@ LAUNCHERS = {"hydra/launcher/joblib": "joblib", "hydra/launcher/submitit_slurm":
 RENEWED: tuple[type, ...] = (GlobalHydra, JobRuntime, VersionBase)  # of Hydra's state: what composing changes
 _HYDRA = threading.RLock()  # is held while Hydra's global state is ours
 
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 SEEDS_APART = 1000
 """Between the seeds of two members of a collective, so that a collective of another seed has other ones."""

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
-from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
@@ -249,7 +249,7 @@ def make_agent(
     return new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, checked_device(cfg.device))
 
 
-def method_of(cfg: DictConfig) -> Callable[[], Method]:
+def method_of(cfg: DictConfig) -> Callable[[], MethodLike]:
     """Return what builds the method of a configuration, labelled by its detector if it has one."""
     make_method = config.target(cfg, "method")
     if "detector" not in cfg:
@@ -382,7 +382,7 @@ def first_line(run_dir: Path) -> Mapping[str, Any] | None:
     raise FileExistsError(f"{run_dir} holds {', '.join(there)}, which are of no run; {advice}")
 
 
-def curriculum_of(cfg: DictConfig, method: Method) -> Curriculum:
+def curriculum_of(cfg: DictConfig, method: MethodLike) -> Curriculum:
     """Return what a configuration lets an agent with a method learn.
 
     Raises:

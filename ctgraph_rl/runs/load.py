@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.labels import policies_by_label
@@ -69,7 +69,7 @@ def load(
     make_agent: MakeAgent | None = None,
     curriculum: Curriculum | None = None,
     device: torch.device | str = "cpu",
-    make_method: Callable[[], Method] | None = None,
+    make_method: Callable[[], MethodLike] | None = None,
 ) -> Trained:
     """Load the trained agent of a run, finished or not, with its method and all that it needs to play or to learn on.
 
@@ -125,7 +125,7 @@ def _builder(
     run_dir: Path,
     config: Mapping[str, Any],
     make_agent: MakeAgent | None,
-    make_method: Callable[[], Method] | None,
+    make_method: Callable[[], MethodLike] | None,
     curriculum: Curriculum,
 ) -> MakeAgent:
     """Return what builds the agent with its method, if it has one; the curriculum is already prepared for that."""
@@ -141,12 +141,12 @@ def _builder(
     return with_method(alone, partial(_labelled, run_dir, make_method, stored["detector"]), curriculum)
 
 
-def _labelled(run_dir: Path, make_method: Callable[[], Method], detector: Any) -> Method:
+def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: Any) -> MethodLike:
     """Return a new method, labelled by the detector that a run stored, if there is one and it is not labelled yet."""
     method = make_method()
     if detector is None or hasattr(method, "detector"):
         return method
-    labelled: Method = _ours(run_dir, "detector", detector)().labelling(method)
+    labelled: MethodLike = _ours(run_dir, "detector", detector)().labelling(method)
     return labelled
 
 

@@ -26,7 +26,7 @@ from ctgraph_rl.runs.status import marked_if_it_fails
 from ctgraph_rl.runs.train import RunDirectory, train_together
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-Run = tuple[Any, Path]
+JobAndPath = tuple[Any, Path]
 """A composed configuration and its directory."""
 
 
@@ -75,7 +75,7 @@ def _why_one_after_the_other(job: Job) -> str | None:
     return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent, job.device)
 
 
-def _run_in_turn(runs: Sequence[Run], first: Job) -> None:
+def _run_in_turn(runs: Sequence[JobAndPath], first: Job) -> None:
     """Run each, the first by the job that was built of it; one that fails stops no other."""
     errors = []
     for number, (cfg, run_dir) in enumerate(runs):
@@ -87,7 +87,7 @@ def _run_in_turn(runs: Sequence[Run], first: Job) -> None:
         raise RuntimeError("; ".join(errors))
 
 
-def run_as_one(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None = None) -> None:
+def run_as_one(runs: Sequence[JobAndPath], built: tuple[Job, torch.Generator] | None = None) -> None:
     """Run those that are not finished, as one batch; a seed that fails stops no other.
 
     Args:
@@ -110,7 +110,7 @@ def run_as_one(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None = 
         raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
 
 
-def _marked(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None) -> Failures:
+def _marked(runs: Sequence[JobAndPath], built: tuple[Job, torch.Generator] | None) -> Failures:
     """Run all as one batch; leave in the directory of each that fails, or of all, why."""
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt() if built is None else built[0].interrupt)
@@ -124,7 +124,7 @@ def _marked(runs: Sequence[Run], built: tuple[Job, torch.Generator] | None) -> F
     return failed
 
 
-def _learn(runs: Sequence[Run], interrupt: Interrupt, built: tuple[Job, torch.Generator] | None) -> Failures:
+def _learn(runs: Sequence[JobAndPath], interrupt: Interrupt, built: tuple[Job, torch.Generator] | None) -> Failures:
     """Build the objects of all runs, and let them learn; return the error of each seed that failed.
 
     A seed with a single-task expert that failed does not begin.
@@ -144,11 +144,11 @@ def _learn(runs: Sequence[Run], interrupt: Interrupt, built: tuple[Job, torch.Ge
         members = []
         for seed, run_dir in begin.items():
             directory = stack.enter_context(jobs[seed].prepared(run_dir, [*begin], experts.get(seed)))
-            members.append(Member(jobs[seed].agent, directory, generators[seed]))
+            members.append(SeedOfRun(jobs[seed].agent, directory, generators[seed]))
         return failed | _as_one(first, first.curriculum, members)
 
 
-class Member(NamedTuple):
+class SeedOfRun(NamedTuple):
     """A run of a group."""
 
     agent: Agent
@@ -162,7 +162,7 @@ def _generator() -> torch.Generator:
     return torch.Generator(device="cpu").set_state(torch.get_rng_state())
 
 
-def _as_one(job: Job, curriculum: Curriculum, members: Sequence[Member]) -> Failures:
+def _as_one(job: Job, curriculum: Curriculum, members: Sequence[SeedOfRun]) -> Failures:
     """Let the runs of a group learn a curriculum; return the error of each seed that failed."""
     if not members:
         return {}
@@ -193,7 +193,7 @@ def train_experts(jobs: Sequence[Job], only: int | None = None) -> tuple[dict[in
             except FloatingPointError as error:
                 return {seed: error}
         members = [
-            Member(*by_seed[seed].expert(alone, run_dir, [*run_dirs]), _generator())
+            SeedOfRun(*by_seed[seed].expert(alone, run_dir, [*run_dirs]), _generator())
             for seed, run_dir in run_dirs.items()
         ]
         return _as_one(first, alone, members)

@@ -46,20 +46,20 @@ class Status(NamedTuple):
     reason: str = ""
 
 
-class Outcome(NamedTuple):
+class RunOutcome(NamedTuple):
     """The results and the failure of a run directory, each as what differs once it is written again; None without."""
 
     results: Hashable = None
     failure: Hashable = None
 
     @classmethod
-    def of(cls, folder: Path) -> Outcome:
+    def of(cls, folder: Path) -> RunOutcome:
         """Return what a directory holds; no clock is compared, for that of another machine may be behind."""
         results = _identity(folder / METRICS)
         return cls(results and (results, _content(folder / SUMS)), _identity(folder / FAILURE))
 
 
-NOTHING = Outcome()
+NOTHING = RunOutcome()
 
 
 def holds_results(folder: Path) -> bool:
@@ -97,7 +97,7 @@ def _identity(path: Path) -> Hashable:
     return found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
-def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None) -> Status:
+def status_of(folder: Path, before: RunOutcome = NOTHING, error: str | None = None) -> Status:
     """Return the status of the cell of a run directory.
 
     Args:
@@ -105,7 +105,7 @@ def status_of(folder: Path, before: Outcome = NOTHING, error: str | None = None)
         before: results and failures that do not count, as they were there before the sweep began.
         error: what it raised, where that is known.
     """
-    now = Outcome.of(folder)
+    now = RunOutcome.of(folder)
     if now.results not in (None, before.results) and is_complete(folder):
         return Status(DONE)
     user = lock_holder(folder)
@@ -179,7 +179,7 @@ class SweepProgress:
         console: where it shows; default: standard error.
     """
 
-    def __init__(self, cells: Mapping[Path, Outcome], console: Console | None = None) -> None:
+    def __init__(self, cells: Mapping[Path, RunOutcome], console: Console | None = None) -> None:
         self.total = len(cells)
         self.console = Console(stderr=True) if console is None else console
         self._left = dict(cells)

@@ -33,7 +33,7 @@ from ctgraph_rl.runs.status import (
     NOTHING,
     SHOWN,
     STALE,
-    Outcome,
+    RunOutcome,
     Status,
     SweepProgress,
     holds_results,
@@ -124,7 +124,7 @@ class Sweeper(Base):
         batch = [cell for variant in self.variants for cell in self._combined(variant, arguments)]
         cells = self.cells(batch)
         again = cells if overwrite is True else self._stale
-        before = {folder: Outcome.of(folder) if folder in again else NOTHING for folder in cells}
+        before = {folder: RunOutcome.of(folder) if folder in again else NOTHING for folder in cells}
         done = {folder for folder in cells if status_of(folder, before[folder]).state == DONE}
         left = [folder for folder in cells if folder not in done or (folder / CHECKPOINTS).exists()]  # to remove these
         errors: dict[Path, str] = {}
@@ -171,7 +171,7 @@ class Sweeper(Base):
         statuses = dict(zip(shortened(list(cells.values())), found.values(), strict=True))
         print(report(statuses, repeated, None if self.status else SHOWN))
 
-    def _status(self, folder: Path, before: Outcome, error: str | None) -> Status:
+    def _status(self, folder: Path, before: RunOutcome, error: str | None) -> Status:
         found = status_of(folder, before, error)
         stale = found.state == MISSING and folder in self._stale
         return Status(STALE, f"{self._stale[folder]} changed") if stale else found

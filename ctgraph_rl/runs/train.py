@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from torchrl.data import Composite, TensorSpec
 
-from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.batch.rows import seed_rule
 from ctgraph_rl.checks import as_path, is_json_object, require, require_memory, takes_numbers
 from ctgraph_rl.core.device import checked_device
@@ -34,7 +34,7 @@ from ctgraph_rl.log.run_log import RunLog, metrics_text, write_metrics, write_pe
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.sums import RESULTS, write_sums
 from ctgraph_rl.log.tables import write_tables
-from ctgraph_rl.runs.checkpoints import Checkpoints, State, newest_of_all, offer_all
+from ctgraph_rl.runs.checkpoints import Checkpoints, RunState, newest_of_all, offer_all
 from ctgraph_rl.runs.experts import Expert, Failures
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
@@ -119,7 +119,7 @@ def _takes_specs(make_agent: Callable[..., object]) -> tuple[bool, str]:
     return True, ""
 
 
-def with_method(make_agent: MakeAgent, make_method: Callable[[], Method], curriculum: Curriculum) -> MakeAgent:
+def with_method(make_agent: MakeAgent, make_method: Callable[[], MethodLike], curriculum: Curriculum) -> MakeAgent:
     """Return a function that builds an agent and attaches a new method to it."""
     return lambda observation_spec, action_spec: make_method().attach(
         make_agent(observation_spec, action_spec), curriculum
@@ -204,7 +204,7 @@ class RunDirectory:
     listeners: Sequence[Callable[[dict[str, Any]], object]] = ()
     console: Console | None = None
 
-    def begin(self, curriculum: Curriculum, agent: Agent, saved: State | None) -> RunLog:
+    def begin(self, curriculum: Curriculum, agent: Agent, saved: RunState | None) -> RunLog:
         """Return the log of a new run, or of one that is resumed from a saved state."""
         run_dir, about = self.run_dir, provenance(curriculum, learners(self.config, agent))
         if self.together:
@@ -289,7 +289,7 @@ class Participant(NamedTuple):
 
 def execute(
     participants: Sequence[Participant],
-    saved: Sequence[State | None],
+    saved: Sequence[RunState | None],
     learn: Callable[[Sequence[RunLog]], Failures],
     progress: ProgressBar,
 ) -> Failures:
@@ -363,7 +363,7 @@ def _reopen(run_dir: Path) -> None:
         sync_folder(run_dir)
 
 
-def resumed_log(run_dir: Path, saved: State, about: Mapping[str, Any], strict: bool) -> RunLog:
+def resumed_log(run_dir: Path, saved: RunState, about: Mapping[str, Any], strict: bool) -> RunLog:
     """Return the log as it was at a checkpoint; warn of another machine or versions, or refuse them if ``strict``.
 
     Raises:

@@ -19,7 +19,7 @@ from ctgraph_rl.checks import (
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.switch import Switch, switch_rule
 
-Part = TypeVar("Part", "Evaluation", "Protocol")
+ProtocolPart = TypeVar("ProtocolPart", "Evaluation", "Protocol")
 
 TASK_IDS = ("hidden", "one_hot", "at_boundaries")
 BOUNDARIES = ("announced", "hidden")
@@ -237,7 +237,7 @@ class Protocol:
         return max(self.ids(num_tasks)) + 1 if self.num_task_ids is None else self.num_task_ids
 
 
-def changed(name: str, part: Part, changes: Mapping[str, Any]) -> Part:
+def changed(name: str, part: ProtocolPart, changes: Mapping[str, Any]) -> ProtocolPart:
     """An evaluation or a protocol with other values of some fields.
 
     Args:

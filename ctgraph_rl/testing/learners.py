@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.learn.collect import agent_specs, make_env
 from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.log.run_log import RunLog
@@ -101,7 +101,7 @@ class AgentContract:
 class MethodContract(AgentContract):
     """Tests of a lifelong-learning method on an agent. Override `make_agent` and `make_method`."""
 
-    def make_method(self) -> Method:
+    def make_method(self) -> MethodLike:
         """Return a new method; override it."""
         raise NotImplementedError
 

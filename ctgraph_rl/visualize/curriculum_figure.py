@@ -15,7 +15,16 @@ from ctgraph_rl.log.escape import figure_text
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import ct_graphs
 from ctgraph_rl.visualize.layout import MOST_PATHS, Layout, in_digits, lay_out
-from ctgraph_rl.visualize.style import Point, draw_lines, goal_mark, mark, new_figure, save_figure, shape_of, stub_lines
+from ctgraph_rl.visualize.style import (
+    PlanePoint,
+    draw_lines,
+    goal_mark,
+    mark,
+    new_figure,
+    save_figure,
+    shape_of,
+    stub_lines,
+)
 
 MOST_PANELS = 12
 MOST_LEVEL = 4
@@ -94,7 +103,7 @@ def _room(depth: int, level: bool) -> float:
     return (0.16 if level else 0.32) * depth + 0.2
 
 
-def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
     """Draw the edges; the paths to goals are thick and black."""
     graph = layout.graph
     on_path = {node for goal in goals for node in graph.nodes_to(goal)}
@@ -104,7 +113,7 @@ def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, Point], goals: I
     draw_lines(axes, [line for node, line in lines.items() if node in on_path], linewidths=1.6)
 
 
-def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: Iterable[int]) -> None:
+def _draw_states(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
     size = max(3.0, 9.0 - len(layout.leaves) / 6 - layout.graph.depth / 4)
     ends = set(layout.leaves)
     stars = set(goals)
@@ -117,7 +126,7 @@ def _draw_states(axes: Any, layout: Layout, places: Mapping[int, Point], goals: 
             axes.plot(*zip(*points, strict=True), zorder=3, clip_on=False, **style)
 
 
-def _write(axes: Any, place: Point, text: str, level: bool) -> None:
+def _write(axes: Any, place: PlanePoint, text: str, level: bool) -> None:
     """A goal's label below it, upright where there is little room."""
     words, rotation = (text, 0) if level else (text.replace("\n", "  "), 90)
     axes.annotate(

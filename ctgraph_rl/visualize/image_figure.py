@@ -23,7 +23,7 @@ ROW, GAP = 1.22, 0.06
 """Height of a line and the gap between images, relative to that."""
 
 
-class Line(NamedTuple):
+class ImageLine(NamedTuple):
     """Images side by side, uint8 [n, *shape], with a word above each."""
 
     label: str
@@ -55,23 +55,23 @@ def image_figure(task: Task, seed: int = 0) -> Any:
     return figure
 
 
-def _plain(task: Task) -> list[Line]:
+def _plain(task: Task) -> list[ImageLine]:
     """A line for each kind of state."""
     lines = []
     for kind in StateType:
         ids = _first_ids(task, kind, COLUMNS)
-        lines.append(Line(kind.name.lower(), _stored(task, ids), [str(number) for number in ids]))
+        lines.append(ImageLine(kind.name.lower(), _stored(task, ids), [str(number) for number in ids]))
     return lines
 
 
-def _varied(task: Task, seed: int) -> list[Line]:
+def _varied(task: Task, seed: int) -> list[ImageLine]:
     """A line for each of the first ids of each kind of state."""
     shown = [(kind, number) for kind in StateType for number in _first_ids(task, kind, MOST_IDS)]
     reads = _reads(task, shown, COLUMNS - 1, seed)
     lines = []
     for (kind, number), images in zip(shown, reads, strict=True):
         words = ["image", *["read"] * len(images)]
-        lines.append(Line(f"{kind.name.lower()} {number}", torch.cat([_stored(task, [number]), images]), words))
+        lines.append(ImageLine(f"{kind.name.lower()} {number}", torch.cat([_stored(task, [number]), images]), words))
     return lines
 
 
@@ -106,7 +106,7 @@ def _pinned(task: Task, kind: StateType, number: int) -> Task:
     return replace(task, observations=replace(task.observations, **changes))
 
 
-def _draw_line(axes: Any, row: int, line: Line, white: float) -> None:
+def _draw_line(axes: Any, row: int, line: ImageLine, white: float) -> None:
     """Images in cells of size 1, a row lower by `ROW` than the one before."""
     from matplotlib.patches import Rectangle
 

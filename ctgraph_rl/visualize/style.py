@@ -22,7 +22,7 @@ DPI = 160
 MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", StateType.END: "s", StateType.FAIL: "8"}
 """Pentagon, circle, diamond, square and octagon."""
 
-Point = tuple[float, float]
+PlanePoint = tuple[float, float]
 
 
 def import_matplotlib() -> None:
@@ -95,7 +95,7 @@ def goal_mark(size: float) -> dict[str, Any]:
     return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
 
 
-def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> None:
+def draw_lines(axes: Any, lines: Sequence[Sequence[PlanePoint]], **style: Any) -> None:
     """Draw straight lines behind the states."""
     from matplotlib.collections import LineCollection
 
@@ -103,7 +103,7 @@ def draw_lines(axes: Any, lines: Sequence[Sequence[Point]], **style: Any) -> Non
     axes.add_collection(LineCollection(list(lines), **look))
 
 
-def stub_lines(layout: Layout, places: Mapping[int, Point], height: float) -> list[list[Point]]:
+def stub_lines(layout: Layout, places: Mapping[int, PlanePoint], height: float) -> list[list[PlanePoint]]:
     """Return short lines from the states drawn towards branches left out, left or right of those drawn."""
     reach = 1 / max(len(layout.leaves), 3) / 7
     ends = [(places[node], side) for node, side in layout.stubs]

@@ -10,9 +10,9 @@ from ctgraph_rl.tasks.task import Task
 from ctgraph_rl.visualize import states as drawn
 from ctgraph_rl.visualize.layout import MOST_LEAVES, MOST_PATHS, in_digits, lay_out
 from ctgraph_rl.visualize.states import DECISION, END, FAIL, FAIL_KEY, HOME, HOME_KEY, WAIT, Edge, Key
-from ctgraph_rl.visualize.style import Point, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
+from ctgraph_rl.visualize.style import PlanePoint, colour, draw_lines, goal_mark, mark, new_figure, shape_of, stub_lines
 
-Counts = Mapping[Any, float]
+Counted = Mapping[Any, float]
 PerAction = Mapping[Any, Any]
 
 ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
@@ -41,7 +41,7 @@ def task_figure(task: Task, **overlays: Any) -> Any:
 def draw_task(
     axes: Any,
     task: Task,
-    visits: Counts | None = None,
+    visits: Counted | None = None,
     policy: PerAction | None = None,
     values: PerAction | None = None,
     ids: bool = True,
@@ -73,7 +73,7 @@ def draw_task(
 class _TaskPicture:
     """The arguments of `draw_task`, laid out on the axes."""
 
-    def __init__(self, axes: Any, task: Task, visits: Counts, policy: PerAction, values: PerAction, ids: bool) -> None:
+    def __init__(self, axes: Any, task: Task, visits: Counted, policy: PerAction, values: PerAction, ids: bool) -> None:
         self.axes = axes
         self.task = task
         self.visits = visits
@@ -93,7 +93,7 @@ class _TaskPicture:
         counts = {node: count for (kind, node), count in self.visits.items() if kind == END and node != self.goal}
         return sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
 
-    def _place(self, state: Key) -> Point:
+    def _place(self, state: Key) -> PlanePoint:
         """x in (0, 1), y a row of states below 0."""
         kind, node = state
         x = self.layout.x[node]
@@ -169,7 +169,7 @@ class _TaskPicture:
             return 0.8 + 2 * self.policy[edge.start][edge.action]
         return 1.6 if self._is_strong(edge) else 0.8
 
-    def _write_at_edge(self, edge: Edge, line: Sequence[Point]) -> None:
+    def _write_at_edge(self, edge: Edge, line: Sequence[PlanePoint]) -> None:
         """The action, its probability and its value, on the edge; further down, where edges are apart."""
         if edge.action is None:
             return
@@ -264,7 +264,7 @@ class _TaskPicture:
         most = max(b + 1, len(self.policy.get(state, ())), len(self.values.get(state, ())))
         return [action for action in range(most) if action not in right]
 
-    def _note(self, words: str, place: Point, shift: Point, **style: Any) -> None:
+    def _note(self, words: str, place: PlanePoint, shift: PlanePoint, **style: Any) -> None:
         """Words some points off a place."""
         self.axes.annotate(words, place, xytext=shift, textcoords="offset points", **style)
 

@@ -124,7 +124,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.parts.networks",
             "baselines.update.optimiser",
-            "baselines.update.update:State,update",
+            "baselines.update.update:UpdateState,update",
             "baselines.parts.embedding",
             "baselines.parts.transport",
             "baselines.methods.method",

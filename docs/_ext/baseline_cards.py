@@ -11,7 +11,7 @@ from yaml_settings import ALONE, base_of, escaped, first_comment, names_in, sett
 
 from baselines.cells.cell import Cell
 from baselines.methods.__main__ import needs_ids
-from baselines.parts.catalogue import Entry, catalogue
+from baselines.parts.catalogue import CatalogueEntry, catalogue
 
 DETECTABLE = "curriculum=dick2020_pair agent=ppo method=mask_ri "
 """A run in which every detector can work."""
@@ -28,7 +28,7 @@ def baseline_cards() -> Iterator[tuple[str, str]]:
             yield f"{group}s/{entry.name}.md", _card(group, entry, facts(entry), first[entry.kind] == entry.name)
 
 
-def _index(group: str, entries: list[Entry]) -> str:
+def _index(group: str, entries: list[CatalogueEntry]) -> str:
     rows = [f"| [`{entry.name}`]({entry.name}.md) | {escaped(entry.comment)} |" for entry in entries]
     words = f"Choose one with `{group}=NAME`. Each card has all settings with their defaults."
     listing = "\n".join([f"| `{group}=` | |", "|---|---|", *rows])
@@ -36,24 +36,24 @@ def _index(group: str, entries: list[Entry]) -> str:
     return f"# {group.title()} cards\n\n{words}\n\n{listing}\n{base}"
 
 
-def _agent_facts(entry: Entry) -> dict[str, str]:
+def _agent_facts(entry: CatalogueEntry) -> dict[str, str]:
     return {"memory": "yes" if entry.kind.memory else "no", "can solve in principle": entry.kind.solves}
 
 
-def _cell_facts(entry: Entry) -> dict[str, str]:
+def _cell_facts(entry: CatalogueEntry) -> dict[str, str]:
     return {"memory": "yes" if entry.kind.memory else "no", "can hold": entry.kind.holds}
 
 
-def _method_facts(entry: Entry) -> dict[str, str]:
+def _method_facts(entry: CatalogueEntry) -> dict[str, str]:
     ids = {"yes": "yes", "no": "no"}.get(needs_ids(entry), f"only with `{needs_ids(entry)}`")
     return {"needs task ids": ids, "needs to know boundaries": "yes" if entry.kind.needs_boundaries else "no"}
 
 
-def _detector_facts(entry: Entry) -> dict[str, str]:
+def _detector_facts(entry: CatalogueEntry) -> dict[str, str]:
     return {"reads": entry.kind.reads}
 
 
-def _card(group: str, entry: Entry, facts: dict[str, str], is_first: bool) -> str:
+def _card(group: str, entry: CatalogueEntry, facts: dict[str, str], is_first: bool) -> str:
     chosen = {"agent": "", "cell": "agent=lstm_ppo ", "method": "agent=ppo ", "detector": DETECTABLE}[group]
     results = {"agent": agents_results, "method": methods_results}.get(group, lambda name: "")(entry.name)
     prefix = "agent.cell." if group == "cell" else f"{group}."
@@ -93,7 +93,7 @@ def _variants(group: str, name: str) -> list[str]:
     return ["## Variants", *sections] if sections else []
 
 
-def _source(entry: Entry) -> list[str]:
+def _source(entry: CatalogueEntry) -> list[str]:
     """Return a section with the papers that the module of an entry names."""
     words = (getdoc(import_module(entry.kind.__module__)) or "").split("\n\n")[1:]
     return ["## Source", " ".join(escaped(words[0]).replace("``", "`").split())] if words else []

@@ -19,7 +19,7 @@ from baselines.parts.distinct import distinct
 from baselines.parts.networks import GROUP
 from baselines.update import seeds as together
 from baselines.update.compiled import compiler_options
-from baselines.update.seeds import Group, why_not_together
+from baselines.update.seeds import SeedGroup, why_not_together
 from baselines.update.update import update
 from benchmarks import agents as benchmark
 from benchmarks import environment_ladder as ladder_of_envs
@@ -358,7 +358,7 @@ def test_a_run_starts_within_1_3_times_the_bare_imports():
 
 
 def test_graphs_for_acting_of_equal_code_are_compiled_once(small_agent, monkeypatch):
-    group = Group([small_agent("ppo", [ct_su_b1()])], [torch.Generator()])
+    group = SeedGroup([small_agent("ppo", [ct_su_b1()])], [torch.Generator()])
     zero, compiled = torch.zeros(1), []
     one, equal_one = (symbolic_trace(lambda x: x.sin()) for _ in range(2))
     other = symbolic_trace(lambda x: x.cos())

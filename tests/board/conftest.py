@@ -14,7 +14,7 @@ from helpers.sweeping import command_line
 from ctgraph_rl.board import relearn, rerun, verify
 from ctgraph_rl.board.isolate import Isolation, Outcome
 from ctgraph_rl.board.method import TEMPLATE
-from ctgraph_rl.board.relearn import Job
+from ctgraph_rl.board.relearn import Relearning
 from ctgraph_rl.board.submission import Submission, read_submission
 from ctgraph_rl.board.submit import submit
 from ctgraph_rl.board.tracks import Track, track
@@ -107,7 +107,7 @@ def in_process(monkeypatch):
     def run(module, arguments, folder, limits, **more):
         folders.append(folder)
         try:
-            relearn.learn_again(Job.read(folder / arguments[0]), folder)
+            relearn.learn_again(Relearning.read(folder / arguments[0]), folder)
         except Exception as error:
             return Outcome(1, None, 0.0, f"{type(error).__name__}: {error}")
         more["watch"]()

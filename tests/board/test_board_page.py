@@ -11,7 +11,7 @@ from helpers.paths import CHECKOUT
 
 from ctgraph_rl import cli
 from ctgraph_rl.board.standings.entries import read_entries
-from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.board.standings.tables import BoardTable, tables
 from ctgraph_rl.board.submission import VERIFICATION, read_submission
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.portable import cpu_model
@@ -28,7 +28,7 @@ MOST_BYTES = 6 * 2**20
 
 
 @pytest.fixture(scope="module")
-def made() -> list[Table]:
+def made() -> list[BoardTable]:
     """The tables of the submissions."""
     entries, problems = read_entries([SUBMISSIONS])
     assert problems == []

@@ -56,6 +56,6 @@ def test_a_held_out_log_has_the_evaluations_of_the_protocol(tiny_submission, tmp
     log = RunLog.of_content("".join(json.dumps(each) + "\n" for each in kept).encode(), tmp_path)
     cell = cell._replace(curriculum=tiny_submission.curriculum)
 
-    frames, evaluations, _ = held_out.held_out_checks(tiny_submission, [(cell, rerun.Result(log, "", None))])
+    frames, evaluations, _ = held_out.held_out_checks(tiny_submission, [(cell, rerun.Rerun(log, "", None))])
 
     assert (frames.passed, evaluations.passed, evaluations.level) == (True, is_complete, "held_out")

@@ -18,9 +18,9 @@ from ctgraph_rl import Protocol
 from ctgraph_rl.board.method import TEMPLATE
 from ctgraph_rl.board.standings import formats
 from ctgraph_rl.board.standings.ceilings import ceilings_of
-from ctgraph_rl.board.standings.entries import Entry, Verification
+from ctgraph_rl.board.standings.entries import BoardEntry, Verification
 from ctgraph_rl.board.standings.page import html
-from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.board.standings.tables import BoardTable, tables
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.report import statistics
 
@@ -30,7 +30,7 @@ pytest.importorskip("jinja2")
 SMALL, FORGETTING = track("small"), track("forgetting")
 
 
-def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant: int = 0, **more: Any) -> Entry:
+def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant: int = 0, **more: Any) -> BoardEntry:
     """A submission with these scores, one for each seed."""
     code = {"repository": "https://example.org/repository", "commit": "0123abc", "licence": "MIT"}
     method = yaml.safe_load(TEMPLATE) | {"name": name, "authors": ["A. Author"], "code": code}
@@ -40,7 +40,7 @@ def entry(name: str, scores: Sequence[float | None], of: Track = SMALL, variant:
     about = {"verification": verification, "failed": {}, "agent_bytes": 1234, "folder": Path("made"), **more}
     values = dict.fromkeys(("normalised_performance", "average_performance", "forgetting"), tuple(scores))
     digest = hashlib.sha256(name.encode()).hexdigest()
-    return Entry(digest, method, of, of.variants[variant], seeds=of.seeds, values=values, **about)
+    return BoardEntry(digest, method, of, of.variants[variant], seeds=of.seeds, values=values, **about)
 
 
 def some(low: float, high: float, count: int = 20) -> list[float]:
@@ -48,7 +48,7 @@ def some(low: float, high: float, count: int = 20) -> list[float]:
     return [high if seed % 2 else low for seed in range(count)]
 
 
-def ranks(table: Table) -> dict[str, str]:
+def ranks(table: BoardTable) -> dict[str, str]:
     return {line.name: line.rank for line in table.standings}
 
 
@@ -146,7 +146,7 @@ def test_ceilings_are_those_by_hand(curriculum, expected):
 
 
 @pytest.fixture
-def made() -> list[Table]:
+def made() -> list[BoardTable]:
     """Two tables, with a name that means something in every format."""
     best = entry("<b>A_1</b> & *co* | $x$", [1.0] * 20, level="rerun", bytes_per_task=4096)
     other = entry("other", [0.5] * 20, variant=1, level="held_out", verification=(False,))

@@ -15,7 +15,7 @@ from helpers.sweeping import command_line
 
 from ctgraph_rl.board import bubblewrap, relearn, rerun, verify
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome
-from ctgraph_rl.board.relearn import Job, run_dir_of
+from ctgraph_rl.board.relearn import Relearning, run_dir_of
 from ctgraph_rl.board.rerun import cells_of, draw, result_of
 from ctgraph_rl.board.rescore import Check
 from ctgraph_rl.board.submit import submit
@@ -182,7 +182,7 @@ def test_experts_are_trained_again_in_the_groups_of_seeds_in_which_they_were(tin
     monkeypatch.chdir(tmp_path)
     cell.job._replace(config={**cell.job.config, "experts": True}).write(tmp_path / "job.json")
 
-    relearn.learn_again(Job.read(tmp_path / "job.json"), tmp_path)
+    relearn.learn_again(Relearning.read(tmp_path / "job.json"), tmp_path)
 
     [found] = RunLog.read(tmp_path / "seed0" / "run.jsonl").of_kind("experts")
     assert [expert.get("together") for expert in found["experts"]] == [[0, 1], None, None, None]
@@ -199,9 +199,9 @@ def test_where_bits_are_not_promised_scores_are_tested_and_the_power_is_stated(
     scores = iter(found)
     monkeypatch.setattr(rerun, "score_of", lambda *_: next(scores))
     run = tiny_submission.runs[0]
-    other = rerun.Result(RunLog(), "", None, run.agent_bytes)
+    other = rerun.Rerun(RunLog(), "", None, run.agent_bytes)
     results = {replace(run, seed=seed): other for seed in range(1, len(found) + 1)}
-    stopped = rerun.Result(None, "", "stopped: it took longer than 1 seconds")
+    stopped = rerun.Rerun(None, "", "stopped: it took longer than 1 seconds")
 
     check, *sizes, undecided = rerun.verified(tiny_submission, {**results, run: stopped}, ["cpu A there, B here"])
 
@@ -233,9 +233,9 @@ def test_a_learner_that_is_not_ours_is_called_by_its_entry_point(tiny_submission
         folder = tmp_path / name
         folder.mkdir()
         path = str(tiny_submission.path / "curriculum.json")
-        job = Job((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
+        job = Relearning((3,), False, {}, 1, entry_point="waiting_learner:train", curriculum=path)
         relearn.learn_again(job, folder)
-        cell = rerun.Cell(folder, job, (), tiny_submission.curriculum, 1.0)
+        cell = rerun.RerunCell(folder, job, (), tiny_submission.curriculum, 1.0)
         result = result_of(cell, 3, Outcome(0, None, 0.0, ""))
         assert (result.failure, result.agent_sha256) == (None, "")
         sums.append(rerun.log_sum(result.log))
@@ -308,7 +308,7 @@ def test_a_level_needs_all_checks_and_a_lower_held_out_score_takes_none_away():
 
 def test_a_run_that_cannot_be_finished_here_is_undecided_and_says_why(tiny_submission):
     run = tiny_submission.runs[0]
-    stopped = rerun.Result(None, "", "stopped: it took longer than 1 seconds")
+    stopped = rerun.Rerun(None, "", "stopped: it took longer than 1 seconds")
 
     (check,) = rerun.checks_of(run, tiny_submission.log(run), stopped)
 

@@ -24,7 +24,7 @@ from helpers.task_families import FAMILIES, RICH, SWITCHED, VECTORS
 from torch import nn
 
 import curricula
-from baselines.update.seeds import Group
+from baselines.update.seeds import SeedGroup
 from ctgraph_rl import (
     CTGraphEnv,
     Evaluation,
@@ -269,7 +269,7 @@ def stacked(compose) -> Any:
         agents.append(learner_of(compose, "dqn", {}, seed)[0])
         generators.append(torch.Generator("cpu").set_state(torch.get_rng_state()))
     logs = [RunLog(), RunLog()]
-    learn_together(TWO_TASKS, Group(agents, generators), [0, 1], logs)
+    learn_together(TWO_TASKS, SeedGroup(agents, generators), [0, 1], logs)
     return [lines(log) for log in logs], [agent.state_dict() for agent in agents]
 
 

@@ -10,7 +10,7 @@ import io
 import re
 import tokenize
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -69,6 +69,12 @@ class Module:
 
     functions: tuple[tuple[str, int], ...] = ()
     """Functions and how many tokens of code their bodies have, without comments and docstrings."""
+
+    starred: tuple[str, ...] = ()
+    """Functions that star into a call a dict of literal keys that they made for it."""
+
+    classes: tuple[str, ...] = ()
+    """Public classes and aliases of types."""
 
     @property
     def folder(self) -> str:
@@ -189,7 +195,48 @@ def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
         by_name=tuple(reader.by_name),
         private=tuple(reader.private),
         functions=tuple(_sizes_of_functions(tree, text)),
+        starred=tuple(_starred_dicts(tree)),
+        classes=tuple(_public_classes(tree)),
     )
+
+
+def _starred_dicts(tree: ast.Module) -> Iterator[str]:
+    """Functions that star a dict of literal keys into a call, but for those that set other items of it."""
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            nodes = list(ast.walk(function))
+            made = {name for node in nodes for name in _literal_dicts(node)}
+            starred = {
+                ast.unparse(each.value)
+                for node in nodes
+                if isinstance(node, ast.Call)
+                for each in node.keywords
+                if each.arg is None
+            }
+            changed = {
+                ast.unparse(node.value)
+                for node in nodes
+                if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
+            }
+            if made & starred - changed:
+                yield function.name
+
+
+def _literal_dicts(node: ast.AST) -> Iterator[str]:
+    """The name that a statement gives to a dict whose keys are all literals."""
+    value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+    if isinstance(value, ast.Dict) and value.keys and all(isinstance(key, ast.Constant) for key in value.keys):
+        yield ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
+
+
+def _public_classes(tree: ast.Module) -> Iterator[str]:
+    """The public classes of a module and its aliases of types, whose names are in camel case."""
+    for node in tree.body:
+        name = node.name if isinstance(node, ast.ClassDef) else ""
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            name = ast.unparse(node.targets[0])
+        if re.fullmatch(r"[A-Z]+[a-z]\w*", name):
+            yield name
 
 
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
@@ -358,6 +405,35 @@ def long_files(modules: Iterable[Module], most: int, exceptions: Iterable[str]) 
 def long_functions(modules: Iterable[Module], most: int) -> list[str]:
     """Functions of more tokens than allowed."""
     return sorted(f"{module.name}.{name}" for module in modules for name, size in module.functions if size > most)
+
+
+def p90_of_functions(modules: Iterable[Module]) -> int:
+    """The tokens that at most one function in ten exceeds."""
+    sizes = sorted(size for module in modules for _, size in module.functions)
+    return sizes[9 * len(sizes) // 10]
+
+
+def starred_dicts(modules: Iterable[Module]) -> list[str]:
+    return sorted(f"{module.name}.{name}" for module in modules for name in module.starred)
+
+
+def classes_defined_twice(modules: Iterable[Module]) -> dict[str, list[str]]:
+    """Public names of classes and aliases that several modules define, with these modules."""
+    found: dict[str, list[str]] = {}
+    for module in modules:
+        for name in module.classes:
+            found.setdefault(name, []).append(module.name)
+    return {name: homes for name, homes in sorted(found.items()) if len(homes) > 1}
+
+
+def modules_of_one_name(modules: Iterable[Module]) -> dict[str, list[str]]:
+    """Names that several modules have, with these modules."""
+    found: dict[str, list[str]] = {}
+    for module in modules:
+        last = module.name.rpartition(".")[2]
+        if not module.is_folder and last != "__main__":
+            found.setdefault(last, []).append(module.name)
+    return {name: homes for name, homes in sorted(found.items()) if len(homes) > 1}
 
 
 def long_calls(modules: Iterable[Module], most: int, exceptions: Iterable[str] = ()) -> list[str]:

@@ -15,7 +15,7 @@ from helpers.scripted import ONE, THREE, TWO, ScriptedGroup, Told, decide, first
 from helpers.small_agents import BATCHED, TINY, others_slow, saved_and_loaded
 
 from baselines.update import seeds as together
-from baselines.update.seeds import Group
+from baselines.update.seeds import SeedGroup
 from baselines.update.stack import Stack
 from baselines.update.update import losses_of, total_loss, unstacked, update, with_tensors
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
@@ -48,7 +48,7 @@ class Together(NamedTuple):
     make_agent: Any
     curriculum: Curriculum = CURRICULUM
 
-    def group(self, seeds=SEEDS) -> Group:
+    def group(self, seeds=SEEDS) -> SeedGroup:
         generators = []
 
         def built(seed: int):
@@ -56,9 +56,9 @@ class Together(NamedTuple):
             generators.append(torch.Generator().set_state(torch.get_rng_state()))
             return agent
 
-        return Group([built(seed) for seed in seeds], generators)
+        return SeedGroup([built(seed) for seed in seeds], generators)
 
-    def learn(self, seeds=SEEDS, saved=None, logs=None, checkpoint=None) -> tuple[Group, list[RunLog]]:
+    def learn(self, seeds=SEEDS, saved=None, logs=None, checkpoint=None) -> tuple[SeedGroup, list[RunLog]]:
         group, logs = self.group(seeds), [RunLog() for _ in seeds] if logs is None else logs
         torch.manual_seed(1234)
         learn_together(self.curriculum, group, seeds, logs, saved=saved, checkpoint=checkpoint)
@@ -82,7 +82,7 @@ def make(compose):
     return make
 
 
-def states(group: Group) -> list[tuple[Any, torch.Tensor]]:
+def states(group: SeedGroup) -> list[tuple[Any, torch.Tensor]]:
     pairs = zip(group.agents, group.generators, strict=True)
     return [(saved_and_loaded(agent.state_dict()), generator.get_state()) for agent, generator in pairs]
 
@@ -123,7 +123,7 @@ def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_ru
     make, monkeypatch, name, method
 ):
     its, found = make(name, method, curriculum=LESS_EVALUATED), []
-    start, update = Group.start_task, Group._update
+    start, update = SeedGroup.start_task, SeedGroup._update
 
     def started(group, task=None):
         start(group, task)
@@ -141,8 +141,8 @@ def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_ru
                 learner.float()
         return update(group, stack, minibatches, errors)
 
-    monkeypatch.setattr(Group, "start_task", started)
-    monkeypatch.setattr(Group, "_update", compared)
+    monkeypatch.setattr(SeedGroup, "start_task", started)
+    monkeypatch.setattr(SeedGroup, "_update", compared)
     its.learn()
 
     assert len(found) == 3
@@ -156,7 +156,7 @@ def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_ru
         assert any(gradient.abs().max() > 1e-6 for gradient in gradients)
 
 
-def of_all(group: Group, minibatches) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
+def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
     """Losses of a group, and the gradients of what is trained."""
     first, state = group.learners[0], Stack(group.learners).state
     batch = {key: torch.stack([wide(each[key]) for each in minibatches]) for key in minibatches[0]}
@@ -194,7 +194,7 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
 
 @pytest.mark.parametrize(("name", "method"), others_slow(SOME, ("a2c", "mask_lc")))
 def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(make, monkeypatch, name, method):
-    act, compared = Group._act, []
+    act, compared = SeedGroup._act, []
 
     def checked(group, stack, data):
         outputs = act(group, stack, data)
@@ -203,7 +203,7 @@ def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(ma
         compared.extend(torch.equal(outputs[key], present[key]) for key in present)
         return outputs
 
-    monkeypatch.setattr(Group, "_act", checked)
+    monkeypatch.setattr(SeedGroup, "_act", checked)
     make(name, method).learn()
 
     assert len(compared) > 8
@@ -218,7 +218,7 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
         name, method, "agent.compile=true", curriculum=of(Block(ONE, 64), Block(THREE, 64), task_id="at_boundaries")
     )
     sizes = []
-    step = Group._step
+    step = SeedGroup._step
 
     def compared(group, stack, batch):
         first = stack.learners[0]
@@ -232,7 +232,7 @@ def test_a_compiled_step_is_the_same_step_of_fewer_seeds_at_a_time(make, monkeyp
         torch.testing.assert_close(values_of(one), values_of(other), rtol=1e-10, atol=1e-10)
         return step(group, stack, batch)
 
-    monkeypatch.setattr(Group, "_step", compared)
+    monkeypatch.setattr(SeedGroup, "_step", compared)
     monkeypatch.setattr(together, "_most_at_once", lambda learner: 2)
     its.learn()
 
@@ -317,7 +317,7 @@ def test_a_group_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_
 
 def spoil(monkeypatch, numbers=(1,)) -> None:
     """Let weights of some seeds be nan when the first batch of the second task is learned from."""
-    learn, batches = Group.learn, []
+    learn, batches = SeedGroup.learn, []
 
     def spoiled(group, batch):
         batches.append(batch)
@@ -325,7 +325,7 @@ def spoil(monkeypatch, numbers=(1,)) -> None:
             group.learners[number].weights[0].data.fill_(torch.nan)
         return learn(group, batch)
 
-    monkeypatch.setattr(Group, "learn", spoiled)
+    monkeypatch.setattr(SeedGroup, "learn", spoiled)
 
 
 @pytest.mark.parametrize(("name", "method"), others_slow([("a2c", "finetune"), *SOME[1:]], ("a2c", "finetune")))

@@ -11,7 +11,7 @@ import pytest
 from helpers.made_runs import write_run
 
 from ctgraph_rl.report import formats, results
-from ctgraph_rl.report.latex import LINE_WIDTH, Cell, Labels, Table, latex, letters
+from ctgraph_rl.report.latex import LINE_WIDTH, Labels, Table, TableCell, latex, letters
 from ctgraph_rl.runs.read import find_runs
 
 pytest.importorskip("scipy")
@@ -28,7 +28,7 @@ HEADS = ("average performance", "forward transfer", "backward transfer", "forget
 
 
 def table(rows: int = 3, heads=HEADS, name: str = "LSTMPPO + EWC", notes=("seed 1: unfinished",)) -> Table:
-    cells = [Cell("-0.25", "[-0.82, -0.07]", 1), *[Cell("0.17", "[-0.89, 0.79]")] * (len(heads) - 1)]
+    cells = [TableCell("-0.25", "[-0.82, -0.07]", 1), *[TableCell("0.17", "[-0.89, 0.79]")] * (len(heads) - 1)]
     return Table(
         "Some tasks: 95 % of x_1", "some", "agent", heads, [(f"{name} {i}", cells) for i in range(rows)], notes
     )

@@ -27,7 +27,7 @@ from rich.console import Console
 from ctgraph_rl.log.files import locked
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import explain
-from ctgraph_rl.runs.status import SHOWN, Outcome, Status, SweepProgress, lock_holder, report, status_of
+from ctgraph_rl.runs.status import SHOWN, RunOutcome, Status, SweepProgress, lock_holder, report, status_of
 from ctgraph_rl.runs.sweep import shortened, sigterm_exits, why
 
 SHORT = ("curriculum.num_frames=512", "agent.num_envs=64", "agent.num_steps=8", "agent.hidden_size=8")
@@ -318,7 +318,7 @@ def test_the_status_of_a_cell_is_read_from_its_directory(tmp_path):
     assert [state for state, _ in found] == ["missing", "missing", "failed", "in use", "done"]
     reasons = ["not begun", "stopped; the next start resumes it", "ValueError: no\n"]
     assert [reason for _, reason in found[:3]] == reasons
-    assert status_of(tmp_path, before=Outcome.of(tmp_path)).state == "missing"
+    assert status_of(tmp_path, before=RunOutcome.of(tmp_path)).state == "missing"
 
 
 def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
@@ -354,7 +354,7 @@ def test_progress_counts_cells_and_tells_the_time_left(tmp_path):
     for cell in cells[:10]:
         cell.mkdir()
         (cell / ("failed.txt" if cell == cells[3] else "metrics.json")).write_text("{}")
-    progress = SweepProgress(dict.fromkeys(cells, Outcome()), console=Console(file=io.StringIO()))
+    progress = SweepProgress(dict.fromkeys(cells, RunOutcome()), console=Console(file=io.StringIO()))
 
     done, failed, running = progress.look()
 
@@ -368,7 +368,7 @@ def test_progress_on_a_terminal_ends_with_the_cells_that_were_done_last(tmp_path
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=True, width=120)
 
-    with SweepProgress(dict.fromkeys([tmp_path / "a", tmp_path / "b"], Outcome()), console):
+    with SweepProgress(dict.fromkeys([tmp_path / "a", tmp_path / "b"], RunOutcome()), console):
         for name in "ab":
             (tmp_path / name).mkdir()
             (tmp_path / name / "metrics.json").write_text("{}")
@@ -388,7 +388,7 @@ def test_progress_without_a_terminal_is_a_line_a_minute(tmp_path, monkeypatch):
     monkeypatch.setattr("ctgraph_rl.runs.status.SECONDS_BETWEEN_LINES", 0.0)
 
     (tmp_path / "metrics.json").write_text("{}")  # done before, so it tells nothing of the rate
-    cells = dict.fromkeys([tmp_path, tmp_path / "b"], Outcome())
+    cells = dict.fromkeys([tmp_path, tmp_path / "b"], RunOutcome())
     with SweepProgress(cells, console=Console(file=shown)):
         assert is_shown.wait(60)
 

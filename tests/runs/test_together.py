@@ -12,7 +12,7 @@ import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
-from baselines.update.seeds import Group
+from baselines.update.seeds import SeedGroup
 from ctgraph_rl import RunLog, disk
 from ctgraph_rl.compare import ROUNDING, compare
 from ctgraph_rl.log import run_log, sums, tables
@@ -233,14 +233,14 @@ def test_seeds_that_cannot_be_one_batch_are_trained_as_alone(monkeypatch):
 
 def test_a_seed_that_fails_is_marked_alone_and_tried_again_by_the_next_start(monkeypatch, capsys, together):
     settings = (SEEDS, "together=true", *PPO)
-    start = Group.start_task
+    start = SeedGroup.start_task
 
     def spoiled(group, task=None):
         start(group, task)
         group.learners[0].weights[0].data.fill_(torch.nan)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Group, "start_task", spoiled)
+        patch.setattr(SeedGroup, "start_task", spoiled)
         assert sweep(patch, *settings) == 1
     shown = capsys.readouterr().out
     assert "2 done, 1 failed" in shown and "FloatingPointError: seed 0: loss_objective is nan in block 1" in shown
@@ -262,14 +262,14 @@ def test_a_seed_that_failed_has_failed_also_where_its_group_was_stopped_before_i
 ):
     settings = (SEEDS, "together=true", *PPO)
     assert sweep(monkeypatch, *settings, "hydra.sweep.dir=whole") == 0
-    start = Group.start_task
+    start = SeedGroup.start_task
 
     def spoiled(group, task=None):
         start(group, task)
         group.learners[0].weights[0].data.fill_(torch.nan)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Group, "start_task", spoiled)
+        patch.setattr(SeedGroup, "start_task", spoiled)
         stop_after(patch, finished, train.RunDirectory, "finish")
         assert sweep(patch, *settings) == 130
     capsys.readouterr()
@@ -388,7 +388,7 @@ def test_experts_of_a_stopped_group_begin_again_where_one_is_needed_alone(monkey
 
 @pytest.mark.slow
 def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch, whole):
-    start, begun = Group.start_task, []
+    start, begun = SeedGroup.start_task, []
 
     def spoiled(group, task=None):
         start(group, task)
@@ -403,7 +403,7 @@ def test_an_expert_that_fails_fails_alone_and_its_run_does_not_begin(monkeypatch
         run_as_one(made)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Group, "start_task", spoiled)
+        patch.setattr(SeedGroup, "start_task", spoiled)
         with pytest.raises(
             RuntimeError, match=r"^FloatingPointError: expert 1 of 2, .*: seed 1: loss_objective is nan"
         ):

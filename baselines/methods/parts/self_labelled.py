@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
 from baselines.parts.networks import sequences_of, trunk_of
-from ctgraph_rl.agent import Agent, Method
+from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions
@@ -38,7 +38,7 @@ class SelfLabelled:
         detector: what gives the labels.
     """
 
-    def __init__(self, method: Method, detector: Detector) -> None:
+    def __init__(self, method: MethodLike, detector: Detector) -> None:
         self.method = method
         self.detector = detector
 

@@ -53,7 +53,7 @@ class Verification(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Entry:
+class BoardEntry:
     """A submission on the board.
 
     Args:
@@ -125,14 +125,14 @@ class Entry:
         return f"no score of seed {', '.join(without)}" if without else None
 
 
-def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) -> tuple[list[Entry], list[Problem]]:
+def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) -> tuple[list[BoardEntry], list[Problem]]:
     """Return the submissions in or below folders, and what is left out.
 
     Args:
         paths: folders of submissions, or folders that hold them.
         config_dir: where tracks of the user are, as ``track/NAME.yaml``.
     """
-    found: dict[str, Entry] = {}
+    found: dict[str, BoardEntry] = {}
     problems = []
     for path in map(Path, paths):
         files, deep = files_below(path, (METHOD,))
@@ -153,7 +153,7 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
     return list(found.values()), problems
 
 
-def entry_of(submission: Submission) -> Entry:
+def entry_of(submission: Submission) -> BoardEntry:
     """Return a submission as an entry.
 
     Raises:
@@ -180,7 +180,7 @@ def entry_of(submission: Submission) -> Entry:
         metric: tuple(_value(submission, run, metric, bounds.of_metric(metric)) for run in names)
         for metric in dict.fromkeys((track.score, *MEASURES))
     }
-    return Entry(
+    return BoardEntry(
         digest=submission.digest,
         method=submission.method,
         track=own if other else track,
@@ -264,7 +264,7 @@ def shown_level(level: str) -> str:
     return level.replace("_", " ")
 
 
-def names_of(entries: Sequence[Entry]) -> list[str]:
+def names_of(entries: Sequence[BoardEntry]) -> list[str]:
     """Return a name for each entry: that of its method, with digits of the digest where two have the same."""
     names = [entry.name for entry in entries]
     return [

@@ -11,11 +11,11 @@ from ctgraph_rl import __version__
 from ctgraph_rl.board.method import OURS
 from ctgraph_rl.board.standings.ceilings import in_words
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
-from ctgraph_rl.board.standings.tables import Standing, Table, is_significant
+from ctgraph_rl.board.standings.tables import BoardTable, Standing, is_significant
 from ctgraph_rl.log.escape import csv_text, markdown_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
-from ctgraph_rl.report.latex import PREAMBLE, Cell, Labels, latex
+from ctgraph_rl.report.latex import PREAMBLE, Labels, TableCell, latex
 from ctgraph_rl.report.latex import Table as LatexTable
 from ctgraph_rl.report.statistics import Estimate
 
@@ -38,7 +38,7 @@ NOT_IN_LATEX = ("method", "bytes of the agent", "steps")
 """Columns that stand elsewhere in LaTeX, or are left out for want of room."""
 
 
-class Column(NamedTuple):
+class BoardColumn(NamedTuple):
     """A cell of a line for a page: what is shown, and what the column is sorted by."""
 
     head: str
@@ -47,7 +47,7 @@ class Column(NamedTuple):
     interval: str = ""
 
 
-def columns(line: Standing) -> list[Column]:
+def columns(line: Standing) -> list[BoardColumn]:
     """Return the cells of a line."""
     entry = line.entry
     compute = line.entry.method["compute"]
@@ -55,21 +55,21 @@ def columns(line: Standing) -> list[Column]:
     numbers = [_measure(name, estimate) for name, estimate in line.estimates.items()]
     n = str(line.score).rpartition(" n = ")[2]
     return [
-        Column("rank", line.rank, line.best_rank),
-        Column("method", line.name, line.name.lower()),
+        BoardColumn("rank", line.rank, line.best_rank),
+        BoardColumn("method", line.name, line.name.lower()),
         *numbers,
-        Column("n", n, line.score.n),
-        Column("bytes per task", f"{per_task:,}", per_task),
-        Column("bytes of the agent", _count(entry.agent_bytes), entry.agent_bytes),
-        Column("steps", f"{entry.frames:,}", entry.frames),
-        Column("hours", _hours(compute["hours"]), compute["hours"]),
-        Column("level", entry.verified, LEVELS.index(entry.level)),
+        BoardColumn("n", n, line.score.n),
+        BoardColumn("bytes per task", f"{per_task:,}", per_task),
+        BoardColumn("bytes of the agent", _count(entry.agent_bytes), entry.agent_bytes),
+        BoardColumn("steps", f"{entry.frames:,}", entry.frames),
+        BoardColumn("hours", _hours(compute["hours"]), compute["hours"]),
+        BoardColumn("level", entry.verified, LEVELS.index(entry.level)),
     ]
 
 
-def _measure(name: str, estimate: Estimate) -> Column:
+def _measure(name: str, estimate: Estimate) -> BoardColumn:
     value, _, interval = str(estimate).partition(" n = ")[0].partition(" ")
-    return Column(measure_name(name), value, estimate.value, interval)
+    return BoardColumn(measure_name(name), value, estimate.value, interval)
 
 
 def _count(value: int | None) -> str:
@@ -80,7 +80,7 @@ def _hours(value: float | None) -> str:
     return "-" if value is None else f"{value:.2g}" if value < 10 else f"{value:,.0f}"
 
 
-def notes(table: Table) -> list[str]:
+def notes(table: BoardTable) -> list[str]:
     """Return what lines of a table need said: no rank, a verification that does not count, and seeds that failed."""
     found = []
     for line in table.standings:
@@ -92,7 +92,7 @@ def notes(table: Table) -> list[str]:
     return found
 
 
-def facts(table: Table) -> list[tuple[str, str]]:
+def facts(table: BoardTable) -> list[tuple[str, str]]:
     """Return what a table's tasks allow, with the budget and the seeds."""
     curriculum = table.variant.curriculum
     seeds = table.track.seeds
@@ -105,7 +105,7 @@ def facts(table: Table) -> list[tuple[str, str]]:
     return [*about, *in_words(table.ceilings)]
 
 
-def verdicts(table: Table) -> list[tuple[str, str, str]]:
+def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
     """Return each comparison of a table: the pair, the difference of the scores, and the corrected p-value."""
     return [
         (f"{one} - {other}", str(found.difference).partition(" n = ")[0], _p_value(found.holm, is_significant(found)))
@@ -117,13 +117,13 @@ def _p_value(holm: float | None, significant: bool) -> str:
     return "-" if holm is None else f"{holm:.2g}" + ("" if significant else ", not distinguishable")
 
 
-def markdown(tables: Sequence[Table]) -> str:
+def markdown(tables: Sequence[BoardTable]) -> str:
     """Return all tables in Markdown."""
     parts = [part for table in tables for part in _markdown(table)]
     return "\n\n".join(["# Board", f"{LEGEND}.", *parts]) + "\n"
 
 
-def _markdown(table: Table) -> Iterator[str]:
+def _markdown(table: BoardTable) -> Iterator[str]:
     yield f"## {markdown_text(table.title)}"
     yield f"{markdown_text(table.track.measures)} Breakthrough: {markdown_text(table.track.breakthrough)}"
     yield "; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + "."
@@ -135,16 +135,16 @@ def _markdown(table: Table) -> Iterator[str]:
         yield "\n".join(f"- {markdown_text(note)}" for note in notes(table))
 
 
-def tables_tex(tables: Sequence[Table]) -> str:
+def tables_tex(tables: Sequence[BoardTable]) -> str:
     """Return all tables in LaTeX."""
     labels = Labels()
     return "\n\n".join([PREAMBLE, *(_latex(table, labels) for table in tables)]) + "\n"
 
 
-def _latex(table: Table, labels: Labels) -> str:
+def _latex(table: BoardTable, labels: Labels) -> str:
     lines = [[cell for cell in columns(line) if cell.head not in NOT_IN_LATEX] for line in table.standings]
     rows = [
-        (line.name, [Cell(cell.shown, cell.interval) for cell in cells])
+        (line.name, [TableCell(cell.shown, cell.interval) for cell in cells])
         for line, cells in zip(table.standings, lines, strict=True)
     ]
     label = labels.new("board", table.track.id, table.variant.rung, table.variant.given)
@@ -184,13 +184,13 @@ SCORE_COLUMNS = {
 """Columns of ``scores.csv`` in the same way."""
 
 
-def entries_csv(tables: Sequence[Table]) -> str:
+def entries_csv(tables: Sequence[BoardTable]) -> str:
     """Return a line for each entry."""
     rows = [list(_entry_cells(table, line)) for table in tables for line in table.standings]
     return csv_text([list(ENTRY_COLUMNS), *rows])
 
 
-def _entry_cells(table: Table, line: Standing) -> Iterator[Any]:
+def _entry_cells(table: BoardTable, line: Standing) -> Iterator[Any]:
     entry = line.entry
     score = line.score
     yield from (entry.id, entry.name, table.track.id, table.variant.rung, table.variant.given)
@@ -199,7 +199,7 @@ def _entry_cells(table: Table, line: Standing) -> Iterator[Any]:
     yield from (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, entry.verified)
 
 
-def scores_csv(tables: Sequence[Table]) -> str:
+def scores_csv(tables: Sequence[BoardTable]) -> str:
     """Return a line for each metric of each seed of each entry."""
     rows = [
         [line.entry.id, seed, metric, value]
@@ -211,12 +211,12 @@ def scores_csv(tables: Sequence[Table]) -> str:
     return csv_text([list(SCORE_COLUMNS), *rows])
 
 
-def as_json(tables: Sequence[Table]) -> dict[str, Any]:
+def as_json(tables: Sequence[BoardTable]) -> dict[str, Any]:
     """Return all tables as plain values."""
     return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": [_json(table) for table in tables]}
 
 
-def _json(table: Table) -> dict[str, Any]:
+def _json(table: BoardTable) -> dict[str, Any]:
     track = table.track
     variant = table.variant
     return {
@@ -271,7 +271,7 @@ def _numbers(estimate: Estimate) -> dict[str, Any]:
     return {name: getattr(estimate, name) for name in names}
 
 
-def model_index(tables: Sequence[Table]) -> str:
+def model_index(tables: Sequence[BoardTable]) -> str:
     """Return the results file that model hubs read, as YAML: ``model-index`` of the Hugging Face Hub."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for table in tables:
@@ -281,7 +281,7 @@ def model_index(tables: Sequence[Table]) -> str:
     return yaml.safe_dump({"model-index": models}, sort_keys=False, allow_unicode=True, width=120)
 
 
-def _result(table: Table, line: Standing) -> dict[str, Any]:
+def _result(table: BoardTable, line: Standing) -> dict[str, Any]:
     """Return the result of an entry: task, data set, metrics and source."""
     variant = table.variant
     method = line.entry.method

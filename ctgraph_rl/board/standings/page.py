@@ -21,8 +21,8 @@ from typing import NamedTuple
 from ctgraph_rl import __version__
 from ctgraph_rl.board.standings import formats
 from ctgraph_rl.board.standings.croissant import croissant
-from ctgraph_rl.board.standings.entries import LEVELS, Entry, read_entries, shown_level
-from ctgraph_rl.board.standings.tables import Table, tables
+from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
+from ctgraph_rl.board.standings.tables import BoardTable, tables
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
@@ -39,7 +39,7 @@ class Board(NamedTuple):
     """The page that was written, its tables, and what was left out."""
 
     page: Path
-    tables: list[Table]
+    tables: list[BoardTable]
     problems: list[Problem]
 
 
@@ -85,7 +85,7 @@ def write_board(
     return Board(folder / PAGE, made, problems)
 
 
-def html(made: Sequence[Table], problems: Sequence[Problem] = ()) -> str:
+def html(made: Sequence[BoardTable], problems: Sequence[Problem] = ()) -> str:
     """Return the page: without JavaScript plain tables, with it tables that are sorted and filtered."""
     from jinja2 import FileSystemLoader, StrictUndefined
     from jinja2.sandbox import SandboxedEnvironment
@@ -115,7 +115,7 @@ def html(made: Sequence[Table], problems: Sequence[Problem] = ()) -> str:
     )
 
 
-def link_of(entry: Entry) -> str | None:
+def link_of(entry: BoardEntry) -> str | None:
     """Return the address of the paper of an entry, else of its code; None if neither is one."""
     addresses = (str(entry.method["paper"]), str(entry.method["code"]["repository"]))
     return next(filter(ADDRESS.fullmatch, addresses), None)

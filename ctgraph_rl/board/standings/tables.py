@@ -13,7 +13,7 @@ from functools import cached_property
 from itertools import combinations
 
 from ctgraph_rl.board.standings.ceilings import Ceilings, ceilings_of
-from ctgraph_rl.board.standings.entries import Entry, names_of
+from ctgraph_rl.board.standings.entries import BoardEntry, names_of
 from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import bounds_of_curriculum
@@ -32,7 +32,7 @@ class Standing:
         worst_rank: the worst one.
     """
 
-    entry: Entry
+    entry: BoardEntry
     name: str
     estimates: Mapping[str, Estimate]
     best_rank: int | None = None
@@ -52,7 +52,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Table:
+class BoardTable:
     """Entries that are comparable, the best score first.
 
     Args:
@@ -83,31 +83,31 @@ class Table:
         return len(self.track.seeds)
 
 
-def tables(entries: Iterable[Entry]) -> list[Table]:
+def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
     """Return a table for all entries that are comparable, in the order of tracks, rungs and what is given."""
-    found: dict[tuple[str, str], list[Entry]] = {}
+    found: dict[tuple[str, str], list[BoardEntry]] = {}
     for entry in entries:
         found.setdefault((entry.track.id, entry.variant.curriculum.fingerprint), []).append(entry)
     made = [_table(some) for some in found.values()]
     return sorted(made, key=lambda table: (table.track.name != "small", table.track.id, _place(table)))
 
 
-def _place(table: Table) -> int:
+def _place(table: BoardTable) -> int:
     """Return the place of a table's variant in its track."""
     given = [each.curriculum.fingerprint for each in table.track.variants]
     return given.index(table.variant.curriculum.fingerprint)
 
 
-def _table(entries: Sequence[Entry]) -> Table:
+def _table(entries: Sequence[BoardEntry]) -> BoardTable:
     """Return the table of comparable entries."""
     lines = [Standing(entry, name, _estimates(entry)) for entry, name in zip(entries, names_of(entries), strict=True)]
     lines.sort(key=lambda line: (line.score.value is None, -(line.score.value or 0.0), line.name))
     pairs = _pairs([line for line in lines if line.entry.why_not_ranked is None])
     ranked = [_ranked(line, pairs) if line.entry.why_not_ranked is None else line for line in lines]
-    return Table(entries[0].track, entries[0].variant, ranked, pairs)
+    return BoardTable(entries[0].track, entries[0].variant, ranked, pairs)
 
 
-def _estimates(entry: Entry) -> dict[str, Estimate]:
+def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
     """Return each measure of an entry over seeds, with the interval that the package's rules give it."""
     bounds = bounds_of_curriculum(entry.variant.curriculum)
     return {name: statistics.mean(values, bounds=bounds.of_metric(name)) for name, values in entry.values.items()}

@@ -8,7 +8,7 @@ from typing import Any
 
 from ctgraph_rl.report.figures.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.figures.trees import Trees
-from ctgraph_rl.report.sections import Matrix, Result, Section
+from ctgraph_rl.report.sections import Estimates, Result, Section
 from ctgraph_rl.report.style import WIDTH, ink, new_figure, short
 
 MOST_NUMBERS = 10
@@ -26,7 +26,7 @@ NEGATIVE = -0.05
 NO_VALUE = (0.85, 0.85, 0.85)
 """Colour of a cell without a value."""
 
-Values = list[list[float]]
+CellValues = list[list[float]]
 
 
 def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure:
@@ -61,7 +61,7 @@ def draw_matrices(section: Section, result: Result) -> Any:
     return figure
 
 
-def draw_performance(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
+def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
     """The performance matrix on a scale from 0, or the lowest value, to 1, or the highest; row 0 is untrained."""
     values = _values(matrix)
     known = [value for row in values for value in row if not math.isnan(value)]
@@ -74,7 +74,7 @@ def draw_performance(axes: Any, matrix: Matrix, labels: Sequence[str], trained: 
     axes.set(ylabel="after block", title="mean return on each task")
 
 
-def draw_transfer(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
+def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
     """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
     values = _values(matrix)
     largest = max([abs(value) for row in values for value in row if not math.isnan(value)], default=0.0) or 1.0
@@ -88,11 +88,11 @@ def draw_transfer(axes: Any, matrix: Matrix, labels: Sequence[str], trained: Seq
     axes.set(ylabel="training in block", title="change of return by the block's training")
 
 
-def _values(matrix: Matrix) -> Values:
+def _values(matrix: Estimates) -> CellValues:
     return [[math.nan if cell.value is None else cell.value for cell in row] for row in matrix]
 
 
-def _show(axes: Any, values: Values, colours: str, low: float, high: float) -> Any:
+def _show(axes: Any, values: CellValues, colours: str, low: float, high: float) -> Any:
     """Draw the cells, with a scale beside them; what has no value is grey."""
     axes.set_facecolor(NO_VALUE)
     image = axes.imshow(values or [[math.nan]], cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
@@ -114,7 +114,7 @@ def _name(axes: Any, labels: Sequence[str], rows: int, first: int) -> None:
     axes.tick_params(length=0)
 
 
-def _write(axes: Any, matrix: Matrix, image: Any, sign: str) -> None:
+def _write(axes: Any, matrix: Estimates, image: Any, sign: str) -> None:
     """Write each mean into its cell, with its interval where there is room."""
     tasks = len(matrix[0]) if matrix else 0
     if tasks > MOST_NUMBERS:

@@ -31,7 +31,7 @@ MOST_SEEDS = 20
 """Seeds up to which each has a thin line."""
 
 BANDS = f"from {FEWEST_FOR_BANDS} seeds on the 95 % interval of their mean"
-Places = Sequence[tuple[float, float]]
+LabelPlaces = Sequence[tuple[float, float]]
 """Values after numbers of frames."""
 
 COLUMNS = 4
@@ -160,7 +160,7 @@ def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
             axes.axvspan(start, end, color="0.9", zorder=-1, linewidth=0)
 
 
-def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[Places]) -> None:
+def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[LabelPlaces]) -> None:
     """Draw a mean with its band, piece by piece, and thin lines for seeds."""
     look = agent_style(position)
     if len(seeds) > 1:

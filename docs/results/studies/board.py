@@ -12,7 +12,7 @@ from ctgraph_rl.board.method import OURS
 from ctgraph_rl.board.standings.entries import shown_level
 from ctgraph_rl.board.standings.formats import columns
 from ctgraph_rl.board.standings.page import write_board
-from ctgraph_rl.board.standings.tables import Table
+from ctgraph_rl.board.standings.tables import BoardTable
 from studies.raw import HERE, TEMPLATES, table
 
 FOLDER = HERE / "board"
@@ -98,7 +98,7 @@ def _method(about: About, commit: str) -> dict[str, Any]:
     return method
 
 
-def page(tables: list[Table]) -> str:
+def page(tables: list[BoardTable]) -> str:
     """Return the page: its template with its tables."""
     shown = [part for each in tables for part in (f"## {each.title}", _table(each))]
     lines = [line for each in tables for line in each.standings]
@@ -108,13 +108,13 @@ def page(tables: list[Table]) -> str:
     return template.substitute(tables="\n\n".join(shown), levels=counts, count=len(lines))
 
 
-def _table(of: Table) -> str:
+def _table(of: BoardTable) -> str:
     lines = [[cell for cell in columns(line) if cell.head not in ELSEWHERE] for line in of.standings]
     rows = [[f"{cell.shown} {cell.interval}".strip() for cell in cells] for cells in lines]
     return table([cell.head for cell in lines[0]], rows)
 
 
-def draw(of: Table, path: Path) -> None:
+def draw(of: BoardTable, path: Path) -> None:
     """Draw every seed, the mean and its interval of each submission of a table, beside the bytes for a further task."""
     import matplotlib
 

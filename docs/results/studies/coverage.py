@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from string import Template
 from zlib import crc32
 
@@ -68,8 +69,8 @@ def bca(values: Sequence[float]) -> Interval:
     """The bootstrap interval BCa, 999 samples; of no width where all seeds agree."""
     if min(values) == max(values):
         return values[0], values[0]
-    how = {"n_resamples": 999, "method": "BCa", "confidence_level": statistics.LEVEL, "rng": 0}
-    found = scipy("stats").bootstrap((np.array(values),), np.mean, **how).confidence_interval
+    bootstrap = partial(scipy("stats").bootstrap, n_resamples=999, method="BCa", rng=0)
+    found = bootstrap((np.array(values),), np.mean, confidence_level=statistics.LEVEL).confidence_interval
     return float(found.low), float(found.high)
 
 

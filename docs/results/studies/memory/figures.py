@@ -48,8 +48,16 @@ def _panel(axes: Any, of: Mapping[str, Raw]) -> None:
             axes.text(0.5, place, "not run", ha="center", va="center", fontsize=5, color="0.4")
             continue
         shifts = [place + 0.6 * (seed / (SEEDS - 1) - 0.5) for seed in range(len(values))]
-        style = {"markersize": 3, "markeredgecolor": "0.35", "markerfacecolor": "none", "markeredgewidth": 0.6}
-        axes.plot(values, shifts, "o", **style, label="a seed" if place == 0 else None)
+        axes.plot(
+            values,
+            shifts,
+            "o",
+            markersize=3,
+            markeredgecolor="0.35",
+            markerfacecolor="none",
+            markeredgewidth=0.6,
+            label="a seed" if place == 0 else None,
+        )
         centre = sum(values) / len(values)
         axes.plot(centre, place, "|", color="0", ms=9, mew=1.6, label="mean" if place == 0 else None)
         number = sum(solved(of[name]))
