@@ -97,7 +97,7 @@ def test_a_pattern_chooses_files_of_a_group(learned, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["cell=glob(zz*)"], "cell=glob(zz*) matches none of amrl_avg, amrl_max, backpropamine, "),
+        (["cell=glob(zz*)"], "cell=glob(zz*) matches none of amrl_avg, amrl_max, attention, "),
         (["seed=glob(1*)"], "seed=glob(1*): glob chooses files of a group, such as agent or method; seed has values"),
         (["method=glob(l2*)", "method.coef=1"], "with method=l2: unknown setting 'method.coef': did you mean"),
         (["agent=glob(d*qn)", "seed=0", "agent.burn_in=2"], "with agent=dqn: unknown setting 'agent.burn_in'"),
