@@ -20,11 +20,21 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
     parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
     parser.add_argument("--agent", **AGENT_OPTION)
+    parser.add_argument("--width", default="text", help="of figures: text of a page, or column, one of its two")
+    parser.add_argument(
+        "--colour",
+        action="append",
+        default=[],
+        metavar="NAME=COLOUR",
+        help="of an agent in figures; repeat it for each",
+    )
     arguments = parser.parse_args()
     with refused_by(parser):
         if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
-        report = write_report(arguments.runs, arguments.out, arguments.agent)
+        report = write_report(
+            arguments.runs, arguments.out, arguments.agent, width=arguments.width, colours=arguments.colour
+        )
     incomplete = print_problems(report.problems, report.runs)
     count = len(report.runs)
     print(f"report of {count} run{'s' * (count != 1)}: {terminal_text(report.page)}")

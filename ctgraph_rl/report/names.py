@@ -106,6 +106,22 @@ def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
     ]
 
 
+def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
+    """Return the colours of agents that are given as ``NAME=COLOUR``, by their names in tables and figures.
+
+    Raises:
+        ValueError: for an unknown agent, with the one that was probably meant, and for what has no colour.
+    """
+    known = list(dict.fromkeys(agent for _, agent in grouped(runs)))
+    found = {}
+    for each in given:
+        name, _, colour = each.rpartition("=")  # settings in names have the sign of equality, too
+        unknown = f"--colour: there is no agent {name!r}: {did_you_mean(name, known)}"
+        require((bool(name), f"--colour must be NAME=COLOUR, got {each!r}"), (not name or name in known, unknown))
+        found[name] = colour
+    return found
+
+
 def _choice(given: str, known: Sequence[str]) -> tuple[str, str]:
     """Return an agent's name in tables and the one to show; settings in names have the sign of equality, too."""
     if given in known:

@@ -13,23 +13,25 @@ from ctgraph_rl.disk import is_writable, made_folder, write_whole
 from ctgraph_rl.log.escape import markdown_text, terminal_text
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.adaptation import adaptation_curves
+from ctgraph_rl.report.figures.aggregates import improvements, profiles
+from ctgraph_rl.report.figures.experiments import experiments
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, Written
 from ctgraph_rl.report.figures.heatmaps import MOST_NAMES, transfer_maps
 from ctgraph_rl.report.figures.labels import label_strips
 from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curves, training_curves
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, latex
-from ctgraph_rl.report.names import displayed
+from ctgraph_rl.report.names import colours_of, displayed
 from ctgraph_rl.report.sections import Estimates, Result, Section, sections
 from ctgraph_rl.report.statistics import Estimate
-from ctgraph_rl.report.style import MOST_AGENTS, require_packages
+from ctgraph_rl.report.style import MOST_AGENTS, require_packages, style
 from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
 
 OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
     *(mean_curves, learning_curves),
-    *(training_curves, adaptation_curves, label_strips),
+    *(training_curves, adaptation_curves, label_strips, profiles, improvements),
 )
 """Figures of all agents on a curriculum, in their order; None where there is nothing to draw."""
 
@@ -93,7 +95,13 @@ class Part(NamedTuple):
         return ("agent", *self.matrix.head), lines
 
 
-def write_report(paths: Sequence[Path | str], folder: Path | str | None = None, agents: Sequence[str] = ()) -> Report:
+def write_report(
+    paths: Sequence[Path | str],
+    folder: Path | str | None = None,
+    agents: Sequence[str] = (),
+    width: str = "text",
+    colours: Sequence[str] = (),
+) -> Report:
     """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
 
     Args:
@@ -101,22 +109,31 @@ def write_report(paths: Sequence[Path | str], folder: Path | str | None = None, 
         folder: where the report goes; None: ``report`` within the one path, or, of several or a read-only one, within
             the working directory.
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
+        width: of figures: ``text`` of a page, or one of two columns, ``column``.
+        colours: of agents, each as ``NAME=COLOUR`` with its name in figures.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
-        ValueError: if there is no run that can be read.
+        ValueError: if there is no run that can be read, and for a width, an agent or a colour that there is not.
     """
     require_packages()
     runs, problems = find_runs(paths)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
     runs = displayed(runs, agents)
+    chosen = colours_of(runs, colours)
+    with style(width, chosen):
+        pass  # refuses before any work
     if folder is None:
         within = len(paths) == 1 and is_writable(paths[0])
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
-    gallery = Gallery(Path(folder))
-    parts = [_part(section, gallery) for section in sections(runs)]
+    gallery = Gallery(Path(folder), width, chosen)
+    found = sections(runs)
+    together = gallery.write((), (experiments(each) for each in [found]))  # drawn in the gallery's style
+    parts = [_part(section, gallery) for section in found]
     about = {
         "title": _title(parts),
+        "figures": together,
+        "smallest": "44rem" if width == "text" else "0",
         "parts": parts,
         "problems": problems,
         "code": [*mixed_code(runs), *code_notes(runs), *label_notes(runs)],

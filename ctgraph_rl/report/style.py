@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.visualize.style import import_matplotlib
 
@@ -18,6 +20,9 @@ PACKAGES = ("matplotlib", "jinja2", "scipy")
 
 WIDTH = 7.2
 """Of a figure: a page's text in print."""
+
+WIDTHS = {"text": WIDTH, "column": 3.5}
+"""Inches of a figure: as wide as the text of a page, or as one of its two columns."""
 
 MOST_AGENTS = 6
 """Agents of a curriculum that figures show: the style has so many colours and marks."""
@@ -42,13 +47,46 @@ def require_packages() -> None:
             raise ModuleNotFoundError(f"the report needs {name}: pip install 'ctgraph_rl[report]'") from error
 
 
-@contextmanager
-def style() -> Iterator[None]:
-    """Figures made and saved within have the report's style."""
-    from matplotlib import rc_context
+_WIDTH: ContextVar[str] = ContextVar("width", default="text")
+_COLOURS: ContextVar[Mapping[str, str] | None] = ContextVar("colours", default=None)
 
-    with rc_context(fname=STYLE):
-        yield
+
+@contextmanager
+def style(width: str = "text", colours: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Figures made and saved within have the report's style.
+
+    Args:
+        width: one of `WIDTHS`.
+        colours: of agents, by their names in figures; others have the style's.
+
+    Raises:
+        ValueError: for another width, and for a colour that matplotlib does not know.
+    """
+    from matplotlib import rc_context
+    from matplotlib.colors import is_color_like
+
+    require((width in WIDTHS, f"width must be one of {', '.join(WIDTHS)}, got {width!r}"))
+    for agent, colour in (colours or {}).items():
+        rule = f"the colour of {agent} must be one that matplotlib knows, such as tab:blue or #0072B2, got {colour!r}"
+        require((is_color_like(colour), rule))
+    widths = _WIDTH.set(width)
+    chosen = _COLOURS.set(colours)
+    try:
+        with rc_context(fname=STYLE):
+            yield
+    finally:
+        _WIDTH.reset(widths)
+        _COLOURS.reset(chosen)
+
+
+def figure_width() -> float:
+    """Return the inches of a whole figure within `style`."""
+    return WIDTHS[_WIDTH.get()]
+
+
+def beside(most: int) -> int:
+    """Return how many panels stand beside each other, of which a page's text has room for ``most``."""
+    return max(1, round(most * figure_width() / WIDTH))
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -58,12 +96,14 @@ def new_figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height))
 
 
-def agent_style(position: int) -> dict[str, Any]:
-    """Colour, line and mark of an agent's curve; needs `style`."""
+def agent_style(position: int, agent: str = "") -> dict[str, Any]:
+    """Colour, line and mark of an agent's curve, by its place and its name; needs `style`."""
     from matplotlib import rcParams
 
     cycle = rcParams["axes.prop_cycle"].by_key()
-    return {name: values[position % len(values)] for name, values in cycle.items()}
+    look = {name: values[position % len(values)] for name, values in cycle.items()}
+    own = (_COLOURS.get() or {}).get(agent)
+    return look if own is None else {**look, "color": own}
 
 
 def short(name: str) -> str:

@@ -11,7 +11,7 @@ from ctgraph_rl.metrics.adaptation import Adaptation
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.figures.learning_curves import named
 from ctgraph_rl.report.sections import Result, Section
-from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure
+from ctgraph_rl.report.style import MOST_AGENTS, WIDTHS, agent_style, beside, figure_width, new_figure
 
 KINDS = ("trained", "held-out")
 
@@ -32,12 +32,12 @@ def adaptation_curves(section: Section) -> CaptionedFigure | None:
 
 def draw_adaptation(section: Section, kinds: list[str]) -> Any:
     """Draw a panel for trained tasks, and one for held-out ones."""
-    figure = new_figure(WIDTH * len(kinds) / len(KINDS), 2.6)
+    figure = new_figure(max(WIDTHS["column"], figure_width() * len(kinds) / len(KINDS)), 2.6)
     panels = figure.subplots(1, len(kinds), squeeze=False, sharey=True)[0]
     shown = section.results[:MOST_AGENTS]
     for axes, kind in zip(panels, kinds, strict=True):
         for position, result in enumerate(shown):
-            look = agent_style(position)
+            look = agent_style(position, result.agent)
             seeds = [adaptation.success.mean(dim=0) for adaptation in _of_seeds(result, kind)]
             for success in seeds:
                 axes.plot(_episodes(success), success, color=look["color"], linewidth=0.4, marker="", linestyle="-")
@@ -49,7 +49,7 @@ def draw_adaptation(section: Section, kinds: list[str]) -> Any:
         axes.set(title=f"{kind} tasks", xlabel="episode of a row", ylim=(-0.05, 1.05))
     panels[0].set_ylabel("share at the goal")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=min(3, len(labels)))
+    figure.legend(handles, labels, loc="outside upper left", ncols=min(beside(3), len(labels)))
     return figure
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,17 +45,21 @@ class Gallery:
 
     Args:
         folder: of the report.
+        width: of figures, see `style`.
+        colours: of agents, see `style`.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, width: str = "text", colours: Mapping[str, str] | None = None) -> None:
         self.folder = folder
+        self.width = width
+        self.colours = colours
         self._taken: set[str] = set()
         made_folder(folder / FOLDER)
 
     def write(self, names: tuple[str, ...], figures: Iterable[CaptionedFigure | None]) -> list[Written]:
         """Draw and write figures, skipping None; their file names start with ``names``."""
         written = []
-        with style():
+        with style(self.width, self.colours):
             for one in filter(None, figures):
                 path = f"{FOLDER}/{self._stem(*names, one.kind)}"
                 png = picture(one.figure, "png")

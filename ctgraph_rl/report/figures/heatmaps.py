@@ -9,7 +9,7 @@ from typing import Any
 from ctgraph_rl.report.figures.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.figures.trees import Trees
 from ctgraph_rl.report.sections import Estimates, Result, Section
-from ctgraph_rl.report.style import WIDTH, ink, new_figure, short
+from ctgraph_rl.report.style import beside, figure_width, ink, new_figure, short
 
 MOST_NUMBERS = 10
 """Tasks up to which cells have numbers."""
@@ -52,13 +52,15 @@ def draw_matrices(section: Section, result: Result) -> Any:
     transfer = result.transfer()
     tasks = len(performance[0])
     rows = len(performance)
-    beside = tasks <= MOST_NUMBERS
-    height = min(1.3 + 0.34 * rows, 6.0) if beside else min(1.2 + 0.22 * rows, 6.5)
-    figure = new_figure(WIDTH, height if beside else 2 * height)
-    left, right = figure.subplots(1, 2) if beside else figure.subplots(2, 1)
+    few = tasks <= MOST_NUMBERS
+    height = min(1.3 + 0.34 * rows, 6.0) if few else min(1.2 + 0.22 * rows, 6.5)
+    if few and beside(2) == 2:
+        left, right = new_figure(figure_width(), height).subplots(1, 2)
+    else:
+        left, right = new_figure(figure_width(), 2 * height).subplots(2, 1)
     draw_performance(left, performance, section.labels, section.trained)
     draw_transfer(right, transfer, section.labels, section.trained)
-    return figure
+    return left.figure
 
 
 def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:

@@ -9,7 +9,7 @@ from ctgraph_rl.learn.labels import Span
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Section
-from ctgraph_rl.report.style import WIDTH, frames_axis, ink, new_figure, short
+from ctgraph_rl.report.style import figure_width, frames_axis, ink, new_figure, short
 from ctgraph_rl.runs.read import Run
 
 MOST_STRIPS = 30
@@ -44,7 +44,7 @@ def label_strips(section: Section) -> CaptionedFigure | None:
 def draw_labels(section: Section) -> Any:
     """Draw a strip for the true tasks and one for each run."""
     runs = _runs(section)[:MOST_STRIPS]
-    figure = new_figure(WIDTH, 0.7 + 0.24 * (len(runs) + 1))
+    figure = new_figure(figure_width(), 0.7 + 0.24 * (len(runs) + 1))
     axes = figure.subplots()
     blocks = list(zip(section.ends, section.ends[1:], section.trained, strict=False))
     for start, end, tasks in blocks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from ctgraph_rl.report.sections import (
     over_seeds,
     training_curve,
 )
-from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, frames_axis, new_figure, short
+from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, frames_axis, new_figure, short
 
 MOST_TASKS = 32
 """Tasks that have a panel."""
@@ -88,9 +88,9 @@ def _agents(section: Section) -> str:
 def draw_tasks(section: Section) -> Any:
     """Draw a panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
     labels = section.labels[:MOST_TASKS]
-    rows = math.ceil(len(labels) / COLUMNS)
-    columns = min(COLUMNS, len(labels))
-    figure = new_figure(max(0.5 * WIDTH, WIDTH * columns / COLUMNS), 1.45 * rows + 0.5)
+    rows = math.ceil(len(labels) / beside(COLUMNS))
+    columns = min(beside(COLUMNS), len(labels))
+    figure = new_figure(figure_width() * max(0.5, columns / beside(COLUMNS)), 1.45 * rows + 0.5)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for panel in grid.ravel()[len(labels) :]:
         panel.axis("off")
@@ -99,7 +99,8 @@ def draw_tasks(section: Section) -> Any:
         for position, result in enumerate(section.results[:MOST_AGENTS]):
             seeds = [run.history.evaluations.get(label, []) for run in result.finished[: MOST_SEEDS + 1] if run.history]
             seeds = seeds if len(seeds) <= MOST_SEEDS else []
-            _draw(axes, position, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
+            look = agent_style(position, result.agent)
+            _draw(axes, look, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
         axes.set_title(short(label))
     _finish(figure, grid, section, "mean return")
     return figure
@@ -107,20 +108,27 @@ def draw_tasks(section: Section) -> Any:
 
 def draw_mean(section: Section) -> Any:
     """Draw the mean return over all tasks, a curve for each agent."""
-    figure = new_figure(WIDTH, 2.3)
+    figure = new_figure(figure_width(), 2.3)
     axes = figure.subplots()
-    _mark_blocks(axes, section, None)
-    for position, result in enumerate(section.results[:MOST_AGENTS]):
-        seeds = [curve for run in result.finished if run.history for curve in [mean_curve(run.history)] if curve]
-        points = over_seeds(seeds, result.bounds.of_returns)
-        _draw(axes, position, [points], seeds if len(seeds) <= MOST_SEEDS else [])
+    shown = section.results[:MOST_AGENTS]
+    draw_means(axes, section, {result.agent: agent_style(i, result.agent) for i, result in enumerate(shown)})
     _finish(figure, [[axes]], section, "mean return over all tasks")
     return figure
 
 
+def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]]) -> None:
+    """Draw the mean return over all tasks of a section's agents that have a look."""
+    _mark_blocks(axes, section, None)
+    for result in section.results:
+        if result.agent in looks:
+            seeds = [curve for run in result.finished if run.history for curve in [mean_curve(run.history)] if curve]
+            points = over_seeds(seeds, result.bounds.of_returns)
+            _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
+
+
 def draw_training(section: Section) -> Any:
     """Draw the return while training over all blocks, a curve for each agent."""
-    figure = new_figure(WIDTH, 2.3)
+    figure = new_figure(figure_width(), 2.3)
     axes = figure.subplots()
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
@@ -130,7 +138,7 @@ def draw_training(section: Section) -> Any:
         few = len(result.finished) < FEWEST_FOR_BANDS
         alone = [_training(replace(result, by_seed={run.seed: run}), blocks, places) for run in result.finished if few]
         seeds = [[(point.frames, point.value) for point in piece] for each in alone for piece in each if piece]
-        _draw(axes, position, pieces, seeds)
+        _draw(axes, agent_style(position, result.agent), pieces, seeds)
     _finish(figure, [[axes]], section, "return while training")
     return figure
 
@@ -160,9 +168,8 @@ def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
             axes.axvspan(start, end, color="0.9", zorder=-1, linewidth=0)
 
 
-def _draw(axes: Any, position: int, pieces: Sequence[list[Point]], seeds: Sequence[LabelPlaces]) -> None:
+def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], seeds: Sequence[LabelPlaces]) -> None:
     """Draw a mean with its band, piece by piece, and thin lines for seeds."""
-    look = agent_style(position)
     if len(seeds) > 1:
         for curve in seeds:
             axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
@@ -198,8 +205,8 @@ def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
         frames_axis(axes)
     figure.supxlabel("frames", fontsize=8)
     shown = section.results[:MOST_AGENTS]
-    marks = [Line2D([], [], label=named(result), **agent_style(i)) for i, result in enumerate(shown)]
-    figure.legend(handles=marks, loc="outside upper left", ncols=min(3, len(marks)))
+    marks = [Line2D([], [], label=named(result), **agent_style(i, result.agent)) for i, result in enumerate(shown)]
+    figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
 
 
 def named(result: Result) -> str:

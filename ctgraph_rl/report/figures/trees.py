@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ctgraph_rl.log.files import AGENT, CURRICULUM
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Result, Section
-from ctgraph_rl.report.style import WIDTH, new_figure, short
+from ctgraph_rl.report.style import beside, figure_width, new_figure, short
 from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -50,9 +50,9 @@ def draw_trees(trees: Trees, seed: int) -> Any:
     """Draw a panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     assert trees.curriculum is not None
     tasks = list(zip(ct_graphs(trees.curriculum.tasks, "a tree"), trees.curriculum.labels, strict=True))[:MOST_TREES]
-    columns = min(COLUMNS, len(tasks))
+    columns = min(beside(COLUMNS), len(tasks))
     rows = math.ceil(len(tasks) / columns)
-    figure = new_figure(WIDTH, rows * max(_height(task.graph.depth) for task, _ in tasks))
+    figure = new_figure(figure_width(), rows * max(_height(task.graph.depth) for task, _ in tasks))
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, (task, label) in zip(grid, tasks, strict=False):
         seen = Visits({}, {}) if trees.trained is None else _visits(trees.trained, task, seed)

@@ -1,0 +1,66 @@
+"""Several experiments in one figure: a panel for each curriculum, and one legend of all agents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
+from ctgraph_rl.report.figures.learning_curves import BANDS, draw_means
+from ctgraph_rl.report.sections import Section
+from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, frames_axis, new_figure, short
+
+MOST_EXPERIMENTS = 12
+"""Curricula that have a panel."""
+
+COLUMNS = 3
+
+
+def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
+    """Return the mean return over all tasks on several curricula; None for fewer than two with a finished run."""
+    measured = [section for section in found if any(result.finished for result in section.results)]
+    if len(measured) < 2:
+        return None
+    agents = left_out(len(_agents(measured)), MOST_AGENTS, "agents")
+    cut = left_out(len(measured), MOST_EXPERIMENTS, "curricula") + agents
+    caption = (
+        "Mean return over all tasks of each curriculum at its evaluations, over the frames learned from. Lines: means "
+        f"over seeds; bands: {BANDS}; thin lines: single seeds. Dashed: ends of blocks.{cut}"
+    )
+    return CaptionedFigure("experiments", "All experiments", caption, draw_experiments(measured))
+
+
+def draw_experiments(found: Sequence[Section]) -> Any:
+    """Draw a panel for each curriculum; an agent has one colour in all of them."""
+    shown = found[:MOST_EXPERIMENTS]
+    agents = _agents(shown)[:MOST_AGENTS]
+    looks = {agent: agent_style(position, agent) for position, agent in enumerate(agents)}
+    columns = min(beside(COLUMNS), len(shown))
+    rows = math.ceil(len(shown) / columns)
+    figure = new_figure(figure_width(), 1.7 * rows + 0.5)
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes, section in zip(grid.ravel(), shown, strict=False):
+        draw_means(axes, section, looks)
+        axes.set_title(short(section.name))
+        frames_axis(axes)
+    for axes in grid.ravel()[len(shown) :]:
+        axes.axis("off")
+    for row in grid:
+        row[0].set_ylabel("mean return")
+    figure.supxlabel("frames", fontsize=8)
+    marks = [_line(agent, look) for agent, look in looks.items()]
+    figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
+    return figure
+
+
+def _line(agent: str, look: dict[str, Any]) -> Any:
+    """Return the line of an agent in a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=short(agent), **look)
+
+
+def _agents(found: Sequence[Section]) -> list[str]:
+    """Return the names of all agents, each once."""
+    return list(dict.fromkeys(result.agent for section in found for result in section.results))
