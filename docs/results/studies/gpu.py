@@ -1,8 +1,8 @@
 """Measures a GPU in calls of four minutes, in a checkout on a machine with one.
 
 It runs the tests marked ``cuda`` and the ladders of learning and of the environment, the most important rungs first,
-and writes gpu.json after each. Given again at the same commit on the same kind of GPU, it goes on where it stopped.
-At its end it writes the section on GPUs of docs/reference/speed_table.md. Commit both.
+and writes gpu.json after each. A call at the same commit on the same kind of GPU measures what earlier ones left.
+Last comes the section on GPUs of docs/reference/speed_table.md. Commit both.
 Where there is no GPU, it writes the section alone, from the gpu.json that is there.
 """
 
