@@ -56,7 +56,7 @@ def changed_decisions(
     envs = [CTGraphEnv([each] * num_episodes, seed=seed) for each in (task, swapped)]
     starts = [start_of_episodes(env, initial_state) for env in envs]
     data = [dict(env.reset().update(start).items(True, True)) for env, start in zip(envs, starts, strict=True)]
-    running = torch.ones(num_episodes, dtype=torch.bool)
+    running = torch.ones(num_episodes, dtype=torch.bool, device=envs[0].device)
     changed = 0
     decided = 0
     with set_exploration_type(ExplorationType.DETERMINISTIC):
