@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
@@ -22,7 +23,8 @@ author = copyright = "the ctgraph_rl developers"
 version = release = __version__
 repository = PROJECT.get("urls", {}).get("Repository", "")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "links", "generate", "llms"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "sphinx_design"]
+extensions += ["links", "generate", "llms"]
 exclude_patterns = ["_build", "results/templates"]
 templates_path: list[str] = []
 nitpicky = True
@@ -38,6 +40,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {"source_repository": repository, "source_branch": "main", "source_directory": "docs/"}
 html_copy_source = False
+copybutton_exclude = ".linenos, .gp, .go"  # prompts and what is printed
 
 default_role = "py:obj"
 autodoc_member_order = "bysource"
@@ -48,3 +51,14 @@ napoleon_use_rtype = False
 OTHERS = "collections|fractions|gymnasium|matplotlib|numpy|os|pathlib|stable_baselines3|tensordict|torch|torchrl|types"
 SHORT_NAMES = "Path|Sequence|Span|Tensor|TensorDictBase|nn.Module"
 nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?"), ("py:class", SHORT_NAMES)]
+
+
+def without_aliases(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Drop the docstrings that Python gives to fields of named tuples, which say nothing."""
+    if lines and lines[0].startswith("Alias for field number"):
+        lines.clear()
+
+
+def setup(app: Any) -> None:
+    """Connect what this file adds to Sphinx."""
+    app.connect("autodoc-process-docstring", without_aliases)

@@ -87,6 +87,13 @@ class RunLog:
         if self._path is not None:
             self._file = open_own(self._path, "xb")
 
+    def __repr__(self) -> str:
+        """Return the curriculum, the seed and how much was measured, in one line."""
+        about = (self.of_kind("run") or [{}])[0]
+        seed = (about.get("config") or {}).get("seed")
+        counts = f"{len(self.of_kind('training'))} training intervals, {len(self.of_kind('evaluation'))} evaluations"
+        return f"<RunLog {about.get('curriculum')!s:.80}, seed {seed}: {counts}>"
+
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
         """Resume writing a log from a `position`; the lines after it are removed.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.disk import write_named
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
 from ctgraph_rl.visualize.dot import to_dot
@@ -26,6 +28,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("nothing to write: name a --figure, --dot or --gif")
     with refused_by(parser):
         _write(select(arguments), arguments)
+        for path in filter(None, (arguments.figure, arguments.dot, arguments.gif)):
+            print(f"written: {terminal_text(path)}", file=sys.stderr)  # the file itself may be standard output
 
 
 def _parser() -> argparse.ArgumentParser:

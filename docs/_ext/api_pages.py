@@ -18,6 +18,15 @@ ELSEWHERE = "learning"
 """The page of exported names from other modules."""
 
 PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "environments": (
+        "Environments",
+        "The same tasks for TorchRL, Gymnasium and Stable-Baselines3, and the batch of rows behind them.",
+        (
+            "ctgraph_rl.gym",
+            "ctgraph_rl.sb3",
+            "ctgraph_rl.policies",
+        ),
+    ),
     "tasks": (
         "Graphs, tasks and observations",
         "What a task is made of, and the numbers that follow from it.",
@@ -33,15 +42,6 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.tasks.observability",
             "ctgraph_rl.tasks.kinds.task_like:TaskLike",
             "ctgraph_rl.tasks.kinds.gym_task:GymTask",
-        ),
-    ),
-    "environments": (
-        "Environments",
-        "The same tasks for TorchRL, Gymnasium and Stable-Baselines3, and the batch of rows behind them.",
-        (
-            "ctgraph_rl.gym",
-            "ctgraph_rl.sb3",
-            "ctgraph_rl.policies",
         ),
     ),
     "learning": (
@@ -138,9 +138,14 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
 """For each page its title, a sentence, and the modules that it documents: whole, or those names after a colon."""
 
 
+FIRST = "CTGraphEnv"
+"""The name that the API opens with."""
+
+
 def exported(page: str) -> list[str]:
     """Return the names that ``ctgraph_rl`` exports and a page documents."""
-    return [name for name in ctgraph_rl.__all__ if name != "metrics" and _page_of(name) == page]
+    names = [name for name in ctgraph_rl.__all__ if name != "metrics" and _page_of(name) == page]
+    return sorted(names, key=FIRST.__ne__)
 
 
 def _page_of(name: str) -> str:

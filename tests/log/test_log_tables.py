@@ -108,6 +108,10 @@ def test_the_columns_are_what_the_loop_logs():
         assert set(columns) - set(tables.RUN) <= logged
 
 
+def test_a_log_is_shown_in_one_line(log):
+    assert repr(log) == "<RunLog two, tasks, seed 3: 2 training intervals, 1 evaluations>"
+
+
 def test_a_log_is_a_data_frame_where_pandas_is_there(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=list))  # it gets a list of rows
 

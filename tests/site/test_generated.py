@@ -34,6 +34,12 @@ def test_every_exported_name_stands_on_one_page_of_the_api(site):
     listed = re.findall(r"auto(?:class|function):: ctgraph_rl\.(\w+)$", "\n".join(pages.values()), re.MULTILINE)
 
     assert sorted(listed) == sorted(set(ctgraph_rl.__all__) - {"metrics"})
+    index = pages.pop("api/index.rst").split()
+    assert (index[index.index("2") + 1], next(iter(pages)), listed[0]) == (
+        "environments",
+        "api/environments.rst",
+        "CTGraphEnv",
+    )
 
 
 @pytest.mark.slow

@@ -39,6 +39,13 @@ def test_every_page_of_docs_that_a_file_names_exists():
     assert [pair for pair in sorted(written) if not (CHECKOUT / pair[1]).is_file()] == []
 
 
+def test_every_figure_of_a_page_has_a_text_in_its_place():
+    silent = re.compile(r"!\[\s*\]\(|<img(?![^>]*\balt=\"[^\"])|```\{(?:image|figure)\}(?![^`]*:alt: \S)")
+    pages = {page: page.read_text(encoding="utf-8") for page in PAGES if page.suffix == ".md"}
+
+    assert [page for page, text in pages.items() if silent.search(text)] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(CHECKOUT).as_posix() for path in PAGES])
 def test_every_link_of_a_page_leads_to_a_file(page):
     folder = page.parent
