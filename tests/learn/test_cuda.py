@@ -160,7 +160,7 @@ def test_several_seeds_learn_by_graphs_what_they_learn_step_by_step_and_never_wa
         group = CapturedGroup(agents, [torch.Generator().manual_seed(seed) for seed in range(3)])
         if not is_captured:
             group.gradient_step = group._usual_update
-        collected = collect.collect(env, group.policy, 10**9, group.first.num_steps, group.first.initial_state)
+        collected = collect.collect(env, group.policy, 10**6 * 192, group.first.num_steps, group.first.initial_state)
         measured = [group.learn(next(collected)) for _ in range(WARM_UP + 1)]
         if is_captured:
             with without_waiting():
