@@ -27,6 +27,10 @@ from curricula.paper import ct_su_b1
 
 every_agent = pytest.mark.parametrize("name", AGENTS)
 
+an_agent_of_each_family = pytest.mark.parametrize(
+    "name", others_slow(AGENTS, "a2c", "dqn", "lstm_ppo", "mohqa", "qrdqn_lstm")
+)
+
 
 def reading(agent, batch):
     """Only what the agent's policy reads of a batch."""
@@ -126,7 +130,7 @@ def test_a_saved_agent_acts_the_same_after_loading(small_agent, name):
         assert (expected == found).all()
 
 
-@every_agent
+@an_agent_of_each_family
 def test_a_saved_agent_goes_on_as_if_never_stopped(small_agent, name):
     short = ["agent.target_update_interval=5"] if name in Q_LEARNERS else []
     agent, other = small_agent(name, [ct_su_b1()], *short), small_agent(name, [ct_su_b1()], "seed=1", *short)
@@ -172,7 +176,7 @@ def test_an_agent_takes_the_task_that_starts_or_none(small_agent, name):
     assert agent.policy_for(1) is agent.policy
 
 
-@every_agent
+@an_agent_of_each_family
 def test_a_loss_that_is_not_a_number_stops_learning_and_is_named(small_agent, name):
     agent = small_agent(name, [ct_su_b1()])
     batch = batches(agent, ct_su_b1(), 1)[0]
