@@ -32,7 +32,9 @@ class GRU(Cell):
         if is_traced():  # PyTorch's own cannot be vectorised over seeds
             num_rows = len(inputs)
             each = torch.arange(num_rows, device=inputs.device)
-            output = packed_gru(self.gru, inputs, each, torch.tensor([num_rows], device="cpu"), state[0])
+            output = packed_gru(
+                self.gru, inputs, each, torch.tensor([num_rows], dtype=torch.int64, device="cpu"), state[0]
+            )
         else:
             output = self.gru(inputs.unsqueeze(1), state[0].unsqueeze(0))[0].squeeze(1)
         return output, (output,)
