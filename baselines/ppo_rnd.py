@@ -2,7 +2,7 @@
 
 Random network distillation, Burda et al. 2019 (arXiv 1810.12894): a predictor g learns the outputs of a fixed random
 network f. A step that leads to observation o' gets the bonus |g(o') - f(o')|^2, which falls as o' is seen more often,
-divided by the standard deviation of its discounted returns. The bonus has a critic and a discount factor of its own,
+divided by the standard deviation of its discounted returns. The bonus has its own critic and discount factor,
 and its return does not end with an episode. PPO learns from the advantages A + bonus_coeff A_bonus.
 
 Both networks read observations that are standardised pixel by pixel and limited to [-5, 5]. Five things differ from

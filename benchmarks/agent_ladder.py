@@ -102,7 +102,7 @@ def learning(
 
 
 def seeds(name: str, task: Task, num_seeds: int, device: torch.device) -> TimedRun:
-    """Return a run of many seeds of an agent, as ``together=true`` trains them: each learns from a batch of its own."""
+    """Return a run of many seeds of an agent, as ``together=true`` trains them: each learns from its own batch."""
     agents = [built(name, task).to(device) for _ in range(num_seeds)]
     generators = [torch.Generator(device="cpu").manual_seed(seed) for seed in range(num_seeds)]
     group = CapturedGroup(agents, generators)

@@ -25,7 +25,7 @@ class Command(NamedTuple):
 RUN = "ctgraph_rl.run"
 
 COMMANDS = {
-    "run": Command(RUN, "train an agent on a curriculum; settings alone do so, too"),
+    "run": Command(RUN, "train an agent on a curriculum (default command)"),
     "agents": Command("baselines.__main__", "list the agents"),
     "board": Command("ctgraph_rl.board.standings.page", "make a page with tables of submissions"),
     "collectives": Command(

@@ -26,7 +26,7 @@ PART = ".part"
 def write_whole(path: str | os.PathLike[str], content: bytes | str, synced: bool = True) -> None:
     """Write a file so that a reader, also after a crash, finds the old content or the new.
 
-    A link at its place is replaced, its target stays as it is.
+    A link at its place is replaced, its target stays unchanged.
 
     Args:
         path: the file.

@@ -27,7 +27,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 class CTGraphEnv(EnvBase):
-    """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has a task of its own.
+    """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has its own task.
 
     A row's trajectory depends on (seed, row number, its actions) alone: rows 4..7 of a batch of eight equal a batch of
     four with ``first_row=4``. Rows may differ in every field of `Task` but the kind and size of the observations.
@@ -295,7 +295,7 @@ class CTGraphEnv(EnvBase):
 
         Args:
             action: int64 [N].
-            mask: bool [N], TorchRL's ``_step``: the rows to step. The others stay as they are, draw nothing and have
+            mask: bool [N], TorchRL's ``_step``: the rows to step. The others stay unchanged, draw nothing and have
                 the data of before, with reward 0. None: all rows.
 
         Raises:

@@ -222,7 +222,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
 
         Args:
             seed: start the random streams of (seed + i, row 0), or of a list's seeds; None: continue the present ones.
-            options: ``{"reset_mask": bool [N]}`` says which rows; the others stay as they are.
+            options: ``{"reset_mask": bool [N]}`` says which rows; the others stay unchanged.
 
         Raises:
             ValueError: for wrong seeds and masks, and a mask in the very first reset.

@@ -90,8 +90,8 @@ def from_axes(
         read_rotation: largest rotation whenever an image is read, in whole degrees in 0..359.
         random_graphs: how many tasks to draw from ``seed``, each with one of the branching factors, depths, wait
             probabilities and image seeds, and any goal. None: all combinations.
-        unique_decisions: each decision state has an image of its own, MDP_D of the paper; None: as configured.
-        unique_waits: each wait state has an image of its own, MDP_W; None: as configured.
+        unique_decisions: each decision state has its own image, MDP_D of the paper; None: as configured.
+        unique_waits: each wait state has its own image, MDP_W; None: as configured.
         decision_ids: first and last id of decision states, D_IDs; None: the next free ids.
         wait_ids: first and last id of wait states, W_IDs; None: the configured ones where wait states draw one of
             several, else the next free ids.

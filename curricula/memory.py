@@ -1,7 +1,7 @@
 """Tasks that compare memories: confounding graphs with long waits, after Ladosz et al. 2021.
 
 Their graph was not published. Section 4.2 of Soltoggio et al. 2023 says that the most complex one had p = 0.9 and 500
-observations; whether decision states had images of their own is not known, so it is an argument here.
+observations; whether decision states had their own images is not known, so it is an argument here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def co_hard(
         depth: d.
         wait_prob: p, in [0, 1).
         expected_length: E[rho], the mean steps of an episode without fail, which then decides p; None: p is given.
-        unique_decisions: whether each decision state has an image of its own; False: all show one image.
+        unique_decisions: whether each decision state has its own image; False: all show one image.
         num_wait_images: images that wait states draw from at every observation; 1 is a surjective graph.
         read_noise: largest addition to each pixel whenever an image is read, in 0..255.
         num_frames: frames to learn from.

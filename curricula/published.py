@@ -45,7 +45,7 @@ def environment(
         end_ids: first and last; the last image.
         image_seed: seed of the image set.
         fail_reward: reward of the fail state.
-        unique: whether decision states and wait states have images of their own.
+        unique: whether decision states and wait states have their own images.
         one_hot: vectors instead of images.
     """
     return {

@@ -45,7 +45,7 @@ CT16_ORDERS = """
 
 
 def ct16(num_frames: int = 51_200, agent: int = 0) -> Curriculum:
-    """CT16: four image seeds x four goals, each agent in an order of its own; agent 0 in the order of the ids.
+    """CT16: four image seeds x four goals, each agent in its own order; agent 0 in the order of the ids.
 
     Args:
         num_frames: frames per task.

@@ -29,7 +29,7 @@ class L2D2C(MaskExchange):
     """
 
     def takes(self, method: Masks) -> bool:
-        """Return whether the mask of a task is made of its own scores alone."""
+        """Return whether the mask of a task is made only of its own scores."""
         return not isinstance(method, CombinedMasks)
 
     def connect(self, agents: Sequence[Agent]) -> None:

@@ -1,4 +1,4 @@
-"""CKA-RL: each task's weights are those of the first task, a vector of its own, and a mixture of earlier vectors.
+"""CKA-RL: each task's weights are those of the first task, its own vector, and a mixture of earlier vectors.
 
 Hu et al. 2025 (Continual Knowledge Adaptation for Reinforcement Learning, NeurIPS, arXiv 2510.19314).
 """

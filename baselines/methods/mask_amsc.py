@@ -41,7 +41,7 @@ class MaskAMSC(SelectedMasks):
         temperature: of the sparsemax.
         competence: ``training`` or ``evaluation``, the episodes that it is of; ``none`` leaves out no task.
         competence_batches: batches that a training return is the mean of.
-        shuffled: select as many tasks at random instead, by a random stream of its own.
+        shuffled: select as many tasks at random instead, by its own random stream.
         settings: the arguments of `SelectedMasks`.
     """
 

@@ -13,7 +13,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Scratch(TaskMethod):
-    """Each task has a network of its own with random initial weights, and an optimiser without state.
+    """Each task has its own network with random initial weights, and an optimiser without state.
 
     Stored are 4 P bytes for each of the curriculum's tasks. Nothing is forgotten and nothing is transferred.
     """

@@ -27,7 +27,7 @@ from ctgraph_rl.core import philox
 from ctgraph_rl.core.region import Region
 
 AS_EVER = ("learn", "gradient_step", "minibatches", "after_update", "after_batch", "one_step", "reward", "advantages")
-"""Methods of `PolicyGradient` that `CapturedGroup` has in a form of its own, for all seeds."""
+"""Methods of `PolicyGradient` that `CapturedGroup` has in its own form, for all seeds."""
 
 
 def why_not_captured(agent: Agent) -> str | None:

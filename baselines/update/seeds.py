@@ -51,7 +51,7 @@ def why_not_together(agent: Agent) -> str | None:
 class SeedGroup:
     """Agents of one configuration with different seeds, which act and learn together.
 
-    Each draws from a generator of its own, in the order in which it draws from torch's global one when alone.
+    Each draws from its own generator, in the order in which it draws from torch's global one when alone.
 
     Args:
         agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_together` has no objection.

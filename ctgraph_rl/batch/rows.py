@@ -277,7 +277,7 @@ class Rows(TakesNumbers, nn.Module):
         self.set_streams(torch.tensor([seed], device=self.device, dtype=torch.int64), self.row)
 
     def set_streams(self, seed: Tensor, row: Tensor) -> None:
-        """Restart all rows with random streams of their own.
+        """Restart all rows with their own random streams.
 
         Args:
             seed: int64 [N], or [1] for all.
@@ -301,7 +301,7 @@ class Rows(TakesNumbers, nn.Module):
     def step(self, action: Tensor, mask: Tensor | None = None) -> Shown:
         """One step of all rows, or of those of a mask, bool [N], with actions, int64 [N]; what all rows show.
 
-        The reward is in ``state``. Rows outside the mask stay as they are, draw nothing, and may have any action.
+        The reward is in ``state``. Rows outside the mask stay unchanged, draw nothing, and may have any action.
         """
         before = self.state
         engine = self.engine

@@ -22,7 +22,7 @@ def with_task_ids(
     Args:
         space: of observations without ids.
         pool: the tasks.
-        task_ids: their ids; None: the space stays as it is, and there are none.
+        task_ids: their ids; None: the space stays unchanged, and there are none.
         num_task_ids: length of an id; None: just enough.
 
     Raises:

@@ -354,16 +354,22 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--cells", type=int, default=2, metavar="N", help="runs of each level (default: %(default)s)")
     drawn = "draws the runs and the held-out seeds, in 0..2^63-1 (default: a random one, which is printed)"
     made.add_argument("--number", type=int, help=drawn)
-    made.add_argument("--code", type=Path, metavar="DIR", help="where modules are that are not installed")
-    made.add_argument("--hours", type=float, help=f"of a process, at most (default: {TIMES} times the submitted run's)")
-    made.add_argument("--memory", type=float, default=8.0, metavar="GB", help="of a process (default: %(default)g)")
-    made.add_argument("--disk", type=float, default=4.0, metavar="GB", help="of a process (default: %(default)g)")
-    made.add_argument("--yes", action="store_true", help="agree to run it, with all that is not isolated")
-    made.add_argument("--not-isolated", action="store_true", help="run it also where bubblewrap cannot be used")
+    made.add_argument("--code", type=Path, metavar="DIR", help="folder of modules that are not installed")
     made.add_argument(
-        "--folder", type=Path, default=Path("verify"), metavar="DIR", help="of the reruns (default: %(default)s)"
+        "--hours", type=float, help=f"time limit of a process (default: {TIMES} times the submitted run's)"
     )
-    made.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
+    made.add_argument(
+        "--memory", type=float, default=8.0, metavar="GB", help="memory limit of a process (default: %(default)g)"
+    )
+    made.add_argument(
+        "--disk", type=float, default=4.0, metavar="GB", help="disk limit of a process (default: %(default)g)"
+    )
+    made.add_argument("--yes", action="store_true", help="skip the prompt despite incomplete isolation")
+    made.add_argument("--not-isolated", action="store_true", help="run without bubblewrap")
+    made.add_argument(
+        "--folder", type=Path, default=Path("verify"), metavar="DIR", help="folder of the reruns (default: %(default)s)"
+    )
+    made.add_argument("--config-dir", type=Path, metavar="DIR", help="folder with your own track, track/NAME.yaml")
     return made
 
 

@@ -1,4 +1,4 @@
-"""Collectives as runs: members in directories of their own, and what the group measured of messages and learning time.
+"""Collectives as runs: members in their own directories, and what the group measured of messages and learning time.
 
 Imports the wings up to ``report``; nothing but commands imports it.
 """

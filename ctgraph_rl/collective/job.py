@@ -1,4 +1,4 @@
-"""One collective of a configuration: each member is an ordinary run in a directory of its own."""
+"""One collective of a configuration: each member is an ordinary run in its own directory."""
 
 from __future__ import annotations
 

@@ -280,7 +280,7 @@ def reset(
 
     Args:
         state: the rows' states.
-        mask: bool, the rows that start an episode; the others stay as they are.
+        mask: bool, the rows that start an episode; the others stay unchanged.
         params: the rows' tasks.
         uses: what the rows have use for.
         words: the draws of the ticks after the reset, if they are at hand.

@@ -183,7 +183,7 @@ def _require_own(path: Path) -> None:
 
 
 def _compiled(source: Path, compiler: list[str], folder: Path, key: str) -> Path:
-    """Compile into a file of its own that then gets its name; processes that do so at once share nothing else."""
+    """Compile into its own file that then gets its name; processes that do so at once share nothing else."""
     with tempfile.TemporaryDirectory(dir=folder) as own:
         made = Path(own) / "native.so"
         _compile(source, compiler, made)

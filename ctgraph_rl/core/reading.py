@@ -68,7 +68,7 @@ def by_pixel(images: Tensor, start: Tensor, read_noise: Tensor) -> Tensor:
 
 
 # Inductor of torch 2.13 writes beyond its buffers on a CPU when it fuses `noisy` with what comes before it, and in C++
-# numbers of `by_pixel` may not leave the range of int64. As an operator of its own the noise stays whole there.
+# numbers of `by_pixel` may not leave the range of int64. As its own operator the noise stays whole there.
 _opaque = torch.library.custom_op("ctgraph_rl::add_noise", _added, mutates_args=())
 _opaque.register_fake(lambda images, start, read_noise: torch.empty_like(images))
 

@@ -65,7 +65,7 @@ class RewardParams(NamedTuple):
 class RowParams(NamedTuple):
     """Everything that stays the same between two changes of tasks."""
 
-    seed: Tensor  # int64 [1], or [N] for rows with seeds of their own
+    seed: Tensor  # int64 [1], or [N] for rows with their own seeds
     row: Tensor  # numbers of the rows
     tree: TreeParams
     x: ObservationParams

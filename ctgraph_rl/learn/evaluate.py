@@ -1,4 +1,4 @@
-"""Evaluation: equally many episodes on every task, in environments of their own, at the moments of a curriculum."""
+"""Evaluation: equally many episodes on every task, in their own environments, at the moments of a curriculum."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def labels_per_task(labelling: Labelling) -> Tensor:
 def label_agreement(labelling: Labelling) -> Tensor:
     """Return the adjusted Rand index of the true tasks and the labels that acted, over all frames of training.
 
-    1: each task has a label of its own, whatever its number. 0 is expected of labels without relation to the tasks.
+    1: each task has its own label, whatever its number. 0 is expected of labels without relation to the tasks.
     """
     labelling.check_one_task_each()
     return torch.tensor([adjusted_rand_index(*labelling[:3])], dtype=torch.float64, device="cpu")

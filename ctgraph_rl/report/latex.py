@@ -141,7 +141,7 @@ def letters(number: int) -> str:
 
 
 class Labels:
-    """Gives every table of a document a label of its own."""
+    """Gives every table of a document its own label."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()

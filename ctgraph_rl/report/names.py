@@ -21,7 +21,7 @@ AGENT_OPTION: dict[str, Any] = {
     "action": "append",
     "default": [],
     "metavar": "NAME[=SHOWN]",
-    "help": "show this agent next, by another name if one is given; repeat it for each agent, others follow",
+    "help": "order and rename agents; repeatable",
 }
 """Of ``ctgraph-rl report`` and ``ctgraph-rl results``: names and order of agents."""
 

@@ -354,7 +354,7 @@ def _parser() -> argparse.ArgumentParser:
     kinds = "; ".join(f"{kind}: {what}" for kind, what in STATISTICS.items())
     of_seeds = parser.add_mutually_exclusive_group()
     of_seeds.add_argument("--statistics", choices=STATISTICS, default="exact", help=f"{kinds} (default: exact)")
-    of_seeds.add_argument("--per-seed", action="store_true", help="show each run alone: a row for each of its measures")
+    of_seeds.add_argument("--per-seed", action="store_true", help="show single runs, a row for each measure")
     parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
     parser.add_argument(
         "--tidy", type=Path, metavar="FILE", help="also write every evaluation as a row into this .csv or .parquet file"

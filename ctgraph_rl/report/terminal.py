@@ -259,5 +259,5 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
 def label_notes(runs: Sequence[Run]) -> list[str]:
     """Return what is to be known of evaluations of runs whose learners gave tasks labels themselves, if there are."""
     count = sum(run.history is not None and bool(run.history.spans) for run in runs)
-    how = "each task is played with the label that acted in most of its frames, an oracle in evaluation alone"
+    how = "evaluation uses each task's most frequent label, chosen with knowledge of the true tasks"
     return [f"{count} of {len(runs)} runs have labels of a detector: {how}"] if count else []

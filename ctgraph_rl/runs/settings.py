@@ -173,7 +173,7 @@ def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str
 def in_digits(arguments: Sequence[str]) -> list[str]:
     """Write whole numbers such as ``1e5`` in digits, in the arguments of a command line.
 
-    Settings that have a fraction or a text in a file of ``conf`` are left as they are.
+    Settings that have a fraction or a text in a file of ``conf`` are left unchanged.
     """
     return [_in_digits(*each.partition("=")) if _WITH_EXPONENT.search(each) else each for each in arguments]
 

@@ -243,7 +243,7 @@ def train_together(
     device: torch.device,
     directories: Sequence[RunDirectory],
 ) -> Failures:
-    """Let the agents of several seeds learn a curriculum as one batch; each is a run in a directory of its own.
+    """Let the agents of several seeds learn a curriculum as one batch; each is a run in its own directory.
 
     Runs that were stopped are resumed from the last checkpoint that all have, and end as if they had never stopped.
 

@@ -34,7 +34,7 @@ PLACED = (StateType.WAIT, StateType.DECISION, StateType.END)
 def states_per_observation(task: Task) -> dict[str, int]:
     """Return for wait, decision and end states how many states may show one and the same observation.
 
-    1 where each state has an id of its own.
+    1 where each state has its own id.
 
     Raises:
         ValueError: for a ``legacy_index`` with more than two branches, where unlike numbers of states share ids.

@@ -30,9 +30,9 @@ class Observations:
         end_ids: ids of end states, O^E.
         home_ids: ids of the home state, O^H.
         fail_ids: ids of the fail state, O^F.
-        unique_waits: each wait state has an id of its own.
-        unique_decisions: each decision state has an id of its own.
-        unique_ends: each end state has an id of its own; None means: when waits or decisions have.
+        unique_waits: each wait state has its own id.
+        unique_decisions: each decision state has its own id.
+        unique_ends: each end state has its own id; None means: when waits or decisions have.
         read_noise: each pixel gets an integer drawn from 0..read_noise added, saturating at 255.
         read_rotation: images are rotated by a whole number of degrees drawn from 0..read_rotation.
         reward_cue: the images of end states show what was paid, as the brightness of a square in their middle.
@@ -84,7 +84,7 @@ class Observations:
         return getattr(self, f"{kind.name.lower()}_ids")
 
     def is_unique(self, kind: StateType) -> bool:
-        """Whether each state of this kind has an id of its own."""
+        """Whether each state of this kind has its own id."""
         return bool(getattr(self, f"unique_{kind.name.lower()}s", False))
 
     @property

@@ -9,7 +9,7 @@ may be 1. A wait state is left with probability 1 - p per wait; with V' the valu
 which is solved for V(wait). Rewards are those of `CTGraphEnv`: ``goal_reward`` times the share of ``reward_fn`` on
 entering an end state, ``fail_reward`` on entering the fail state, and s = ``step_reward`` for every step, one more of
 them after an end state where ``extra_end_step`` is set. The noise of rewards has mean 0 and changes nothing; a goal
-that changes stays as it is. The environment rounds rewards to float32; here they are float64. Policies see observation
+that changes stays unchanged. The environment rounds rewards to float32; here they are float64. Policies see observation
 ids, which is what they see of images where no two are equal and nothing varies on read.
 """
 

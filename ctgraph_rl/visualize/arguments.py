@@ -51,7 +51,7 @@ class Selection(NamedTuple):
     curriculum: Curriculum | None = None
 
     def player(self, seed: int, greedy: bool = True) -> Player:
-        """Return the policy in an environment of its own."""
+        """Return the policy in its own environment."""
         return Player(self.task, self.policy, self.initial_state, seed=seed, greedy=greedy, curriculum=self.curriculum)
 
     def visits(self, num_episodes: int, seed: int, greedy: bool = True) -> Visits:
@@ -65,14 +65,14 @@ class Selection(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that name a task and a policy."""
     names = ", ".join(CONFIGURATIONS)
-    about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: numbers alone"
+    about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: only numbers"
     parser.add_argument("name", nargs="?", help=about)
     parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
     parser.add_argument("--task", type=int, default=1, metavar="N", help="number of a curriculum's task, from 1")
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
     parser.add_argument("--goal", type=decisions, metavar="1.2", help="the decisions to the goal")
-    surjective = "with numbers alone: one image for each kind of state"
+    surjective = "with numbers only: one image for each kind of state"
     parser.add_argument("--surjective", action="store_true", help=surjective)
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--policy", choices=POLICIES, help="who acts")

@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
     parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
     parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
-    parser.add_argument("--episodes", type=int, default=1000, help="that visits are counted in; default: 1000")
+    parser.add_argument("--episodes", type=int, default=1000, help="episodes used to count visits; default: 1000")
     return parser
 
 

@@ -13,7 +13,7 @@ from ctgraph_rl.tasks.task import Task
 
 
 class Player:
-    """Plays a task in an environment of its own. A policy's draws come from torch's global generator.
+    """Plays a task in its own environment. A policy's draws come from torch's global generator.
 
     Args:
         task: what is played.

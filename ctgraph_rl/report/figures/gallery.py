@@ -41,7 +41,7 @@ def left_out(count: int, most: int, what: str) -> str:
 
 
 class Gallery:
-    """Writes figures into the folder of a report, each under a name of its own.
+    """Writes figures into the folder of a report, each under its own name.
 
     Args:
         folder: of the report.

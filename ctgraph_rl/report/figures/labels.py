@@ -35,7 +35,7 @@ def label_strips(section: Section) -> CaptionedFigure | None:
         "Numbers in strips: labels, in the order in which they were opened; colour: the task in most of whose frames "
         "the label acted. Pale: frames that were not learned from, while known labels were tried. Black marks below a "
         f"strip: alarms. Dashed: changes of task.{left_out(len(runs), MOST_STRIPS, 'runs')} In evaluations each task "
-        "is played with the label that acted in most of its frames: an oracle in evaluation alone, which no learner "
+        "is played with the label that acted in most of its frames: an oracle only in evaluation, which no learner "
         "sees."
     )
     return CaptionedFigure("labels", "Labels and true tasks", caption, draw_labels(section))
@@ -77,7 +77,7 @@ def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any
 
 
 def _runs(section: Section) -> list[tuple[str, Run]]:
-    """Return the finished runs with labels of their own, each with agent and seed."""
+    """Return the finished runs with their own labels, each with agent and seed."""
     found = [(result.agent, run) for result in section.results for run in result.finished]
     return [
         (f"{short(terminal_text(agent))}, seed {run.seed}", run)

@@ -137,8 +137,10 @@ def test_without_labels_of_a_detector_there_is_no_figure_of_them_and_with_them_i
     runs, _ = find_runs([tmp_path])
     with style():
         found = label_strips(sections(runs)[0])
-    assert found is not None and "an oracle in evaluation alone" in found.caption
-    assert label_notes(runs)[0].startswith("1 of 2 runs have labels of a detector: each task is played with the label")
+    assert found is not None and "an oracle only in evaluation" in found.caption
+    assert label_notes(runs)[0].startswith(
+        "1 of 2 runs have labels of a detector: evaluation uses each task's most frequent label"
+    )
 
 
 @pytest.mark.parametrize(("number", "said"), [(5, True), (6, False)])
