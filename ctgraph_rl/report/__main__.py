@@ -14,6 +14,10 @@ from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_problems, print_summary
 
 
+def _told(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
+
+
 def main() -> None:
     """Write the report, and say what is in it; the exit code is 1 if something was left out or is of different code."""
     parser = argparse.ArgumentParser(prog="ctgraph-rl report", description=__doc__)
@@ -33,7 +37,12 @@ def main() -> None:
         if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
         report = write_report(
-            arguments.runs, arguments.out, arguments.agent, width=arguments.width, colours=arguments.colour
+            arguments.runs,
+            arguments.out,
+            arguments.agent,
+            width=arguments.width,
+            colours=arguments.colour,
+            progress=_told if sys.stderr.isatty() else None,
         )
     incomplete = print_problems(report.problems, report.runs)
     count = len(report.runs)

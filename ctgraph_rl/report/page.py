@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -37,6 +38,9 @@ OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
 
 OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
 """Figures of an agent with finished runs, in their order; None where there is nothing to draw."""
+
+QUICK = 2.0
+"""Seconds of a report that tells no progress."""
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
@@ -101,6 +105,7 @@ def write_report(
     agents: Sequence[str] = (),
     width: str = "text",
     colours: Sequence[str] = (),
+    progress: Callable[[str], object] | None = None,
 ) -> Report:
     """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
 
@@ -111,11 +116,13 @@ def write_report(
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
         colours: of agents, each as ``NAME=COLOUR`` with its name in figures.
+        progress: is called with a sentence after each curriculum, once `QUICK` seconds have passed.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no run that can be read, and for a width, an agent or a colour that there is not.
     """
+    start = time.perf_counter()
     require_packages()
     runs, problems = find_runs(paths)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
@@ -129,7 +136,11 @@ def write_report(
     gallery = Gallery(Path(folder), width, chosen)
     found = sections(runs)
     together = gallery.write((), (experiments(each) for each in [found]))  # drawn in the gallery's style
-    parts = [_part(section, gallery) for section in found]
+    parts = []
+    for section in found:
+        parts.append(_part(section, gallery))
+        if progress is not None and time.perf_counter() - start > QUICK:
+            progress(f"report: {len(parts)} of {len(found)} curricula")
     about = {
         "title": _title(parts),
         "figures": together,

@@ -30,6 +30,7 @@ LIFELONG = {
 }
 """Transfer as ratios of terminal performance around a training, under its authors' name."""
 WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
+OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the others are in the file."""
 
 MOST_SEEDS = 10
@@ -171,13 +172,13 @@ def _shown(value: float) -> str:
 
 
 def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the main metrics with their definitions, or why one is undefined; those against experts if defined."""
+    """Return the main metrics with their definitions, or why one is undefined; others where they have a value."""
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     for name in (
         *ALWAYS,
-        *(name for name in (*LIFELONG, *WITH_EXPERTS) if metrics.get(name, {}).get("value") is not None),
+        *(name for name in (*LIFELONG, *WITH_EXPERTS, *OF_DETECTION) if metrics.get(name, {}).get("value") is not None),
     ):
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 
 import pytest
@@ -96,6 +97,15 @@ def test_an_undefined_metric_shows_why(run_dir):
 
     reason = "the definition needs each task trained once, alone, in the order of the columns"
     assert ["forgetting", "undefined", reason] in rows
+
+
+def test_a_run_with_a_detector_shows_what_it_detected(run_dir):
+    assert "false alarms" not in [cells[0] for cells in shown(run_dir)]
+    found = json.loads((run_dir / "metrics.json").read_text())
+    found["false_alarms"] = {**found["forgetting"], "value": 2.0, "undefined": None}
+    (run_dir / "metrics.json").write_text(json.dumps(found))
+
+    assert ["false alarms", "2.00"] in [cells[:2] for cells in shown(run_dir)]
 
 
 def test_a_bar_for_each_evaluation_is_printed_for_each_task(run_dir):
