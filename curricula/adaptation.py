@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.checks import at_least_one, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot, PaperImages
@@ -103,10 +103,38 @@ def nm_uniform_goals(num_frames: int | None = None, depth: int = 2) -> Curriculu
     return sequence("nm_uniform_goals", [tasks], frames, 1, NM, evaluation=evaluation)
 
 
+@takes_numbers
+def goal_search(num_frames: int = 409_600, depth: int = 2, num_image_sets: int = 4) -> Curriculum:
+    """Half of the goals on some image sets; held out are the other half, and all goals on one image set more.
+
+    A learner that knows the trained goals by heart finds these faster than the best search for a goal of all, and the
+    held-out ones not at all. Tasks are fully observable. The trained goals have an even number of second decisions. A
+    row has one task, for all its episodes; in an evaluation it plays one for each goal before those that count.
+
+    Args:
+        num_frames: frames of all rows together.
+        depth: of the graph.
+        num_image_sets: image sets that are trained, with the image seeds 1, 2 and so on.
+    """
+    require(*at_least_one(depth=depth, num_image_sets=num_image_sets))
+    tasks = [task for seed in range(1, num_image_sets + 1) for task in all_goals(full_mdp("0" * depth, seed))]
+    trained = [task for task in tasks if task.goal.count(2) % 2 == 0]
+    other_goals = [task for task in tasks if task.goal.count(2) % 2 == 1]
+    other_images = all_goals(full_mdp("0" * depth, num_image_sets + 1))
+    evaluation = Evaluation(
+        40,
+        greedy=False,
+        episodes_per_row=2,
+        held_out=(*other_goals, *other_images),
+        adapt_episodes=2**depth,
+    )
+    return sequence("goal_search", [trained], num_frames, 1, "ctgraph_rl", evaluation=evaluation)
+
+
 def _longest_episode(depth: int) -> int:
     """Steps for p=0: home, a wait and a decision for each level, a wait, and the extra step at the end."""
     return 2 * depth + 3
 
 
-NAMED = {f.__name__: f for f in (dick2020_pair, nm_uniform_goals, penn_a_swap, swoks_2x4)}
+NAMED = {f.__name__: f for f in (dick2020_pair, goal_search, nm_uniform_goals, penn_a_swap, swoks_2x4)}
 """The curricula of this module by name."""

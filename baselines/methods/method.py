@@ -90,7 +90,12 @@ class Method(TakesNumbers, Hooks):
         """
         missing = [f"`{name}`" for name in self.agent_members if not hasattr(agent, name)]
         missing += ["`torch.nn.Module` as its base"] * (not isinstance(agent, nn.Module))
-        message = f"{type(self).__name__} needs an agent with {', '.join(missing)}, got {type(agent).__name__}"
+        name, learner = type(self).__name__, type(agent).__name__
+        message = f"{name} needs an agent with {', '.join(missing)}, got {learner}"
+        adapts = getattr(agent, "adapt_episodes", 0) > 0
+        require(
+            (not adapts, f"{name} learns tasks one after the other, and {learner} draws them: take method=finetune")
+        )
         require((not missing, f"{message}: derive it from baselines.parts.learner.Learner, or take method=finetune"))
         return AgentWithMethod(cast(Learner, agent), self, curriculum)
 

@@ -283,3 +283,15 @@ def test_evaluation_with_adaptation_leaves_training_untouched():
 
     assert torch.equal(ends[0][0], ends[1][0]) and ends[0][0].abs().max() > 0
     assert torch.equal(ends[0][1], ends[1][1])
+
+
+def test_goals_and_images_of_a_search_are_held_out():
+    search = curricula.load("goal_search", depth=2, num_image_sets=3)
+
+    trained, held_out = search.tasks, search.evaluation.held_out
+    assert [task.goal for task in trained] == [(1, 1), (2, 2)] * 3
+    assert [task.goal for task in held_out[:6]] == [(1, 2), (2, 1)] * 3
+    assert [task.goal for task in held_out[6:]] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert {task.images for task in held_out[:6]} == {task.images for task in trained}
+    assert len({task.images for task in trained}) == 3 and held_out[6].images not in {task.images for task in trained}
+    check_adaptation(search, Scripted())

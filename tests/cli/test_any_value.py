@@ -40,7 +40,14 @@ OVER = {
 }
 """What the settings of a group are tried with."""
 
-FITTING = {"l2d2c": ("agent=ppo", "method=mask_ri", "curriculum=l2d2c_2x2"), "isolated": ("agent=ppo",)}
+ADAPTING = ("curriculum=nm_uniform_goals", "agent.adapt_episodes=1")
+
+FITTING = {
+    "maml": ADAPTING,
+    "cavia": ADAPTING,
+    "l2d2c": ("agent=ppo", "method=mask_ri", "curriculum=l2d2c_2x2"),
+    "isolated": ("agent=ppo",),
+}
 
 SMALL = {"num_envs": 4, "num_steps": 8, "hidden_size": 8, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
 

@@ -47,6 +47,7 @@ RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") 
     "qrdqn_lstm": [*BLOCKS, *REPLAY, "agent.replay_on_task_change=keep", "protocol.boundaries=hidden"],
     "reinforce": [*BLOCKS, "experts=true"],
     "rl2": [*TRIALS, *MINIBATCHES],
+    **{name: [*TRIALS, "agent.adapt_episodes=1", "evaluation.adapt_episodes=1"] for name in ("cavia", "maml")},
 }
 """What every agent learns: small, with as many different things in it as a run can have."""
 

@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType
 from baselines.methods.method import AgentWithMethod, Method
 from baselines.methods.parts.importance import Importance
 from baselines.parts.catalogue import catalogue
+from baselines.parts.inner_loop import InnerLoop
 from baselines.parts.learner import Learner
 from baselines.parts.policy_gradient import PolicyGradient
 from baselines.parts.q_learning import QLearner
@@ -33,13 +34,17 @@ from helpers.scripted import OBSERVATIONS, ONE, THREE, TWO, of
 
 YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "agent").glob("*.yaml"))}
 
-AGENTS = [name for name in YAML if "_target_" in YAML[name]]  # others only change some values of one of these
-
 KINDS = {agent.name: agent.kind for agent in catalogue("agent")}
+
+ADAPTING = [name for name, kind in KINDS.items() if issubclass(kind, InnerLoop)]
+"""Agents that need tasks which are drawn, and no method."""
+
+AGENTS = [name for name in KINDS if name not in ADAPTING]
+"""All others; files of conf/agent that are no agents only change some values of one."""
 
 Q_LEARNERS = tuple(name for name, kind in KINDS.items() if issubclass(kind, QLearner))
 POLICY_GRADIENTS = tuple(name for name, kind in KINDS.items() if issubclass(kind, PolicyGradient))
-RECURRENT = tuple(name for name, kind in KINDS.items() if kind.memory)
+RECURRENT = tuple(name for name in AGENTS if KINDS[name].memory)
 
 LESS = {name: [f"agent.batch_size={4 if name in RECURRENT else 32}"] for name in Q_LEARNERS}
 SMALL_AGENT = {

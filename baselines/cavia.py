@@ -1,0 +1,67 @@
+"""CAVIA: a few context inputs adapt to a task, and the weights of the policy are learned for all tasks.
+
+Zintgraf et al. 2019, "Fast context adaptation via meta-learning" (arXiv 1810.03642):
+
+    phi_i = phi_0 - alpha grad_phi L_i(theta, phi_0) with phi_0 = 0,    minimise over theta the mean of the outer losses
+                                                                        of (theta, phi_i),
+
+with L_i on the first episodes of trial i and the outer loss on those that follow, see `baselines.parts.inner_loop`. phi
+is joined to the observation. Without context inputs it learns one policy for all tasks.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+from torch.func import functional_call
+from torchrl.data import Composite, TensorSpec
+
+from baselines.parts.gates import GatedNetwork
+from baselines.parts.inner_loop import InnerLoop, InnerModel, Seen, Weights
+from ctgraph_rl.checks import is_int, require
+
+
+class Context(InnerModel):
+    """The context inputs of the network adapt.
+
+    Args:
+        net: reads the context as its last input.
+        inner_rate: step size of the adaptation.
+        num_context: context inputs.
+    """
+
+    def __init__(self, net: GatedNetwork, inner_rate: float, num_context: int) -> None:
+        super().__init__(net, inner_rate)
+        self.num_context = num_context
+
+    def start(self, theta: Weights) -> Weights:
+        """Return a context of zeros."""
+        like = next(iter(theta.values()))
+        return {"context": like.new_zeros(self.num_context)}
+
+    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+        """Compute the logits from theta and a trial's context."""
+        context = own["context"].expand(*seen[0].shape[: -self.net.event_dims], -1)
+        return functional_call(self.net, theta, (*seen, context))
+
+
+class CAVIA(InnerLoop):
+    """A policy of which a context adapts.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_context: context inputs; 0: nothing adapts.
+        settings: the arguments of `InnerLoop`.
+    """
+
+    solves = "tasks whose goal is drawn from several: it adapts a context after some episodes"
+
+    def __init__(self, observation_spec: Composite, action_spec: TensorSpec, num_context: int, **settings: Any) -> None:
+        require((is_int(num_context, 0), f"num_context must be an integer >= 0, got {num_context!r}"))
+        super().__init__(observation_spec, action_spec, num_context=num_context, **settings)
+
+    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
+        """See `InnerLoop`."""
+        return Context(net, inner_rate, self.num_context)

@@ -1,0 +1,39 @@
+"""MAML: all weights of a policy adapt to a task by a step of gradient descent, and the start of that step is learned.
+
+Finn et al. 2017, "Model-agnostic meta-learning for fast adaptation of deep networks" (arXiv 1703.03400):
+
+    theta_i = theta - alpha grad_theta L_i(theta),    minimise over theta the mean of the outer losses of theta_i,
+
+with L_i on the first episodes of trial i and the outer loss on those that follow, see `baselines.parts.inner_loop`. The
+outer gradient goes through the inner one: it has second derivatives of L_i.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.func import functional_call
+
+from baselines.parts.gates import GatedNetwork
+from baselines.parts.inner_loop import InnerLoop, InnerModel, Seen, Weights
+
+
+class AllWeights(InnerModel):
+    """Every weight of the network adapts."""
+
+    def start(self, theta: Weights) -> Weights:
+        """Return theta."""
+        return theta
+
+    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+        """Compute the logits from a trial's own weights."""
+        return functional_call(self.net, own, seen)
+
+
+class MAML(InnerLoop):
+    """A policy of which all weights adapt; the arguments are those of `InnerLoop`."""
+
+    solves = "tasks whose goal is drawn from several: it adapts all weights after some episodes"
+
+    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
+        """See `InnerLoop`."""
+        return AllWeights(net, inner_rate)

@@ -1,0 +1,101 @@
+"""A network whose layers may be modulated by gates (Ben-Iwhiwhu et al. 2022, Neural Networks, arXiv 2111.00134).
+
+A layer is y = relu((W x + b) g) with the gate g = tanh(s), s = W_o relu(W_n x + b_n) + b_o; ``hard`` takes the sign of
+s, 1 at 0, and ``none`` no gate. The gradient of a sign is 0, so a hard gate never learns: it is fixed and random, as in
+the code that was released with the paper. ``hard_straight_through`` has the values of ``hard`` and the gradient of s.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from baselines.cells.cell import linear_layer
+
+GATES = ("none", "soft", "hard", "hard_straight_through")
+
+
+class GatedLayer(nn.Module):
+    """A linear layer with ReLU, and its gate.
+
+    Args:
+        num_inputs: width of x.
+        num_outputs: width of y.
+        gate: one of `GATES`.
+        gate_size: width of W_n x.
+    """
+
+    def __init__(self, num_inputs: int, num_outputs: int, gate: str, gate_size: int) -> None:
+        super().__init__()
+        self.gate = gate
+        self.linear = linear_layer(num_inputs, num_outputs)
+        self.modulator = nn.Sequential()
+        if gate != "none":
+            layers = linear_layer(num_inputs, gate_size), nn.ReLU(), linear_layer(gate_size, num_outputs)
+            self.modulator.extend(layers)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Map [..., num_inputs] to [..., num_outputs]."""
+        outputs = self.linear(inputs)
+        return outputs.relu() if self.gate == "none" else (outputs * self.gates(inputs)).relu()
+
+    def gates(self, inputs: Tensor) -> Tensor:
+        """Compute g, [..., num_outputs]."""
+        drive = self.modulator(inputs)
+        if self.gate == "soft":
+            return drive.tanh()
+        sign = torch.where(drive >= 0, 1.0, -1.0).to(drive.dtype)
+        return sign + 0 * drive if self.gate == "hard" else sign + drive - drive.detach()
+
+
+class GatedNetwork(nn.Module):
+    """Layers from observations to logits; their weights are as Glorot & Bengio 2010 draw them, biases 0.
+
+    Args:
+        shape: shape of one observation.
+        high: largest value of an observation.
+        num_extra: width of further inputs.
+        hidden_size: width of each layer.
+        num_layers: layers before the output, which has no gate.
+        num_outputs: logits.
+        gate: one of `GATES`.
+        gate_size: see `GatedLayer`.
+    """
+
+    def __init__(
+        self,
+        shape: torch.Size,
+        high: float,
+        num_extra: int,
+        hidden_size: int,
+        num_layers: int,
+        num_outputs: int,
+        gate: str,
+        gate_size: int,
+    ) -> None:
+        super().__init__()
+        self.event_dims, self.scale = len(shape), 1 / high
+        widths = [shape.numel() + num_extra, *[hidden_size] * num_layers]
+        layers = [GatedLayer(before, after, gate, gate_size) for before, after in pairwise(widths)]
+        self.layers = nn.Sequential(*layers)
+        self.output = linear_layer(hidden_size, num_outputs)
+        for name, parameter in self.named_parameters():
+            if name.endswith("weight"):
+                nn.init.xavier_uniform_(parameter)
+            else:
+                nn.init.zeros_(parameter)
+
+    def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
+        """Map observations [..., *shape] and further inputs, [..., n] each, to [..., num_outputs]."""
+        inputs = torch.cat([self.flat(observation), *(self.as_inputs(value) for value in extra)], dim=-1)
+        return self.output(self.layers(inputs))
+
+    def flat(self, observation: Tensor) -> Tensor:
+        """Return observations as vectors in [0, 1]."""
+        return self.as_inputs(observation.flatten(-self.event_dims)) * self.scale
+
+    def as_inputs(self, values: Tensor) -> Tensor:
+        """Return values in the type of the weights."""
+        return values.to(self.output.weight.dtype)

@@ -1,0 +1,429 @@
+"""The base class of agents that adapt to a task by a gradient step within a trial: MAML and CAVIA.
+
+A trial is a number of episodes of one task in one row. A row plays ``adapt_episodes`` with the weights that all trials
+begin with, adapts, and plays as many with the adapted ones. The inner loss is that of REINFORCE,
+
+    L = - 1/E sum_e 1/T_e sum_t A_t log pi(a_t | o_t),
+
+over the E episodes of T_e steps before the adaptation. The outer loss is the same over the episodes after it, with the
+ratio of probabilities in place of log pi, and is differentiated through the inner gradient. TRPO (Schulman et al.
+2015, arXiv 1502.05477) minimises it as published, or PPO by clipped steps of Adam. A = R - b, with mean 0 and standard
+deviation 1 over the steps before the adaptation, or over those after it. R is the discounted rest of the episode, b a
+linear function of observation and time (Duan et al. 2016, arXiv 1604.06778), fitted to the episodes before the
+adaptation.
+
+All trials are one batch: `torch.func.vmap` runs over them. Weights change between batches, so it learns from trials
+that begin and end within one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.func import grad, vmap
+from torch.nn.functional import one_hot
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from baselines.parts.gates import GATES, GatedNetwork
+from baselines.parts.learner import Learner
+from baselines.parts.networks import Data, draw, guided, highest, num_actions_of, require_weights
+from baselines.update.optimiser import make_optimiser
+from baselines.update.trust_region import trust_region_step
+from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
+from ctgraph_rl.learn.collect import UNSTORED
+
+OUTER = ("trpo", "ppo")
+
+ACTIONS, REWARDS, EPISODES = f"{UNSTORED}actions", f"{UNSTORED}rewards", f"{UNSTORED}episodes"
+"""What a row has done since its trial began, [rows, steps]; the number of an episode that is not needed is 0."""
+
+RIDGE = 1e-5
+"""Added to the diagonal of the baseline's normal equations."""
+
+SMALLEST_STD = 1e-4
+"""Added to the standard deviation of A, which is 0 where the baseline fits all returns."""
+
+Weights = dict[str, Tensor]
+Seen = tuple[Tensor, ...]
+
+
+class Played(NamedTuple):
+    """Steps of trials, padded to one length."""
+
+    seen: Seen  # what the network reads, [trials, steps, ...] each
+    action: Tensor  # int64 [trials, steps]
+    reward: Tensor  # [trials, steps]
+    number: Tensor  # of the step's episode, from 1; 0 where padded, int64 [trials, steps]
+
+    def weight(self) -> Tensor:
+        """Compute 1 / (E T_e) of each step, 0 where padded, [trials, steps]."""
+        lengths = one_hot(self.number).sum(dim=1)
+        episodes = (lengths[:, 1:] > 0).sum(dim=1, keepdim=True)
+        steps = lengths.gather(1, self.number) * episodes
+        return torch.where(self.number > 0, 1 / steps, 0.0)
+
+    def returns(self, gamma: float) -> Tensor:
+        """Compute R, [trials, steps]."""
+        found = self.reward.clone()
+        for t in reversed(range(found.shape[1] - 1)):
+            lasts = self.number[:, t] == self.number[:, t + 1]
+            found[:, t] += torch.where(lasts, gamma * found[:, t + 1], 0.0)
+        return found
+
+    def features(self, net: GatedNetwork) -> Tensor:
+        """Compute what the baseline reads: o, o^2, t, t^2, t^3 and 1, with t in 100 steps of the episode, float64."""
+        place = torch.arange(self.number.shape[1], device=self.number.device).expand_as(self.number)
+        begins = self.number != self.number.roll(1, dims=1)
+        begins[:, 0] = True
+        first = torch.where(begins, place, 0).cummax(dim=1).values
+        time = (place - first).unsqueeze(-1).double() / 100
+        flat = net.flat(self.seen[0]).double()
+        return torch.cat([flat, flat**2, time, time**2, time**3, torch.ones_like(time)], dim=-1)
+
+    def baseline(self, net: GatedNetwork, gamma: float) -> Tensor:
+        """Fit the weights of b, float64 [trials, features]."""
+        inputs = self.features(net) * (self.number > 0).unsqueeze(-1)
+        squares = inputs.mT @ inputs + RIDGE * torch.eye(inputs.shape[-1], dtype=inputs.dtype, device=inputs.device)
+        return torch.linalg.solve(squares, inputs.mT @ self.returns(gamma).double().unsqueeze(-1)).squeeze(-1)
+
+    def advantage(self, net: GatedNetwork, gamma: float, baseline: Tensor) -> Tensor:
+        """Compute A, 0 where padded, [trials, steps]."""
+        counts = (self.number > 0).double()
+        number = counts.sum(dim=1, keepdim=True)
+        raw = self.returns(gamma) - (self.features(net) @ baseline.unsqueeze(-1)).squeeze(-1)
+        centred = counts * (raw - (counts * raw).sum(dim=1, keepdim=True) / number)
+        std = ((centred**2).sum(dim=1, keepdim=True) / number).sqrt()
+        return (centred / (std + SMALLEST_STD)).to(self.reward.dtype)
+
+
+class Episodes(NamedTuple):
+    """What a loss reads of the steps of a trial, or of several."""
+
+    seen: Seen
+    action: Tensor
+    advantage: Tensor
+    weight: Tensor
+
+
+def log_prob(logits: Tensor, action: Tensor) -> Tensor:
+    """Compute the logarithm of the probability of actions, [...], from logits [..., num_actions]."""
+    return logits.log_softmax(dim=-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
+class InnerModel(nn.Module):
+    """A network whose logits depend on weights that all trials share, theta, and on a trial's own, which adapt.
+
+    Args:
+        net: maps what is seen to logits.
+        inner_rate: step size of the adaptation.
+    """
+
+    def __init__(self, net: GatedNetwork, inner_rate: float) -> None:
+        super().__init__()
+        self.net, self.inner_rate = net, inner_rate
+
+    @property
+    def theta(self) -> Weights:
+        """The weights that all trials share."""
+        return dict(self.net.named_parameters())
+
+    def start(self, theta: Weights) -> Weights:
+        """Return a trial's own weights before it has adapted."""
+        raise NotImplementedError
+
+    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+        """Compute the logits of any number of steps of one trial, [..., num_actions]."""
+        raise NotImplementedError
+
+    def inner_loss(self, own: Weights, theta: Weights, before: Episodes) -> Tensor:
+        """Compute L of one trial, a scalar."""
+        log_probs = log_prob(self.logits(theta, own, before.seen), before.action)
+        return -(before.weight * before.advantage * log_probs).sum()
+
+    def adapt(self, theta: Weights, own: Weights, before: Episodes) -> Weights:
+        """Return a trial's own weights after a step of gradient descent on L."""
+        gradients = grad(self.inner_loss)(own, theta, before)
+        return {name: value - self.inner_rate * gradients[name] for name, value in own.items()}
+
+    def adapted_logits(self, theta: Weights, before: Episodes, seen: Seen) -> Tensor:
+        """Compute the logits of one trial's steps after its adaptation, [steps, num_actions]."""
+        return self.logits(theta, self.adapt(theta, self.start(theta), before), seen)
+
+
+class InnerPolicy(TensorDictModuleBase):
+    """Acts in each row with weights of the row, and lets it adapt once it has played enough episodes.
+
+    Args:
+        model: the weights, and how they adapt.
+        seen_keys: what the network reads.
+        adapt_episodes: episodes before the adaptation, and after it.
+        gamma: discount factor.
+    """
+
+    def __init__(self, model: InnerModel, seen_keys: list[str], adapt_episodes: int, gamma: float) -> None:
+        super().__init__()
+        self.model, self.adapt_episodes, self.gamma = model, adapt_episodes, gamma
+        self.seen_keys = seen_keys
+        self.kept_keys = [f"{UNSTORED}{key}" for key in seen_keys]
+        self.own_keys = {name: f"{UNSTORED}{name}" for name in model.start(model.theta)}
+        state = ["trial", ACTIONS, REWARDS, EPISODES, *self.kept_keys, *self.own_keys.values()]
+        self.in_keys = [*seen_keys, "is_init", "reward", *state]
+        self.out_keys = ["action", *(("next", key) for key in state)]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` and the next state."""
+        model, theta = self.model, {name: value.detach() for name, value in self.model.theta.items()}
+        begins = tensordict["is_init"].squeeze(-1)
+        episode = tensordict["trial"].squeeze(-1) + begins
+        fresh = begins & ((episode == 1) | (episode > 2 * self.adapt_episodes))
+        episode = torch.where(fresh, 1, episode)
+        rewards = torch.cat([tensordict[REWARDS], tensordict["reward"]], dim=1)
+        rewards = rewards[:, rewards.shape[1] - tensordict[EPISODES].shape[1] :]  # those of the steps that are kept
+        own = {name: tensordict[key] for name, key in self.own_keys.items()}
+        adapts = begins & (episode == self.adapt_episodes + 1)
+        if adapts.any():
+            own = self._adapted(theta, own, tensordict, rewards, rows=adapts.nonzero().squeeze(-1))
+        for name, first in model.start(theta).items():
+            own[name] = torch.where(fresh.view(-1, *[1] * first.ndim), first, own[name])
+        seen = tuple(tensordict[key] for key in self.seen_keys)
+        logits = vmap(model.logits, in_dims=(None, 0, 0))(theta, own, seen)
+        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        action = logits.argmax(dim=-1) if is_greedy else draw(logits.softmax(dim=-1))
+        tensordict.set("action", guided(tensordict, action))
+        tensordict.set(("next", "trial"), episode.unsqueeze(-1))
+        for name, key in self.own_keys.items():
+            tensordict.set(("next", key), own[name])
+        self._remember(tensordict, rewards, episode, forgets=fresh | adapts)
+        return tensordict
+
+    def _adapted(self, theta: Weights, own: Weights, data: Data, rewards: Tensor, *, rows: Tensor) -> Weights:
+        """Return the weights of all rows, adapted ones for some."""
+        seen = tuple(data[key][rows] for key in self.kept_keys)
+        played = Played(seen, data[ACTIONS][rows], rewards[rows], data[EPISODES][rows])
+        theirs = {name: value[rows] for name, value in own.items()}
+        adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
+        return {name: value.index_copy(0, rows, adapted[name]) for name, value in own.items()}
+
+    def before(self, played: Played) -> Episodes:
+        """Return what L reads of the steps before an adaptation."""
+        net = self.model.net
+        advantage = played.advantage(net, self.gamma, played.baseline(net, self.gamma))
+        return Episodes(played.seen, played.action, advantage, played.weight().to(advantage.dtype))
+
+    def _remember(self, data: TensorDictBase, rewards: Tensor, episode: Tensor, *, forgets: Tensor) -> None:
+        """Write what rows have done, this step included, from the first step on that a row still needs."""
+        earlier = torch.where(forgets.unsqueeze(-1), 0, data[EPISODES])
+        now = torch.where(episode <= self.adapt_episodes, episode, 0)
+        numbers = torch.cat([earlier, now.unsqueeze(-1)], dim=1)
+        needed = (numbers > 0).any(dim=0)
+        first = int(needed.int().argmax()) if needed.any() else len(needed)
+        data.set(("next", EPISODES), numbers[:, first:])
+        data.set(("next", ACTIONS), torch.cat([data[ACTIONS], data["action"].unsqueeze(-1)], dim=1)[:, first:])
+        data.set(("next", REWARDS), rewards[:, first:])
+        for key, kept in zip(self.seen_keys, self.kept_keys, strict=True):
+            data.set(("next", kept), torch.cat([data[kept], data[key].unsqueeze(1)], dim=1)[:, first:])
+
+
+class InnerLoop(Learner):
+    """A policy that adapts within a trial; a class that derives from it says which weights do.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_envs: rows, each with one trial at a time.
+        num_steps: steps of each row in a batch: twice those of a trial, so that there is a whole one.
+        hidden_size: width of all layers.
+        num_layers: layers before the output.
+        adapt_episodes: episodes before the adaptation, and after it.
+        inner_rate: step size of the adaptation.
+        gamma: discount factor.
+        gate: modulates layers, see `baselines.parts.gates`: ``none``, ``soft``, ``hard`` or ``hard_straight_through``.
+        gate_size: units of a gate.
+        outer: ``trpo`` or ``ppo``.
+        max_kl: largest mean divergence of a step of TRPO.
+        learning_rate: of PPO.
+        clip_epsilon: how far the probability ratio of PPO may move.
+        num_epochs: steps of PPO on a batch.
+        max_grad_norm: the gradients of PPO are scaled down to this norm.
+        num_context: further inputs of the network.
+    """
+
+    memory = True
+    output_keys = ("log_probs",)
+    minibatch_size = 0  # batches differ in their number of trials
+
+    policy: InnerPolicy
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        num_envs: int,
+        num_steps: int,
+        hidden_size: int,
+        num_layers: int,
+        adapt_episodes: int,
+        inner_rate: float,
+        gamma: float,
+        gate: str,
+        gate_size: int,
+        outer: str,
+        max_kl: float,
+        learning_rate: float,
+        clip_epsilon: float,
+        num_epochs: int,
+        max_grad_norm: float,
+        num_context: int = 0,
+    ) -> None:
+        super().__init__(num_envs, num_steps, max_grad_norm)
+        short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
+        require(
+            *at_least_one(hidden_size=hidden_size, num_layers=num_layers, gate_size=gate_size, num_epochs=num_epochs),
+            *at_least_one(adapt_episodes=adapt_episodes),
+            (num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"),
+            *positive(inner_rate=inner_rate, max_kl=max_kl, learning_rate=learning_rate, clip_epsilon=clip_epsilon),
+            *fraction(gamma=gamma),
+            *one_of(GATES, gate=gate),
+            *one_of(OUTER, outer=outer),
+        )
+        self.adapt_episodes, self.trial_episodes = adapt_episodes, 2 * adapt_episodes
+        self.num_context = num_context
+        self.outer, self.max_kl, self.clip_epsilon, self.num_epochs = outer, max_kl, clip_epsilon, num_epochs
+        num_actions = num_actions_of(action_spec)
+        require_weights(observation_spec, hidden_size, num_layers, num_actions)
+        shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
+        self.specs = {key: observation_spec[key] for key in shown}
+        shape, *others = (spec.shape for spec in self.specs.values())
+        net = GatedNetwork(
+            shape,
+            highest(observation_spec["observation"]),
+            num_context + sum(other.numel() for other in others),
+            hidden_size=hidden_size,
+            num_layers=num_layers,
+            num_outputs=num_actions,
+            gate=gate,
+            gate_size=gate_size,
+        )
+        self.policy = InnerPolicy(self.make_model(net, inner_rate), list(self.specs), adapt_episodes, gamma)
+        self.optimiser = make_optimiser("adam", net.parameters(), learning_rate)
+
+    def make_model(self, net: GatedNetwork, inner_rate: float) -> InnerModel:
+        """Return the model of a network."""
+        raise NotImplementedError
+
+    @property
+    def model(self) -> InnerModel:
+        """The weights, and how they adapt."""
+        return self.policy.model
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return the state before the first trial; it lasts over episodes, as it has a key ``trial``."""
+        theta = self.model.theta
+        like = next(iter(theta.values())).detach()
+        state = {"trial": like.new_zeros(num_envs, 1, dtype=torch.int64), "reward": like.new_zeros(num_envs, 1)}
+        state |= {key: like.new_zeros(num_envs, 0, dtype=torch.int64) for key in (ACTIONS, EPISODES)}
+        state[REWARDS] = like.new_zeros(num_envs, 0)
+        for key, spec in self.specs.items():
+            state[f"{UNSTORED}{key}"] = torch.zeros(num_envs, 0, *spec.shape, dtype=spec.dtype, device=like.device)
+        for name, value in self.model.start(theta).items():
+            state[self.policy.own_keys[name]] = value.detach().expand(num_envs, *value.shape).clone()
+        return TensorDict(state, batch_size=[num_envs])
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from the whole trials of a batch; without one, nothing is learned or measured."""
+        steps = [self.gradient_step(minibatch) for minibatch in self.minibatches(batch)]
+        return self.mean_measurements(steps) if steps else {}
+
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Yield the trials of a batch as often as the outer loop takes a step on them."""
+        trials = self.trials(batch)
+        if trials is not None:
+            yield from [trials] * (1 if self.outer == "trpo" else self.num_epochs)
+
+    @torch.no_grad()
+    def trials(self, batch: TensorDictBase) -> dict[Any, Tensor] | None:
+        """Return what the losses read of the trials that begin and end in a batch; None without one.
+
+        Keys are those of `Episodes`, what was ``seen`` under its own ones, those of steps before the adaptation under
+        ``("before", key)``; and ``log_prob``, of the present weights.
+        """
+        number = batch["next", "trial"].squeeze(-1)
+        begins = batch["is_init"].squeeze(-1) & (number == 1)
+        trial = begins.cumsum(dim=1)
+        rows, first = begins.nonzero(as_tuple=True)
+        own = trial[rows] == trial[rows, first].unsqueeze(-1)
+        ends = batch["next", "done"].squeeze(-1) & (number == self.trial_episodes)
+        whole = (own & ends[rows]).any(dim=1)
+        if not whole.any():
+            return None
+        rows, own = rows[whole], own[whole]
+        is_before = number[rows] <= self.adapt_episodes
+        before = self._played(batch, rows, own & is_before)
+        after = self._played(batch, rows, own & ~is_before)
+        policy, net = self.policy, self.model.net
+        found = self._as_data(policy.before(before), "before")
+        advantage = after.advantage(net, policy.gamma, before.baseline(net, policy.gamma))
+        found |= self._as_data(Episodes(after.seen, after.action, advantage, after.weight().to(advantage.dtype)))
+        found["log_prob"] = log_prob(self._adapted_logits(found), found["action"])
+        for name, played in (("before", before), ("after", after)):
+            found["measured", name] = (played.reward * (played.number > 0)).sum() / len(rows) / self.adapt_episodes
+        return found
+
+    def _played(self, batch: TensorDictBase, rows: Tensor, chosen: Tensor) -> Played:
+        """Return some steps of rows, which follow each other; ``chosen`` is bool [trials, steps of the batch]."""
+        count = chosen.sum(dim=1, keepdim=True)
+        place = torch.arange(int(count.max()), device=rows.device)
+        steps = (chosen.int().argmax(dim=1, keepdim=True) + place).clamp(max=chosen.shape[1] - 1)
+        at = rows.unsqueeze(-1), steps
+        number = torch.where(place < count, batch["next", "trial"].squeeze(-1)[at], 0)
+        number = torch.where(number > self.adapt_episodes, number - self.adapt_episodes, number)
+        seen = tuple(batch[key][at] for key in self.specs)
+        return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
+
+    def _as_data(self, episodes: Episodes, *labels: str) -> dict[Any, Tensor]:
+        """Return episodes by key."""
+        named = {**dict(zip(self.specs, episodes.seen, strict=True)), **episodes._asdict()}
+        del named["seen"]
+        return {(*labels, key) if labels else key: value for key, value in named.items()}
+
+    def _adapted_logits(self, batch: Data, theta: Weights | None = None) -> Tensor:
+        """Compute the logits of all trials after their adaptation, [trials, steps, num_actions]."""
+        seen = tuple(batch["before", key] for key in self.specs)
+        before = Episodes(seen, *(batch["before", key] for key in Episodes._fields[1:]))
+        after = tuple(batch[key] for key in self.specs)
+        return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the outer loss of what `trials` returned."""
+        return {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
+
+    def _outer_loss(self, batch: Data, logits: Tensor) -> Tensor:
+        ratio = (log_prob(logits, batch["action"]) - batch["log_prob"]).exp()
+        gain = ratio * batch["advantage"]
+        if self.outer == "ppo":
+            clipped = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon) * batch["advantage"]
+            gain = torch.minimum(gain, clipped)
+        return -(batch["weight"] * gain).sum(dim=1).mean()
+
+    def gradient_step(self, batch: Data) -> dict[str, Tensor]:
+        """Take a step of the outer loop; return what was measured."""
+        if self.outer == "ppo":
+            measured = super().gradient_step(batch)
+        else:
+            measured = trust_region_step(
+                list(self.model.net.named_parameters()),
+                partial(self._adapted_logits, batch),
+                partial(self._outer_loss, batch),
+                weight=batch["weight"] / len(batch["weight"]),
+                max_kl=self.max_kl,
+            )
+        trials = torch.full_like(batch["measured", "after"], len(batch["action"]))
+        returns = {f"return_{name}": batch["measured", name] for name in ("before", "after")}
+        return {**measured, **returns, "trials": trials}
