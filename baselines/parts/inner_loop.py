@@ -186,12 +186,8 @@ class InnerPolicy(TensorDictModuleBase):
         episode = torch.where(fresh, 1, episode)
         rewards = torch.cat([tensordict[REWARDS], tensordict["reward"]], dim=1)
         rewards = rewards[:, rewards.shape[1] - tensordict[EPISODES].shape[1] :]  # those of the steps that are kept
-        own = {name: tensordict[key] for name, key in self.own_keys.items()}
         adapts = begins & (episode == self.adapt_episodes + 1)
-        if adapts.any():
-            own = self._adapted(theta, own, tensordict, rewards, rows=adapts.nonzero().squeeze(-1))
-        for name, first in model.start(theta).items():
-            own[name] = torch.where(fresh.view(-1, *[1] * first.ndim), first, own[name])
+        own = self._own(theta, tensordict, rewards, fresh=fresh, adapts=adapts)
         seen = tuple(tensordict[key] for key in self.seen_keys)
         logits = vmap(model.logits, in_dims=(None, 0, 0))(theta, own, seen)
         is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
@@ -203,13 +199,19 @@ class InnerPolicy(TensorDictModuleBase):
         self._remember(tensordict, rewards, episode, forgets=fresh | adapts)
         return tensordict
 
-    def _adapted(self, theta: Weights, own: Weights, data: Data, rewards: Tensor, *, rows: Tensor) -> Weights:
-        """Return the weights of all rows, adapted ones for some."""
-        seen = tuple(data[key][rows] for key in self.kept_keys)
-        played = Played(seen, data[ACTIONS][rows], rewards[rows], data[EPISODES][rows])
-        theirs = {name: value[rows] for name, value in own.items()}
-        adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
-        return {name: value.index_copy(0, rows, adapted[name]) for name, value in own.items()}
+    def _own(self, theta: Weights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> Weights:
+        """Return the weights of all rows, new ones for those that begin a trial or adapt."""
+        own = {name: data[key] for name, key in self.own_keys.items()}
+        if adapts.any():
+            rows = adapts.nonzero().squeeze(-1)
+            seen = tuple(data[key][rows] for key in self.kept_keys)
+            played = Played(seen, data[ACTIONS][rows], rewards[rows], data[EPISODES][rows])
+            theirs = {name: value[rows] for name, value in own.items()}
+            adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
+            own = {name: value.index_copy(0, rows, adapted[name]) for name, value in own.items()}
+        for name, first in self.model.start(theta).items():
+            own[name] = torch.where(fresh.view(-1, *[1] * first.ndim), first, own[name])
+        return own
 
     def before(self, played: Played) -> Episodes:
         """Return what L reads of the steps before an adaptation."""

@@ -56,19 +56,25 @@ def trust_region_step(
 
     direction = conjugate_gradients(curvature, -gradient)
     length = (2 * max_kl / (direction @ curvature(direction))).sqrt()
-    before, log_chances = loss_of(logits), logits.log_softmax(dim=-1)
+    before = loss_of(logits)
     scale = kl = torch.zeros_like(before)
     for trial in range(LINE_SEARCH_STEPS):
         candidate = present + SHRINKAGE**trial * length * direction
         found = logits_at(candidate)
-        divergence = (chances * (log_chances - found.log_softmax(dim=-1))).sum(dim=-1)
-        mean = (weight * divergence).sum()
-        if loss_of(found) < before and mean < max_kl:
-            scale, kl = torch.full_like(before, SHRINKAGE**trial), mean
+        divergence = (weight * kl_divergence(logits, found)).sum()
+        if loss_of(found) < before and divergence < max_kl:
+            scale = torch.full_like(before, SHRINKAGE**trial)
+            kl = divergence
             for (_, value), part in zip(weights, candidate.split(sizes), strict=True):
                 value.copy_(part.view_as(value))
             break
     return {"loss_policy": before, "grad_norm": gradient.norm(), "kl": kl, "step_scale": scale}
+
+
+def kl_divergence(logits: Tensor, others: Tensor) -> Tensor:
+    """Compute the divergence of categorical distributions from others, [...], from logits [..., num_actions]."""
+    log_chances = logits.log_softmax(dim=-1)
+    return (log_chances.exp() * (log_chances - others.log_softmax(dim=-1))).sum(dim=-1)
 
 
 def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor) -> Tensor:
