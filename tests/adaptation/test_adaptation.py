@@ -75,6 +75,21 @@ def test_a_policy_that_does_not_search_misses_goals_and_its_first_success_is_not
     assert found["first_success"].undefined == "1 of 2 terms have no value: a row never reached the goal"
 
 
+def test_a_row_that_leaves_the_goal_has_found_it():
+    agent = Searcher()
+    agent.policy = decide(lambda data: 1 + (data["trial"].squeeze(-1) % 2 == 0))
+    count = lambda data: data.set(("next", "trial"), data["trial"] + data["is_init"])  # noqa: E731
+    act = agent.policy
+    agent.policy = lambda data: act(count(data))
+
+    first = [m for m in learned(agent).of_kind("adaptation") if m["task"] == 1]
+
+    assert (
+        sorted(m["success_rate"] for m in first[:2]) == [0, 1] and first[0]["success_rate"] != first[1]["success_rate"]
+    )
+    assert [m["found_rate"] for m in first][1:] == [1, 1]
+
+
 def test_episodes_before_an_evaluation_do_not_count_in_its_means():
     how = replace(SEARCHED.evaluation, num_episodes=6, episodes_per_row=3, adapt_episodes=1)
 
