@@ -18,7 +18,7 @@ from torch.func import functional_call
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.gates import GatedNetwork
-from baselines.parts.inner_loop import InnerLoop, InnerModel, Seen, Weights
+from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetInputs
 from ctgraph_rl.checks import is_int, require
 
 
@@ -35,12 +35,12 @@ class Context(InnerModel):
         super().__init__(net, inner_rate)
         self.num_context = num_context
 
-    def start(self, theta: Weights) -> Weights:
+    def start(self, theta: NamedWeights) -> NamedWeights:
         """Return a context of zeros."""
         like = next(iter(theta.values()))
         return {"context": like.new_zeros(self.num_context)}
 
-    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
         """Compute the logits from theta and a trial's context."""
         context = own["context"].expand(*seen[0].shape[: -self.net.event_dims], -1)
         return functional_call(self.net, theta, (*seen, context))

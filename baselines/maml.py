@@ -14,17 +14,17 @@ from torch import Tensor
 from torch.func import functional_call
 
 from baselines.parts.gates import GatedNetwork
-from baselines.parts.inner_loop import InnerLoop, InnerModel, Seen, Weights
+from baselines.parts.inner_loop import InnerLoop, InnerModel, NamedWeights, NetInputs
 
 
 class AllWeights(InnerModel):
     """Every weight of the network adapts."""
 
-    def start(self, theta: Weights) -> Weights:
+    def start(self, theta: NamedWeights) -> NamedWeights:
         """Return theta."""
         return theta
 
-    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
         """Compute the logits from a trial's own weights."""
         return functional_call(self.net, own, seen)
 

@@ -50,14 +50,14 @@ RIDGE = 1e-5
 SMALLEST_STD = 1e-4
 """Added to the standard deviation of A, which is 0 where the baseline fits all returns."""
 
-Weights = dict[str, Tensor]
-Seen = tuple[Tensor, ...]
+NamedWeights = dict[str, Tensor]
+NetInputs = tuple[Tensor, ...]
 
 
 class Played(NamedTuple):
     """Steps of trials, padded to one length."""
 
-    seen: Seen  # what the network reads, [trials, steps, ...] each
+    seen: NetInputs  # what the network reads, [trials, steps, ...] each
     action: Tensor  # int64 [trials, steps]
     reward: Tensor  # [trials, steps]
     number: Tensor  # of the step's episode, from 1; 0 where padded, int64 [trials, steps]
@@ -106,7 +106,7 @@ class Played(NamedTuple):
 class Episodes(NamedTuple):
     """What a loss reads of the steps of a trial, or of several."""
 
-    seen: Seen
+    seen: NetInputs
     action: Tensor
     advantage: Tensor
     weight: Tensor
@@ -130,29 +130,29 @@ class InnerModel(nn.Module):
         self.net, self.inner_rate = net, inner_rate
 
     @property
-    def theta(self) -> Weights:
+    def theta(self) -> NamedWeights:
         """The weights that all trials share."""
         return dict(self.net.named_parameters())
 
-    def start(self, theta: Weights) -> Weights:
+    def start(self, theta: NamedWeights) -> NamedWeights:
         """Return a trial's own weights before it has adapted."""
         raise NotImplementedError
 
-    def logits(self, theta: Weights, own: Weights, seen: Seen) -> Tensor:
+    def logits(self, theta: NamedWeights, own: NamedWeights, seen: NetInputs) -> Tensor:
         """Compute the logits of any number of steps of one trial, [..., num_actions]."""
         raise NotImplementedError
 
-    def inner_loss(self, own: Weights, theta: Weights, before: Episodes) -> Tensor:
+    def inner_loss(self, own: NamedWeights, theta: NamedWeights, before: Episodes) -> Tensor:
         """Compute L of one trial, a scalar."""
         log_probs = log_prob(self.logits(theta, own, before.seen), before.action)
         return -(before.weight * before.advantage * log_probs).sum()
 
-    def adapt(self, theta: Weights, own: Weights, before: Episodes) -> Weights:
+    def adapt(self, theta: NamedWeights, own: NamedWeights, before: Episodes) -> NamedWeights:
         """Return a trial's own weights after a step of gradient descent on L."""
         gradients = grad(self.inner_loss)(own, theta, before)
         return {name: value - self.inner_rate * gradients[name] for name, value in own.items()}
 
-    def adapted_logits(self, theta: Weights, before: Episodes, seen: Seen) -> Tensor:
+    def adapted_logits(self, theta: NamedWeights, before: Episodes, seen: NetInputs) -> Tensor:
         """Compute the logits of one trial's steps after its adaptation, [steps, num_actions]."""
         return self.logits(theta, self.adapt(theta, self.start(theta), before), seen)
 
@@ -199,7 +199,7 @@ class InnerPolicy(TensorDictModuleBase):
         self._remember(tensordict, rewards, episode, forgets=fresh | adapts)
         return tensordict
 
-    def _own(self, theta: Weights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> Weights:
+    def _own(self, theta: NamedWeights, data: Data, rewards: Tensor, *, fresh: Tensor, adapts: Tensor) -> NamedWeights:
         """Return the weights of all rows, new ones for those that begin a trial or adapt."""
         own = {name: data[key] for name, key in self.own_keys.items()}
         if adapts.any():
@@ -395,7 +395,7 @@ class InnerLoop(Learner):
         del named["seen"]
         return {(*labels, key) if labels else key: value for key, value in named.items()}
 
-    def _adapted_logits(self, batch: Data, theta: Weights | None = None) -> Tensor:
+    def _adapted_logits(self, batch: Data, theta: NamedWeights | None = None) -> Tensor:
         """Compute the logits of all trials after their adaptation, [trials, steps, num_actions]."""
         seen = tuple(batch["before", key] for key in self.specs)
         before = Episodes(seen, *(batch["before", key] for key in Episodes._fields[1:]))
