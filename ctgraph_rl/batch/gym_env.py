@@ -193,11 +193,15 @@ class GymEnv(EnvBase):
 
     def _as_given(self, action: np.ndarray) -> np.ndarray:
         """Return actions as Gymnasium counts them."""
-        return action + int(getattr(spaces_of(self.pool[0])[1], "start", 0)) if action.ndim == 1 else action
+        if action.ndim > 1:
+            return action
+        _, space = spaces_of(self.pool[0])
+        return action + int(getattr(space, "start", 0))
 
     def _episode_seed(self, row: int) -> int:
         """Return the seed of a row's present episode, in [0, 2**31)."""
-        return int(np.random.SeedSequence((self.seed, row, int(self._episode[row]))).generate_state(1)[0] >> 1)
+        sequence = np.random.SeedSequence((self.seed, row, int(self._episode[row])))
+        return int(sequence.generate_state(1)[0] >> 1)
 
     def _set_seed(self, seed: int | None) -> None:
         """Begin the episodes of another seed with the next reset."""
@@ -264,7 +268,10 @@ def _action_spec(space: Any, num_rows: int) -> Any:
 
 def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:
     """Return the rule that tasks can be rows of one environment."""
-    kinds = {(spaces_of(task)[0].dtype, task.observation_shape, str(spaces_of(task)[1])): task.id for task in pool}
+    kinds = {}
+    for task in pool:
+        observed, acted = spaces_of(task)
+        kinds[observed.dtype, task.observation_shape, str(acted)] = task.id
     shown = ", ".join(f"{dtype} {list(shape)} with actions {actions}" for dtype, shape, actions in kinds)
     return len(kinds) == 1, f"tasks of one environment must have observations and actions of one form, got {shown}"
 
