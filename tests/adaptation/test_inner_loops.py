@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers.kill_runs import equal
 from helpers.scripted import ONE, TWO
-from helpers.small_agents import ADAPTING, GREEDY, SAMPLED, saved_and_loaded
+from helpers.small_agents import ADAPTING, GREEDY, SAMPLED, others_slow, saved_and_loaded
 from torch import nn
 from torch.func import hessian
 from torchrl.envs.utils import set_exploration_type
@@ -50,6 +50,7 @@ SETTINGS = {
 MAKE = {"maml": partial(MAML, **SETTINGS), "cavia": partial(CAVIA, num_context=3, **SETTINGS)}
 
 each = pytest.mark.parametrize("name", MAKE)
+cavia_always = pytest.mark.parametrize("name", others_slow(MAKE, "cavia"))
 
 
 def made(name: str, **changes):
@@ -316,7 +317,7 @@ def test_without_a_better_step_weights_stay():
 
 
 @pytest.mark.parametrize("outer", ["trpo", "ppo"])
-@each
+@cavia_always
 def test_learning_changes_every_weight_and_leaves_the_batch_as_it_was(name, outer):
     agent = made(name, outer=outer)
     batch = played(agent, steps=40)
@@ -330,7 +331,7 @@ def test_learning_changes_every_weight_and_leaves_the_batch_as_it_was(name, oute
     assert all(type(value) is float for value in measured.values())
 
 
-@each
+@cavia_always
 def test_a_loss_that_is_not_a_number_stops_learning_and_is_named(name):
     agent = made(name)
     batch = played(agent, steps=40)
@@ -393,7 +394,7 @@ def test_a_policy_reads_and_writes_its_state_and_nothing_else(name):
     assert set(written.keys(True, True)) - set(data.keys(True, True)) == {"action"} | state
 
 
-@each
+@cavia_always
 def test_a_saved_agent_acts_the_same_after_loading(name):
     agent, other = made(name), new_agent(CURRICULUM, MAKE[name], 1)
     agent.learn(played(agent, steps=40))
@@ -406,7 +407,7 @@ def test_a_saved_agent_acts_the_same_after_loading(name):
 
 
 @pytest.mark.parametrize("outer", ["trpo", pytest.param("ppo", marks=pytest.mark.slow)])
-@each
+@cavia_always
 def test_a_run_resumes_as_if_it_had_not_stopped(name, outer, tmp_path):
     states, ended = [], []
 
