@@ -138,7 +138,7 @@ def test_seeds_that_solve_the_hardest_graphs_are_counted_from_the_raw_results(un
     poor, others = ([rival for rival in ran if (number(of[rival]) <= 1) == few] for few in (True, False))
     verdict = f"| {decisions} decisions, first rewards {rewards} | {', '.join(poor)} | {', '.join(others) or 'none'} |"
     assert verdict in table
-    part = PAGE.split("### p = 0.9" + (" |" if given else ", first rewards to be found |"))[1].split("###")[0]
+    part = PAGE.split("**p = 0.9" + ("**" if given else ", first rewards to be found**"))[1].split("**p = ")[0]
     for name, lines in of.items():
         means = (sum(float(line[key]) for line in lines) / 5 for key in ("greedy_return", "training_return"))
         shown = f"{number(lines)} ({at_any_evaluation(lines)}); " + "; ".join(f"{mean:.2f}" for mean in means)
@@ -226,7 +226,7 @@ def test_the_share_of_frames_whose_episode_a_batch_cuts_off_is_that_of_simulated
 
 def test_totals_over_all_graphs_are_counted_from_the_raw_results(names):
     table = PAGE.split("## All graphs")[1].split("## The published claim")[0]
-    after = PAGE.split("**What is lost.** ")[1].split("## Long episodes")[0]
+    after = PAGE.split("**What is lost.** ")[1].split("</details>")[0]
     lines = read("memory_cells", "guide_frames", "read_noise", "agent")
     given = {names[key[-1]]: of for key, of in lines.items() if key[:-1] == ("204800", "0")}
     paired = {
