@@ -128,7 +128,7 @@ def goal_search(num_frames: int = 409_600, depth: int = 2, num_image_sets: int =
         held_out=(*other_goals, *other_images),
         adapt_episodes=2**depth,
     )
-    return sequence("goal_search", [trained], num_frames, 1, "ctgraph_rl", evaluation=evaluation)
+    return sequence("goal_search", [trained], num_frames, 1, f"ctgraph_rl, after {NM}", evaluation=evaluation)
 
 
 def _longest_episode(depth: int) -> int:

@@ -101,7 +101,7 @@ def test_a_cell_of_a_markdown_table_is_one_cell(name, other):
 
 
 KNOWN_TO_LATEX = re.compile(
-    r"\\[&%$#_{}]|\\text(backslash|asciitilde|asciicircum|less|greater|bar|quotedbl)\{\}|\{\[\}|\{\*\}"
+    r"\\[&%$#_{}]|\\text(backslash|asciitilde|asciicircum|less|greater|bar|quotedbl)\{\}|\{\[\}|\{\*\}|\$\\pm\$"
 )
 
 

@@ -11,6 +11,7 @@ from yaml_settings import ALONE, CONF, escaped, settings_of, table
 
 import curricula
 from baselines.parts.catalogue import catalogue
+from baselines.parts.inner_loop import InnerLoop
 from ctgraph_rl import Curriculum, Task
 from ctgraph_rl.describe import Sheet, describe, to_markdown
 from ctgraph_rl.tasks.task import are_graphs
@@ -146,7 +147,9 @@ def _of_memory(tasks: tuple[Task, ...]) -> str:
 
 @cache
 def _agents(memory: bool) -> str:
-    return ", ".join(f"[`{e.name}`](../agents/{e.name}.md)" for e in catalogue("agent") if e.kind.memory == memory)
+    """Names of agents that remember an episode, or that do not: an inner loop remembers earlier episodes only."""
+    names = [e.name for e in catalogue("agent") if (e.kind.memory and not issubclass(e.kind, InnerLoop)) == memory]
+    return ", ".join(f"[`{name}`](../agents/{name}.md)" for name in names)
 
 
 def _conflicts(tasks: tuple[Task, ...]) -> bool:

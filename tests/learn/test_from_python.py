@@ -82,8 +82,8 @@ def test_what_is_not_given_is_what_the_yaml_files_say():
     [
         ("pppo", {}, "unknown agent 'pppo': did you mean 'ppo'?"),
         ("PPO", {}, "unknown agent 'PPO': did you mean 'ppo'?"),
-        ("planner", {}, "unknown agent 'planner': choices: a2c, dqn, "),
-        (3, {}, "unknown agent 3: choices: a2c, dqn, "),
+        ("planner", {}, "unknown agent 'planner': choices: a2c, cavia, dqn, "),
+        (3, {}, "unknown agent 3: choices: a2c, cavia, dqn, "),
         ("ppo", {"lr": 0.1}, "agent has no lr: did you mean 'learning_rate'?"),
         ("ppo", {"method": "emc"}, "unknown method 'emc': did you mean 'ewc'?"),
         ("ppo", {"method": "ewc", "method_settings": {"Coef": 1}}, "method has no Coef: did you mean 'coeff'?"),
