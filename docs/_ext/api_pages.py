@@ -80,6 +80,7 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "ctgraph_rl.metrics.optimum",
             "ctgraph_rl.metrics.regimes",
             "ctgraph_rl.metrics.labels",
+            "ctgraph_rl.metrics.adaptation",
         ),
     ),
     "figures": (
@@ -123,6 +124,8 @@ PAGES: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "baselines.parts.recurrent_q",
             "baselines.rl2:TrialTrunk,episodes_to_goal",
             "baselines.parts.networks",
+            "baselines.parts.inner_loop:InnerModel,Episodes,Played",
+            "baselines.parts.gates:GatedNetwork",
             "baselines.update.optimiser",
             "baselines.update.update:UpdateState,update",
             "baselines.parts.embedding",

@@ -476,4 +476,5 @@ def test_at_depth_1_more_goals_are_reached_than_without_adaptation(name):
 
     log = learn_curriculum(curriculum, agent)
 
-    assert log.training("return_after")[-15:].mean() > 0.7  # no policy that does not adapt has more than 0.5
+    # no policy that does not adapt has more than 0.5; the mean is over 15 x 80 episodes: its deviation is at most 0.015
+    assert log.training("return_after")[-15:].mean() > 0.55

@@ -261,7 +261,8 @@ const wide = document.documentElement.scrollWidth <= window.innerWidth;
 document.getElementById("ct-simulate").click();
 const lines = [
   { kind: "run", curriculum: "mine" },
-  { kind: "evaluation", block: 0, frames: 0, task: 1, return_mean: 0.5, success_rate: 0.5, end_rate: 1 },
+  { kind: "evaluation", block: 0, frames: 0, task: 1, label: "goal1.2",
+    return_mean: 0.5, success_rate: 0.5, end_rate: 0.8 },
 ];
 const file = new File(lines.map((line) => JSON.stringify(line) + "\\n"), "run.jsonl");
 showLog(file).then(() => setTimeout(() => {
@@ -270,6 +271,10 @@ showLog(file).then(() => setTimeout(() => {
   const cells = document.querySelectorAll("#ct-matrix td, #ct-matrix [scope=row]");
   answer.cells = [...cells].map((cell) => cell.textContent);
   answer.measured = text("measured");
+  document.querySelector("#ct-matrix button").click();
+  const fills = [...document.querySelectorAll("#ct-visits circle")].slice(-4);
+  answer.visits = fills.map((mark) => [mark.style.fillOpacity, mark.classList.contains("goal")]);
+  answer.ends = text("ends");
   document.body.dataset.found = JSON.stringify(answer);
 }, 1000));
 </script>"""
@@ -308,4 +313,6 @@ def test_a_browser_plays_to_the_goal_by_keys_from_a_file_opened_by_hand(tmp_path
     assert found["log"].startswith(
         "run.jsonl: mine. Mean return on each task after each block, and where episodes ended;"
     )
-    assert found["cells"] == ["0", "0", "0.5goal 50 %,\nother ends 50 %,\nfail 0 %"]
+    assert found["cells"] == ["0", "0", "0.5goal 50 %,\nother ends 30 %,\nfail 20 %tree"]
+    assert found["visits"] == [["0.2", False], ["1", True], ["0.2", False], ["0.2", False]]
+    assert found["ends"].startswith("goal1.2 after 0 frames: goal 50 %, other ends 30 %, fail 20 %. End states are")

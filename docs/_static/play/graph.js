@@ -184,7 +184,21 @@ function interval(hits, count) {
   return [Math.max(0, middle - half), Math.min(1, middle + half)];
 }
 
-// Where the episodes of an evaluation ended, in words; a log has no visits of single states.
+// The goal in the label of a task, "12" for "depth2, goal1.2"; empty without one.
+function goalIn(label) {
+  const found = /goal((?:\d\.)*\d)(?![\d.])/.exec(label);
+  return found ? found[1].replaceAll(".", "") : "";
+}
+
+// The share of episodes that ended in each end state of a tree: at the goal as a log says, else in equal parts.
+function visitsOf({ success_rate: goal, end_rate: end }, tree) {
+  const count = tree.b ** tree.d;
+  const visits = new Float64Array(count).fill((end - goal) / (count - 1));
+  visits[leafOf(tree)] = goal;
+  return visits;
+}
+
+// Where the episodes of an evaluation ended, in words.
 function endsOf({ success_rate: goal, end_rate: end }) {
   if (typeof goal !== "number" || typeof end !== "number") return "";
   const percent = (share) => `${Math.round(100 * share)} %`;
@@ -206,8 +220,9 @@ function performanceMatrix(text) {
   if (!own.length) throw new Error("This log has no evaluation yet.");
   const tasks = [...new Set(own.map((m) => m.task))].sort((a, b) => a - b), rows = [];
   for (const m of own) {
-    const row = rows.find((each) => each.block === m.block) || rows[rows.push({ block: m.block, frames: m.frames, returns: {}, ends: {} }) - 1];
+    const row = rows.find((each) => each.block === m.block) || rows[rows.push({ block: m.block, frames: m.frames, returns: {}, ends: {}, measured: {} }) - 1];
     row.returns[m.task] = m.return_mean;
+    row.measured[m.task] = m;
     row.ends[m.task] = endsOf(m);
   }
   const labels = tasks.map((task) => String((own.find((m) => m.task === task) || {}).label || `task ${task}`));

@@ -100,23 +100,10 @@ function drawTree() {
   let levels = d;
   while (b ** levels > MOST_DRAWN) levels--;
   const svg = at("tree"), here = Number(rows.node[0]), kind = KINDS[rows.kind[0]];
-  svg.replaceChildren();
-  svg.setAttribute("viewBox", `0 0 400 ${60 + 50 * levels}`);
-  const place = (level, number) => [400 * (number + 0.5) / b ** level, 40 + 50 * level];
-  const onGoal = (level, number) => number === Math.floor(leafOf(task) / b ** (d - level));
-  for (let level = 0; level <= levels; level++)
-    for (let number = 0; number < b ** level; number++) {
-      const [x, y] = place(level, number), node = firstNode(b, level) + number;
-      if (level) {
-        const [x2, y2] = place(level - 1, Math.floor(number / b));
-        const line = element("line", { x1: x, y1: y, x2, y2 }, svg);
-        if (reveal && onGoal(level, number)) line.classList.add("goal");
-      }
-      const mark = element("circle", { cx: x, cy: y, r: level === d ? 5 : 7 }, svg);
-      if (level === d && run && run.ends) mark.style.fillOpacity = Math.min(1, run.visits[number] * b ** d / run.ends / 2);
-      if (level === d && reveal && onGoal(level, number)) mark.classList.add("goal");
-      if (node === here && kind !== "home" && kind !== "fail") mark.classList.add("here");
-    }
+  const share = (number) => run.visits[number] / run.ends;
+  drawNodes(svg, task, levels, reveal, run && run.ends ? share : null, (mark, node) => {
+    if (node === here && kind !== "home" && kind !== "fail") mark.classList.add("here");
+  });
   for (const [name, x] of [["home", 150], ["fail", 250]]) {
     const mark = element("text", { x, y: 16, "text-anchor": "middle" }, svg);
     mark.textContent = name;
@@ -124,6 +111,39 @@ function drawTree() {
   }
   svg.setAttribute("aria-label", `The tree of ${grouped(b ** d)} end states. You are at ${placed(kind, here)}.`);
   say("depth", levels < d ? `The picture ends at level ${levels} of ${d}.` : "");
+}
+
+// Draw a tree to a level; end states are fuller where `share` is above that of equal parts.
+function drawNodes(svg, { b, d, goal }, levels, reveal, share, look) {
+  svg.replaceChildren();
+  svg.setAttribute("viewBox", `0 0 400 ${60 + 50 * levels}`);
+  const place = (level, number) => [400 * (number + 0.5) / b ** level, 40 + 50 * level];
+  const onGoal = (level, number) => number === Math.floor(leafOf({ b, d, goal }) / b ** (d - level));
+  for (let level = 0; level <= levels; level++)
+    for (let number = 0; number < b ** level; number++) {
+      const [x, y] = place(level, number);
+      if (level) {
+        const [x2, y2] = place(level - 1, Math.floor(number / b));
+        const line = element("line", { x1: x, y1: y, x2, y2 }, svg);
+        if (reveal && onGoal(level, number)) line.classList.add("goal");
+      }
+      const mark = element("circle", { cx: x, cy: y, r: level === d ? 5 : 7 }, svg);
+      if (level === d && share) mark.style.fillOpacity = Math.min(1, share(number) * b ** d / 2);
+      if (level === d && reveal && onGoal(level, number)) mark.classList.add("goal");
+      look(mark, firstNode(b, level) + number);
+    }
+}
+
+// Draw where the episodes of an evaluation of a log ended.
+function showVisits(measured, tree, words) {
+  const visits = visitsOf(measured, tree);
+  const picture = at("visits");
+  picture.removeAttribute("hidden");
+  drawNodes(picture, tree, tree.d, true, (number) => visits[number], () => {});
+  const others = "other end states have equal parts of what did not";
+  picture.setAttribute("aria-label", `The tree of ${grouped(visits.length)} end states. ${words}`);
+  say("ends", `${words} End states are fuller where episodes ended more often; a log counts those at the goal, and ${others}.`);
+  picture.scrollIntoView({ block: "nearest" });
 }
 
 function showNumbers() {
@@ -189,6 +209,8 @@ function toggle() {
 async function showLog(file) {
   const table = at("matrix");
   table.replaceChildren();
+  at("visits").setAttribute("hidden", "");
+  say("ends", "");
   try {
     const { name, tasks, labels, rows: blocks } = performanceMatrix(await file.text());
     say("log", `${file.name}: ${name}. Mean return on each task after each block, and where episodes ended; nothing left this browser.`);
@@ -199,14 +221,24 @@ async function showLog(file) {
     };
     const header = table.insertRow();
     for (const label of ["block", "frames", ...labels]) cell(header, label, "th").scope = "col";
-    for (const { block, frames, returns, ends } of blocks) {
+    const goals = labels.map(goalIn);
+    const b = Math.max(2, ...goals.join(""));
+    for (const { block, frames, returns, ends, measured } of blocks) {
       const row = table.insertRow();
       cell(row, block, "th").scope = "row";
       cell(row, grouped(frames));
-      for (const task of tasks) {
+      for (const [place, task] of tasks.entries()) {
         const made = cell(row, returns[task] ?? "not measured");
+        const goal = goals[place];
         made.style.setProperty("--share", Math.max(0, Math.min(1, returns[task] || 0)));
         if (ends[task]) made.appendChild(document.createElement("small")).textContent = ends[task];
+        if (!ends[task] || !goal || b ** goal.length > MOST_DRAWN) continue;
+        const tree = made.appendChild(document.createElement("button"));
+        tree.type = "button";
+        tree.textContent = "tree";
+        const words = `${labels[place]} after ${grouped(frames)} frames: ${ends[task].replaceAll("\n", " ")}.`;
+        tree.setAttribute("aria-label", `tree of ${words}`);
+        tree.addEventListener("click", () => showVisits(measured[task], { b, d: goal.length, goal }, words));
       }
     }
   } catch (error) {
