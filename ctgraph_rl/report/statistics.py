@@ -204,8 +204,9 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
         method="percentile",
         random_state=np.random.default_rng(seed),
     )
-    low, high = found.confidence_interval
-    return Estimate(value, low=float(low), high=float(high), n=n, n_undefined=undefined, method=method)
+    low, high = map(float, found.confidence_interval)
+    reason = "the bootstrap samples are equal: no spread to estimate" if low == high else None
+    return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method, reason=reason)
 
 
 @takes_numbers

@@ -282,6 +282,7 @@ def test_the_interval_of_the_iqm_draws_the_seeds_of_each_task_anew():
     assert (estimate.n, estimate.method) == (5, "IQM, percentiles of a stratified bootstrap 95%")
     constant = iqm([[0.0] * 4, [0.5] * 4, [1.0] * 4])
     assert (constant.low, constant.value, constant.high) == (0.5, 0.5, 0.5)
+    assert constant.reason == "the bootstrap samples are equal: no spread to estimate" and estimate.reason is None
 
 
 def test_one_seed_and_none_have_no_interval_of_the_iqm():
