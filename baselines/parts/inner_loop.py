@@ -57,7 +57,7 @@ NetInputs = tuple[Tensor, ...]
 class Played(NamedTuple):
     """Steps of trials, padded to one length."""
 
-    seen: NetInputs  # what the network reads, [trials, steps, ...] each
+    seen: tuple[Tensor, ...]  # what the network reads, [trials, steps, ...] each
     action: Tensor  # int64 [trials, steps]
     reward: Tensor  # [trials, steps]
     number: Tensor  # of the step's episode, from 1; 0 where padded, int64 [trials, steps]
