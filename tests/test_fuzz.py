@@ -72,6 +72,13 @@ NOT_OURS = (
 BASE = ct_su_b1((1, 2))
 SMALL_CURRICULUM = Curriculum("fuzz", 1, "a test", (Block(BASE, 32), Block(ct_su_b1((2, 1)), 32)), Evaluation(2))
 
+ONE_BLOCK = replace(
+    SMALL_CURRICULUM,
+    blocks=(Block((BASE, ct_su_b1((2, 1))), 64),),
+    evaluation=Evaluation(4, episodes_per_row=2, adapt_episodes=2),
+)
+"""A distribution of tasks, and episodes to adapt in."""
+
 VALUES: list[Any] = [
     *(None, True, False, -1, 0, 1, 2, 3, 7, 2**31, 2**60, 2**63, 2**70, -(2**70), 10**400),
     *(0.0, 0.5, -0.5, 1.0, 1.5, 1e-30, 1e-300, 1e300, math.nan, math.inf, -math.inf),
@@ -128,7 +135,7 @@ def tiny(name: str) -> dict[str, Any]:
     """The settings of an agent's yaml, made small."""
     settings = dict(next(entry for entry in entries("agent") if entry.name == name).settings)
     small = {"num_envs": 2, "num_steps": 8, "hidden_size": 4, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
-    small |= {"num_epochs": 1, "num_updates": 1, "compile": False}
+    small |= {"num_epochs": 1, "num_updates": 1, "compile": False, "adapt_episodes": 2}
     return settings | {key: value for key, value in small.items() if key in settings}
 
 
@@ -141,7 +148,8 @@ def agents() -> Iterator[tuple[str, Any]]:
     for entry in entries("agent"):
 
         def make(name: str = entry.name, **settings: Any) -> object:
-            return new_agent(SMALL_CURRICULUM, built("agent", name, **settings), 0)
+            curriculum = ONE_BLOCK if name in ("cavia", "maml") else SMALL_CURRICULUM
+            return new_agent(curriculum, built("agent", name, **settings), 0)
 
         yield entry.name, (make, tiny(entry.name))
 

@@ -36,7 +36,7 @@ from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, draw, guided, highest, num_actions_of, require_weights
 from baselines.update.optimiser import make_optimiser
 from baselines.update.trust_region import trust_region_step
-from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
+from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 
 OUTER = ("trpo", "ppo")
@@ -285,21 +285,23 @@ class InnerLoop(Learner):
         num_context: int = 0,
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
-        short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
         require(
             *at_least_one(hidden_size=hidden_size, num_layers=num_layers, gate_size=gate_size, num_epochs=num_epochs),
             *at_least_one(adapt_episodes=adapt_episodes),
-            (num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"),
             *positive(inner_rate=inner_rate, max_kl=max_kl, learning_rate=learning_rate, clip_epsilon=clip_epsilon),
             *fraction(gamma=gamma),
             *one_of(GATES, gate=gate),
             *one_of(OUTER, outer=outer),
         )
+        short = f"num_steps must be at least the 2 * adapt_episodes={2 * adapt_episodes} episodes of a trial"
+        require((num_steps >= 2 * adapt_episodes, f"{short}, got {num_steps}"))
         self.adapt_episodes, self.trial_episodes = adapt_episodes, 2 * adapt_episodes
         self.num_context = num_context
         self.outer, self.max_kl, self.clip_epsilon, self.num_epochs = outer, max_kl, clip_epsilon, num_epochs
         num_actions = num_actions_of(action_spec)
         require_weights(observation_spec, hidden_size, num_layers, num_actions)
+        parts = f"weights of num_context={num_context} and gate_size={gate_size}"
+        require_memory(parts, 16 * hidden_size * (num_context + 2 * num_layers * gate_size), "or smaller ones")
         shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
         self.specs = {key: observation_spec[key] for key in shown}
         shape, *others = (spec.shape for spec in self.specs.values())

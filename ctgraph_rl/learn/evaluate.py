@@ -103,7 +103,10 @@ def _built_on(env: EnvBase, policy: type) -> Policy:
     """Return a policy whose class is built on the environment that it acts in."""
     known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
     require((known, f"{policy.__name__} plays CT-graphs alone: it knows their hidden state; give a policy of your own"))
-    return policy(env)
+    try:
+        return policy(env)
+    except TypeError as error:
+        raise ValueError(f"policy must be a class that is built on an environment, got {policy!r}: {error}") from error
 
 
 def num_actions(env: EnvBase) -> int | None:

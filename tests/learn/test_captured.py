@@ -123,7 +123,7 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
 
 @pytest.mark.parametrize(
     ("name", "cell"),
-    others_slow([("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("+cell=gru",))], ("a2c", ())),
+    others_slow([("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("cell=gru",))], ("a2c", ())),
 )
 def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(name, cell, compose, captured, swapped, request):
     env = CTGraphEnv([confounding(p=0.3)] * 48, kernel="off")

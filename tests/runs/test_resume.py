@@ -173,7 +173,7 @@ def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
         for place, name in enumerate(AGENTS)
         for number, kind in enumerate(CURRICULA)
         if name == "a2c" or kind == "announced" or (place + number) % 5 == 0
-        if (name, kind) != ("rl2", "gymnasium")  # it needs CT-graphs
+        if not (name == "rl2" and kind.startswith("gymnasium"))  # it needs CT-graphs
     ],
 )
 def test_one_agent_in_every_kind_of_curriculum_and_every_agent_in_some_go_on_as_if_never_stopped(learner, name, kind):
