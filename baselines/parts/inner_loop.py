@@ -106,7 +106,7 @@ class Played(NamedTuple):
 class Episodes(NamedTuple):
     """What a loss reads of the steps of a trial, or of several."""
 
-    seen: NetInputs
+    seen: tuple[Tensor, ...]
     action: Tensor
     advantage: Tensor
     weight: Tensor
