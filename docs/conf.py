@@ -61,4 +61,4 @@ def without_aliases(app: Any, what: str, name: str, obj: Any, options: Any, line
 
 def setup(app: Any) -> None:
     """Connect what this file adds to Sphinx."""
-    app.connect("autodoc-process-docstring", without_aliases)
+    app.connect("autodoc-process-docstring", without_aliases, priority=300)  # before a handler that adds a line
