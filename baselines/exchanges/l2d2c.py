@@ -29,7 +29,7 @@ class L2D2C(MaskExchange):
     """
 
     def takes(self, method: Masks) -> bool:
-        """Return whether the mask of a task is made only of its own scores."""
+        """Return whether the mask of a task uses only the scores of that task."""
         return not isinstance(method, CombinedMasks)
 
     def connect(self, agents: Sequence[Agent]) -> None:

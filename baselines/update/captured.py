@@ -38,7 +38,7 @@ def why_not_captured(agent: Agent) -> str | None:
     if not isinstance(agent, PolicyGradient) or not agent.capturable:
         return f"{name} cannot be vectorised over seeds on a GPU"
     if any(getattr(type(agent), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
-        return f"{name} learns in a way of its own"
+        return f"{name} does not learn by the steps that a batch of seeds shares"
     if not has_parts(agent.optimiser):
         return f"{type(agent.optimiser).__name__} with these settings cannot be vectorised over seeds"
     return None

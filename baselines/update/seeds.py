@@ -40,7 +40,7 @@ def why_not_together(agent: Agent) -> str | None:
     if not isinstance(learner, Learner) or not learner.stackable or learner.memory:
         return f"{name} cannot be vectorised over seeds"
     if type(learner).learn is not Learner.learn or type(learner).gradient_step is not Learner.gradient_step:
-        return f"{name} learns in a way of its own"
+        return f"{name} does not learn by the steps that a batch of seeds shares"
     if not learner.method.stackable:
         return f"{type(learner.method).__name__} cannot be vectorised over seeds"
     if not has_parts(learner.optimiser):

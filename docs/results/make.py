@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     submitting.set_defaults(run=_submit)
 
     measuring = commands.add_parser("gpu", help="measure a GPU for four minutes, into gpu.json and its page")
-    measuring.add_argument("--minutes", type=float, default=4.0, help="of a call; the next one goes on")
+    measuring.add_argument("--minutes", type=float, default=4.0, help="limit of a call; the next call continues")
     measuring.add_argument("--commit", default="", help="what is measured, where the checkout has no .git")
     measuring.add_argument("--seconds", type=float, default=1.0, help="least time of a measurement")
     measuring.add_argument("--rows", type=int, nargs="+", default=[65536, 262144], help="of the environment")

@@ -257,7 +257,7 @@ def test_what_cannot_be_captured_for_all_seeds_says_why(compose):
 
     assert reason("dqn") == "DQN cannot be vectorised over seeds on a GPU"
     assert reason("ppo", "ewc") == "EWC cannot be vectorised over seeds on a GPU"
-    assert reason("ppo_count") == "PPOCount learns in a way of its own"
+    assert reason("ppo_count") == "PPOCount does not learn by the steps that a batch of seeds shares"
     assert reason("ppo", amsgrad=True) == "Adam with these settings cannot be vectorised over seeds"
     assert reason("lstm_ppo") is None
 
