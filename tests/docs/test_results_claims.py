@@ -20,6 +20,7 @@ def words(path: str) -> str:
 
 TOGETHER = (CHECKOUT / "docs/how-to/seeds_together.md").read_text(encoding="utf-8")
 RESULTS, LIFELONG, README = words("docs/results/baselines.md"), words("docs/results/lifelong.md"), words("README.md")
+HOW_MADE = words("docs/results/how_made.md")
 
 
 @pytest.fixture(scope="module")
@@ -270,13 +271,13 @@ def test_cells_of_all_tables_were_run_again_and_only_those_of_the_earlier_revisi
     ):
         in_part = [int(line["numbers"]) // tasks - 1 for line in again if line["table"] == table]  # evaluations of 20
         assert (len(in_part), min(in_part), max(in_part)) == (count, least * 20, most * 20)
-    assert "ten seeds of two or three methods each in groups as before" in RESULTS
-    assert "a run's first block, or, of these groups, the first 30 to 100 % of it" in RESULTS
+    assert "ten seeds of two or three methods each in groups as before" in HOW_MADE
+    assert "a run's first block, or, of these groups, the first 30 to 100 % of it" in HOW_MADE
     other_greedy = [(line["depth"], line["seed"]) for line in changed if line["equal"] not in "24"]
     assert other_greedy == [("4", "2")]
     assert [line["equal"] for line in changed if (line["depth"], line["seed"]) == ("5", "1")] == ["2"], "the greedy two"
-    assert len(changed) == 20 and "20 of 20 were run again" in RESULTS
-    assert "but for seed 2 of depth 4, which had not learned and now has, and seed 1 of depth 5" in RESULTS
+    assert len(changed) == 20 and "20 of 20 were run again" in HOW_MADE
+    assert "but for seed 2 of depth 4, which had not learned and now has, and seed 1 of depth 5" in HOW_MADE
 
 
 def test_a_cell_that_was_run_again_takes_the_place_of_its_line(monkeypatch, tmp_path):
