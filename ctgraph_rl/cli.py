@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from ctgraph_rl import __version__
+from ctgraph_rl import __version__, parsers
 from ctgraph_rl.checks import nearest
 from ctgraph_rl.log.escape import terminal_lines
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
@@ -97,6 +97,9 @@ def _call() -> None:
         print(versions())
     elif word in COMMANDS:
         sys.argv = [f"ctgraph-rl {word}".removesuffix(" run"), *words[1:]]
+        parser = getattr(parsers, word, None)
+        if parser is not None:
+            parser().parse_args()  # --help and what it refuses need no torch
         _start(COMMANDS[word].module)
     elif word[:1].isalpha() and word.replace("-", "_").isidentifier():  # settings have a sign: seed=1, ~logger, -m
         print(f"error: {terminal_lines(_unknown(word))}", file=sys.stderr)

@@ -1,12 +1,7 @@
-"""Compares two runs: equal, equal up to rounding, or different, since when and in what.
-
-ctgraph-rl compare A B compares all measurements but their times, and the weights of the agents. The exit code is 0
-for equal runs, 1 for different ones, 3 for runs that are equal up to rounding, and 2 for what is no run.
-"""
+"""Compares two runs: equal, equal up to rounding, or different, since when and in what."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import is_real, positive, require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
@@ -21,10 +17,8 @@ from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import bits_of, content_of, read_plain
+from ctgraph_rl.parsers import BOUND
 from ctgraph_rl.runs.settings import ADDED, as_before, flat
-
-BOUND = 1e-4
-"""Largest difference that counts as rounding, as a share of the largest value that the field has in either run."""
 
 EQUAL, DIFFERENT, ROUNDING = 0, 1, 3
 """Exit codes."""
@@ -55,7 +49,7 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     Args:
         one: the first directory.
         other: the second.
-        bound: see `BOUND`.
+        bound: see `ctgraph_rl.parsers.BOUND`.
 
     Raises:
         ValueError: for a directory without a run, and a log or weights that cannot be read.
@@ -219,13 +213,7 @@ def _origins(one: LogLine, other: LogLine) -> list[str]:
 
 def main() -> None:
     """Compare two run directories."""
-    parser = argparse.ArgumentParser(prog="ctgraph-rl compare", description=__doc__)
-    parser.add_argument("one", type=Path, metavar="A", help="a run directory")
-    parser.add_argument("other", type=Path, metavar="B", help="another one")
-    within = (
-        "largest difference that counts as rounding, as a share of the field's largest value (default: %(default)g)"
-    )
-    parser.add_argument("--bound", type=float, default=BOUND, help=within)
+    parser = parsers.compare()
     arguments = parser.parse_args()
     with refused_by(parser):
         require(*positive(bound=arguments.bound))

@@ -14,8 +14,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 from ctgraph_rl.checks import require
 
 VARIABLES = {
@@ -54,7 +52,8 @@ def hold() -> None:
     check_portable()
     if _HELD:
         return
-    import torch  # here: a command asks before torch is imported
+    import numpy as np  # here: a command asks before these are imported
+    import torch  # here: as above
 
     torch.backends.mkldnn.set_flags(False)
     functions = torch.library.Library("aten", "IMPL")

@@ -9,6 +9,7 @@ import io
 import os
 import shlex
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
@@ -17,7 +18,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
@@ -25,8 +26,8 @@ from ctgraph_rl.log.escape import terminal_lines, terminal_text
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
-from ctgraph_rl.runs.config import check_one_cell, explain, in_sweep, of_hydra
-from ctgraph_rl.runs.settings import in_digits
+from ctgraph_rl.runs.config import check_one_cell, composed, explain, in_sweep, of_hydra
+from ctgraph_rl.runs.settings import in_digits, names_in
 from ctgraph_rl.runs.sweep import sweepable
 
 
@@ -84,6 +85,18 @@ class CellError(RuntimeError):
 
 ERRORS = (HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, FloatingPointError, CellError)
 """Errors that a user can cause, each answered with one message."""
+
+HELP = """ctgraph-rl run SETTING=VALUE ...: an agent learns a curriculum, and its transfer and forgetting are measured.
+
+Example: ctgraph-rl curriculum=su_b1_4tasks agent=dqn seed=1. A sweep: ctgraph-rl -m seed=0,1,2;
+in parallel with hydra/launcher=joblib or slurm. ctgraph-rl without settings lists the other commands.
+
+Choices, GROUP=NAME:
+{choices}
+
+Settings, KEY=VALUE; the yaml files of conf/ say what each means:
+{settings}
+--hydra-help shows the options that Hydra adds."""
 
 SEARCHERS = ("ax", "nevergrad", "optuna")
 """Sweepers of Hydra that search for what makes the value of a run best."""
@@ -145,7 +158,12 @@ def main() -> None:
     try:
         try:
             with quiet_where_nobody_reads():
-                sys.argv = ["ctgraph-rl", *sweepable(in_digits(options_first(arguments)))]
+                words = options_first(arguments)
+                given = get_args_parser().parse_args(words)
+                if given.help:
+                    print(settings_help(given))
+                    return
+                sys.argv = ["ctgraph-rl", *sweepable(in_digits(words))]
                 _job()
         except Restart:
             restart(environment, arguments)
@@ -158,6 +176,20 @@ def main() -> None:
     except KeyboardInterrupt:
         print("interrupted; the same command resumes from the last checkpoint", file=sys.stderr)
         sys.exit(130)
+
+
+def settings_help(given: Namespace) -> str:
+    """Return the choices and the settings of a run; Hydra's own help takes as long as the import of torch.
+
+    Args:
+        given: a command line as Hydra parses it.
+    """
+    own = None if given.config_dir is None else Path(given.config_dir)
+    folders = [folder for folder in (Path(conf_dir()), own) if folder is not None]
+    groups = sorted({path.parent.name for folder in folders for path in folder.glob("*/*.yaml")})
+    choices = [f"{group}: {', '.join(name for each in folders for name in names_in(each, group))}" for group in groups]
+    settings = OmegaConf.to_yaml(composed(given.overrides, own))
+    return HELP.format(choices="\n".join(choices), settings=settings)
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:

@@ -19,7 +19,7 @@ from ctgraph_rl import metrics
 from ctgraph_rl.core import rewards
 
 FLOORS = (
-    ("ctgraph_rl", "checks", "metrics"),
+    ("ctgraph_rl", "checks", "metrics", "parsers"),
     ("disk",),
     ("strict",),
     ("core", "portable"),

@@ -19,6 +19,7 @@ from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CURRICULUM
 from ctgraph_rl.log.run_log import RunLog
+from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
@@ -28,7 +29,7 @@ SEEDS = range(10**6, 2**31)
 """Seeds that a verifier draws from, of runs and of images, where no track says otherwise."""
 
 
-HELD_OUT = "held_out"
+HELD_OUT = LEVELS[2]
 
 
 def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:

@@ -30,11 +30,12 @@ from ctgraph_rl.log.provenance import machine, numbers_of, versions
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
+from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.portable import VARIABLES, cpu_model
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-RERUN = "rerun"
+RERUN = LEVELS[1]
 
 MODULE = "ctgraph_rl.board.relearn"
 

@@ -36,11 +36,12 @@ from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
+from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.runs.read import MODIFIED
 from ctgraph_rl.runs.settings import differences
 from ctgraph_rl.strict import named, parquet_rows
 
-RESCORED = "rescored"
+RESCORED = LEVELS[0]
 
 MEASURES = ("average_performance", "forgetting")
 """Metrics that each table of a board shows beside the score of its track."""

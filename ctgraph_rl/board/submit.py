@@ -1,11 +1,7 @@
-"""ctgraph-rl submit RUNS --to DIR makes a submission of finished runs: a folder of files that anybody can check.
-
-ctgraph-rl submit --template > method.yaml prints what an author says about a method, to fill in once.
-"""
+"""The command ``ctgraph-rl submit``: finished runs become a folder of files that anybody can check."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from ctgraph_rl import parsers
 from ctgraph_rl.board import submission as files
 from ctgraph_rl.board.method import TEMPLATE, WRITTEN, completed, fact_rules, facts_of, read_method
 from ctgraph_rl.board.rescore import metrics_text, near, rescore
@@ -244,16 +241,7 @@ def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> tuple[bool, st
 
 def main() -> None:
     """Make a submission, or print a ``method.yaml`` to fill in."""
-    parser = argparse.ArgumentParser(prog="ctgraph-rl submit", description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="*", help="run directories, or folders that hold them")
-    parser.add_argument("--to", type=Path, metavar="DIR", help="the folder to make")
-    about = "what you say about the method (default: %(default)s)"
-    parser.add_argument("--method", type=Path, default=Path("method.yaml"), metavar="FILE", help=about)
-    parser.add_argument("--track", metavar="NAME", help="the track; default: as the file says")
-    only = "leave out runs with another value, such as --only curriculum.depth=4"
-    parser.add_argument("--only", metavar="SETTING=VALUE", nargs="+", type=_setting, default=[], help=only)
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where a track of your own is, track/NAME.yaml")
-    parser.add_argument("--template", action="store_true", help="print a method.yaml to fill in, and do nothing else")
+    parser = parsers.submit()
     arguments = parser.parse_args()
     if arguments.template:
         print(TEMPLATE, end="")
@@ -267,14 +255,6 @@ def main() -> None:
         of_track = None if name is None else track(name, arguments.config_dir)
         made = submit(arguments.runs, arguments.to, method, of_track, dict(arguments.only))
     print(summary(made))
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    """Return a setting of the command line with its value."""
-    key, sign, value = text.partition("=")
-    if not (key and sign):
-        raise argparse.ArgumentTypeError(f"settings are written as in curriculum.depth=4, got {text!r}")
-    return key, yaml.safe_load(value)
 
 
 def summary(made: Submission) -> str:

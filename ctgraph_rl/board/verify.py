@@ -22,6 +22,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
+from ctgraph_rl import parsers
 from ctgraph_rl.board.held_out import HELD_OUT, held_out_cells, held_out_checks
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, isolation
 from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again, result_of, verified, why_other_bits
@@ -36,9 +37,8 @@ from ctgraph_rl.log.provenance import machine, versions
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.packages import check_packages
+from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model
-
-LEVELS = (RESCORED, RERUN, HELD_OUT)
 
 NONE = "none"
 """The level of a submission that fails the first."""
@@ -46,8 +46,8 @@ NONE = "none"
 SCHEMA = 1
 """Of ``verification.json``."""
 
-LEAST_SECONDS, TIMES = 600, 5
-"""Time limit of a process: so many times what the submitted run took, and so much at least."""
+LEAST_SECONDS = 600
+"""The time limit of a process is at least this."""
 
 MOST_HOURS, LEAST_GB, MOST_GB = 10**5, 0.001, 10**6
 """What the limits of a process may be."""
@@ -79,14 +79,14 @@ class Means(NamedTuple):
     """With what a verification runs the code of others."""
 
     isolation: Isolation
-    hours: float | None  # None: `TIMES` what the submitted runs took
+    hours: float | None  # None: `LIMIT_TIMES` what the submitted runs took
     memory: float  # GB
     disk: float  # GB
     paths: tuple[Path, ...]  # folders with code
 
     def limits(self, cell: RerunCell) -> Limits:
         """Return the limits of a process."""
-        usual = max(LEAST_SECONDS, math.ceil(min(TIMES * cell.seconds, MOST_HOURS * 3600)))
+        usual = max(LEAST_SECONDS, math.ceil(min(LIMIT_TIMES * cell.seconds, MOST_HOURS * 3600)))
         seconds = usual if self.hours is None else self.hours * 3600
         return Limits(seconds, round(self.memory * GB), round(self.disk * GB))
 
@@ -346,33 +346,6 @@ def _ended_by_signals(message: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    made = argparse.ArgumentParser(prog="ctgraph-rl verify", description=__doc__)
-    made.add_argument("submission", type=Path, metavar="DIR", help="the folder of a submission")
-    made.add_argument("--level", choices=LEVELS, default=RERUN, help="how far to verify (default: %(default)s)")
-    made.add_argument("--cells", type=int, default=2, metavar="N", help="runs of each level (default: %(default)s)")
-    drawn = "draws the runs and the held-out seeds, in 0..2^63-1 (default: a random one, which is printed)"
-    made.add_argument("--number", type=int, help=drawn)
-    made.add_argument("--code", type=Path, metavar="DIR", help="folder of modules that are not installed")
-    made.add_argument(
-        "--hours", type=float, help=f"time limit of a process (default: {TIMES} times the submitted run's)"
-    )
-    made.add_argument(
-        "--memory", type=float, default=8.0, metavar="GB", help="memory limit of a process (default: %(default)g)"
-    )
-    made.add_argument(
-        "--disk", type=float, default=4.0, metavar="GB", help="disk limit of a process (default: %(default)g)"
-    )
-    made.add_argument("--yes", action="store_true", help="skip the prompt despite incomplete isolation")
-    made.add_argument("--not-isolated", action="store_true", help="run without bubblewrap")
-    made.add_argument(
-        "--folder", type=Path, default=Path("verify"), metavar="DIR", help="folder of the reruns (default: %(default)s)"
-    )
-    made.add_argument("--config-dir", type=Path, metavar="DIR", help="folder with your own track, track/NAME.yaml")
-    return made
-
-
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse values out of range."""
     number = arguments.number
@@ -395,7 +368,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """Verify a submission; the exit code is 1 unless it reaches the level that was asked for."""
-    made = parser()
+    made = parsers.verify()
     arguments = made.parse_args()
     with refused_by(made):
         _check(arguments)

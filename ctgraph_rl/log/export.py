@@ -1,21 +1,19 @@
 """A run in another program's format.
 
---format parquet writes the tidy tables of a run as Parquet and CSV, see ctgraph_rl.log.tables.
-
-ctgraph-rl export RUN --format l2logger --out DIR writes what l2metrics reads: log format 1.1 of l2logger.
-A training interval, and an evaluation of a task, is one experience with its mean return as reward. Time stamps
-count experiences, so that equal runs give equal files; a runtime that is taken from them means nothing.
+l2metrics reads log format 1.1 of l2logger. A training interval, and an evaluation of a task, is one experience with its
+mean return as reward. Time stamps count experiences, so that equal runs give equal files; a runtime that is taken from
+them means nothing.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.log.files import LOG, no_run
@@ -38,7 +36,6 @@ COLUMNS = (
 )
 WORKER = "worker0"
 START = datetime(2000, 1, 1)
-FORMATS = ("l2logger", "parquet")
 
 
 def write_l2logger(regimes: Sequence[Regime], folder: Path | str) -> None:
@@ -98,10 +95,7 @@ def task_names(regimes: Sequence[Regime]) -> dict[str, str]:
 
 def main() -> None:
     """Export a run directory."""
-    parser = argparse.ArgumentParser(prog="ctgraph-rl export", description=__doc__)
-    parser.add_argument("run", type=Path, help="a run directory")
-    parser.add_argument("--format", choices=FORMATS, default=FORMATS[0], help="the format to write")
-    parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
+    parser = parsers.export()
     arguments = parser.parse_args()
     with refused_by(parser):
         require(((arguments.run / LOG).is_file(), no_run(arguments.run)))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from ctgraph_rl.log.escape import markdown_text, terminal_text
+from ctgraph_rl.parsers import TABLE_FORMATS
 from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell
 from ctgraph_rl.report.latex import latex as latex_table
 
@@ -35,7 +36,7 @@ LEGENDS = {
     "iqm": f"interquartile mean [bootstrap 95 % CI], {_EXACT}",
     "seeds": "single runs",
 }
-"""What the numbers of a table are, by `ctgraph_rl.report.results.STATISTICS`, and of a table of single runs."""
+"""What the numbers of a table are, by `ctgraph_rl.parsers.STATISTICS`, and of a table of single runs."""
 
 WHY_EXACT = (
     "--statistics exact: few seeds of bounded values need wider intervals than Student's or a bootstrap's; "
@@ -108,7 +109,9 @@ def as_latex(matrix: Matrix, labels: Labels, modified: str | None = None, legend
     return latex_table(Table(caption, label, "agent", matrix.head, rows=matrix.rows, notes=matrix.notes))
 
 
-FORMATS: dict[str, Callable[[Sequence[Row], Modified, str], str]] = {"text": text, "markdown": markdown, "latex": latex}
+FORMATS: dict[str, Callable[[Sequence[Row], Modified, str], str]] = dict(
+    zip(TABLE_FORMATS, (text, markdown, latex), strict=True)
+)
 SENTENCES: dict[str, Callable[[str], str]] = {
     **{"text": terminal_text, "markdown": markdown_text, "latex": lambda plain: f"% {terminal_text(plain)}"}
 }

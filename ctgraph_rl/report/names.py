@@ -17,14 +17,6 @@ NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
 MOST_CHANGES, MOST_VALUES = 6, 3
 """Changes that are named, and different values of one that are."""
 
-AGENT_OPTION: dict[str, Any] = {
-    "action": "append",
-    "default": [],
-    "metavar": "NAME[=SHOWN]",
-    "help": "order and rename agents; repeatable",
-}
-"""Of ``ctgraph-rl report`` and ``ctgraph-rl results``: names and order of agents."""
-
 
 def modifications(runs: Sequence[Run]) -> dict[str, str]:
     """Return what differs from the published curriculum, for each modified one by its name in tables."""

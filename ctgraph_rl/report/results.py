@@ -1,15 +1,7 @@
-"""Many runs as one table: each agent on each curriculum, with intervals over seeds.
-
-ctgraph-rl results runs/multirun [--all | --metrics forgetting,regret] [--statistics std] [--per-seed] [--csv FILE]
-
-Every seed that any agent has on a curriculum is expected of all: one without a run, with an unfinished run or with an
-undefined metric is counted, as in n = 9/10. The exit code is 1 if a run cannot be read, or if the code of one
-configuration has changed between runs: they are named, and the latter shown separately.
-"""
+"""Many runs as one table: each agent on each curriculum, with intervals over seeds."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,7 +10,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from ctgraph_rl import metrics
+from ctgraph_rl import metrics, parsers
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.log.escape import csv_text
@@ -29,7 +21,7 @@ from ctgraph_rl.log.tables import check_table, write_evaluations
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
-from ctgraph_rl.report.names import AGENT_OPTION, displayed, modifications
+from ctgraph_rl.report.names import displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
 from ctgraph_rl.report.terminal import print_problems
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
@@ -70,14 +62,6 @@ HEADER = (
     *("std", "seed"),
 )
 
-STATISTICS = {
-    "exact": "intervals that hold for few seeds of bounded values, where the others are too narrow",
-    "t": "Student's intervals of means",
-    "std": "standard deviations over seeds",
-    "iqm": "interquartile means with rliable's stratified bootstrap",
-}
-"""What means over seeds are shown with; times are medians and solved seeds are shares with exact intervals in all."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -112,7 +96,7 @@ def table(runs: Sequence[Run], statistics: str = "exact") -> list[Row]:
 
     Args:
         runs: finished or not.
-        statistics: one of `STATISTICS`.
+        statistics: one of `ctgraph_rl.parsers.STATISTICS`.
     """
     bounds = bounds_by_curriculum(runs)
     rows = []
@@ -233,7 +217,7 @@ def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> 
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
-    """Return the values of seeds as one number, by one of `STATISTICS`."""
+    """Return the values of seeds as one number, by one of `ctgraph_rl.parsers.STATISTICS`."""
     if kind == "t":
         return mean(values)
     if kind == "std":
@@ -316,7 +300,7 @@ def _missing(run: Run | None, metric: str | None) -> str | None:
 
 def main() -> None:
     """Print the table of many runs, and write it where asked."""
-    parser = _parser()
+    parser = parsers.results()
     arguments = parser.parse_args()
     if arguments.difference is not None and arguments.compare is None:
         parser.error("--difference is of the metric that --compare names; give both")
@@ -342,27 +326,6 @@ def main() -> None:
             print("\n" + SENTENCES[arguments.format](_sentence(*pair, found, arguments.difference)))
     if print_problems(problems, runs):
         sys.exit(1)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="ctgraph-rl results", description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
-    which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
-    parser.add_argument("--format", choices=FORMATS, default="text", help="of what is printed (default: text)")
-    kinds = "; ".join(f"{kind}: {what}" for kind, what in STATISTICS.items())
-    of_seeds = parser.add_mutually_exclusive_group()
-    of_seeds.add_argument("--statistics", choices=STATISTICS, default="exact", help=f"{kinds} (default: exact)")
-    of_seeds.add_argument("--per-seed", action="store_true", help="show single runs, a row for each measure")
-    parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
-    parser.add_argument(
-        "--tidy", type=Path, metavar="FILE", help="also write every evaluation as a row into this .csv or .parquet file"
-    )
-    parser.add_argument("--agent", **AGENT_OPTION)
-    parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
-    parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
-    return parser
 
 
 def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:

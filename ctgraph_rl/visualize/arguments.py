@@ -7,30 +7,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.runs.config import curriculum_of
 from ctgraph_rl.runs.load import load
 from ctgraph_rl.runs.settings import curriculum_names
-from ctgraph_rl.tasks.configurations import CONFIGURATIONS, make_task
+from ctgraph_rl.tasks.configurations import make_task
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import Task, ct_graphs
 from ctgraph_rl.visualize.layout import in_digits
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.visits import Visits, visits
 
-POLICIES: dict[str, Policy] = {"random": RandomPolicy, "navigation": NavigationPolicy, "optimal": OptimalPolicy}
-
-CHANGES: dict[str, type] = {
-    "branching_factor": int,
-    "depth": int,
-    "wait_prob": float,
-    "image_seed": int,
-    "read_noise": int,
-    "read_rotation": int,
-}
-"""Arguments of `make_task` that are plain numbers."""
+POLICIES: dict[str, Policy] = dict(zip(parsers.POLICIES, (RandomPolicy, NavigationPolicy, OptimalPolicy), strict=True))
 
 
 class Selection(NamedTuple):
@@ -62,25 +53,6 @@ class Selection(NamedTuple):
         return count(max(1, num_episodes // in_row) * in_row, seed, greedy=greedy, episodes_per_row=in_row)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name a task and a policy."""
-    names = ", ".join(CONFIGURATIONS)
-    about = f"{names}; a configuration file of the authors (.json); or a curriculum. Default: only numbers"
-    parser.add_argument("name", nargs="?", help=about)
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
-    parser.add_argument("--task", type=int, default=1, metavar="N", help="number of a curriculum's task, from 1")
-    for name, kind in CHANGES.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
-    parser.add_argument("--goal", type=decisions, metavar="1.2", help="the decisions to the goal")
-    surjective = "with numbers only: one image for each kind of state"
-    parser.add_argument("--surjective", action="store_true", help=surjective)
-    who = parser.add_mutually_exclusive_group()
-    who.add_argument("--policy", choices=POLICIES, help="who acts")
-    who.add_argument("--run", type=Path, help="the trained agent of a run acts, in a task of its curriculum")
-    parser.add_argument("--sampled", action="store_true", help="the trained agent samples and explores")
-    parser.add_argument("--seed", type=int, default=0, help="of the environment")
-
-
 def select(arguments: argparse.Namespace) -> Selection:
     """Return the task and the policy that are named.
 
@@ -88,7 +60,7 @@ def select(arguments: argparse.Namespace) -> Selection:
         ValueError: for names that are unknown and what does not go together.
         OSError: for files that cannot be read.
     """
-    given = {name: getattr(arguments, name) for name in (*CHANGES, "goal")}
+    given = {name: getattr(arguments, name) for name in (*parsers.CHANGES, "goal")}
     changes = {name: value for name, value in given.items() if value is not None}
     changes |= {"fully_observable": False} if arguments.surjective else {}
     if arguments.run is not None:
@@ -96,14 +68,6 @@ def select(arguments: argparse.Namespace) -> Selection:
         return _of_run(arguments.run, arguments.task)
     policy = None if arguments.policy is None else POLICIES[arguments.policy]
     return _named(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
-
-
-def decisions(text: str) -> tuple[int, ...]:
-    """Read ``1.2``, or ``1,2``, as a goal."""
-    parts = text.replace(",", ".").split(".")
-    if not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"a goal is the decisions on the way to it, such as 1.2, got {text!r}")
-    return tuple(map(int, parts))
 
 
 def _named(name: str | None, number: int, changes: dict[str, Any], config_dir: Path | None) -> Selection:

@@ -5,24 +5,24 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import at_least_one, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
-from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
+from ctgraph_rl.visualize.arguments import Selection, select
 from ctgraph_rl.visualize.dot import to_dot
 from ctgraph_rl.visualize.gif import save_gif
 from ctgraph_rl.visualize.image_figure import image_figure
-from ctgraph_rl.visualize.style import DPI, save_figure
+from ctgraph_rl.visualize.style import save_figure
 from ctgraph_rl.visualize.task_figure import task_figure
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line, ``ctgraph-rl draw``."""
-    parser = _parser()
+    parser = parsers.draw()
     arguments = parser.parse_args(argv)
     if not (arguments.figure or arguments.dot or arguments.gif):
         parser.error("nothing to write: name a --figure, --dot or --gif")
@@ -30,21 +30,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         _write(select(arguments), arguments)
         for path in filter(None, (arguments.figure, arguments.dot, arguments.gif)):
             print(f"written: {terminal_text(path)}", file=sys.stderr)  # the file itself may be standard output
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="ctgraph-rl draw", description="Draw a task; with a policy, what it does there."
-    )
-    add_arguments(parser)
-    what = "what a figure has: observation ids in the states, their kinds, or the images"
-    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
-    parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
-    parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
-    parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
-    parser.add_argument("--episodes", type=int, default=1000, help="episodes used to count visits; default: 1000")
-    return parser
 
 
 def _write(selection: Selection, arguments: argparse.Namespace) -> None:

@@ -21,13 +21,14 @@ from rich.style import Style
 from rich.text import Text
 from rich.tree import Tree
 
+from ctgraph_rl import parsers
 from ctgraph_rl.checks import at_least_one, is_real, require
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL, OUTCOME_OTHER_END
 from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.arguments import Selection, add_arguments, select
+from ctgraph_rl.visualize.arguments import Selection, select
 from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.states import kind_of
@@ -255,11 +256,7 @@ def watch(game: Game, episodes: int, delay: float) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line, ``ctgraph-rl play``."""
-    about = "Play a CT-graph in the terminal, or watch a policy play it."
-    parser = argparse.ArgumentParser(prog="ctgraph-rl play", description=about)
-    add_arguments(parser)
-    parser.add_argument("--episodes", type=int, default=3, help="of a policy; default: 3")
-    parser.add_argument("--delay", type=float, default=0.5, help="seconds between a policy's steps; default: 0.5")
+    parser = parsers.play()
     arguments = parser.parse_args(argv)
     with refused_by(parser):
         delay_rule = f"--delay must be seconds >= 0, got {arguments.delay}"

@@ -15,9 +15,8 @@ from typing import Any
 from ctgraph_rl.batch.render import GOAL, PALETTE
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.disk import write_named
+from ctgraph_rl.parsers import DPI
 from ctgraph_rl.visualize.layout import Layout
-
-DPI = 160
 
 MARKERS = {StateType.HOME: "p", StateType.WAIT: "o", StateType.DECISION: "D", StateType.END: "s", StateType.FAIL: "8"}
 """Pentagon, circle, diamond, square and octagon."""

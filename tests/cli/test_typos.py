@@ -7,8 +7,8 @@ import argparse
 import pytest
 from helpers.sweeping import command_line, configs, sweep
 
+from ctgraph_rl.parsers import decisions
 from ctgraph_rl.runs.settings import as_typed, in_digits
-from ctgraph_rl.visualize.arguments import decisions
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,7 @@ def test_an_unknown_word_is_refused_with_what_may_have_been_meant(call, runs, wo
 
 
 LISTS = ("", "--version", "curiculum", "agents", "methods", "curricula", "curricula list --format markdown", "agent=pp")
+HELPS = tuple(f"{name} --help" for name in cli.COMMANDS)
 
 ONE_AFTER_THE_OTHER = """
 import sys
@@ -123,12 +124,12 @@ for words in sys.argv[1:]:
 
 def test_what_only_lists_imports_no_torch(checkout, tmp_path):
     env = {**os.environ, "PYTHONPATH": str(checkout)}
-    command = [sys.executable, "-c", ONE_AFTER_THE_OTHER, *LISTS]
+    command = [sys.executable, "-c", ONE_AFTER_THE_OTHER, *LISTS, *HELPS]
 
     result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
 
     ended = [line for line in result.stdout.splitlines() if line.startswith("ENDED")]
-    assert ended == [f"ENDED {words} False" for words in LISTS], result.stderr
+    assert ended == [f"ENDED {words} False" for words in (*LISTS, *HELPS)], result.stderr
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.made_runs import all_runs, line, make_run
 
-from ctgraph_rl import metrics
+from ctgraph_rl import metrics, parsers
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.results import comparisons, selected, table
@@ -214,7 +214,7 @@ def test_a_table_has_the_statistics_that_are_asked_for(tmp_path, monkeypatch, ca
 
     shown = {
         kind: " ".join(shown_by(monkeypatch, capsys, str(tmp_path), "--statistics", kind).split())
-        for kind in results.STATISTICS
+        for kind in parsers.STATISTICS
     }
 
     assert "--statistics exact: few seeds of bounded values need wider intervals" in shown["exact"]

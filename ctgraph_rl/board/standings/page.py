@@ -1,13 +1,7 @@
-"""ctgraph-rl board DIR... --out FOLDER writes a page with tables of submissions, and the same for programs.
-
-board.html needs nothing else and no network; board.md and tables.tex are the same tables; board.json,
-entries.csv and scores.csv hold their numbers, croissant.json describes the CSV files, and
-model-index.yaml is the results file that model hubs read. The exit code is 1 if something was left out.
-"""
+"""The command ``ctgraph-rl board``: a page with tables of submissions, and the same tables for programs."""
 
 from __future__ import annotations
 
-import argparse
 import base64
 import hashlib
 import json
@@ -18,7 +12,7 @@ from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
-from ctgraph_rl import __version__
+from ctgraph_rl import __version__, parsers
 from ctgraph_rl.board.standings import formats
 from ctgraph_rl.board.standings.croissant import croissant
 from ctgraph_rl.board.standings.entries import LEVELS, BoardEntry, read_entries, shown_level
@@ -136,13 +130,7 @@ def _require_packages() -> None:
 
 def main() -> None:
     """Write the board, and say what is in it."""
-    parser = argparse.ArgumentParser(prog="ctgraph-rl board", description=__doc__)
-    parser.add_argument(
-        "submissions", type=Path, nargs="+", metavar="DIR", help="submissions, or folders that hold them"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the files go")
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="where tracks of your own are, track/NAME.yaml")
-    parser.add_argument("--date", type=date.fromisoformat, help="the day that the metadata names (default: today)")
+    parser = parsers.board()
     arguments = parser.parse_args()
     with refused_by(parser):
         board = write_board(arguments.submissions, arguments.out, arguments.config_dir, arguments.date)
