@@ -34,9 +34,13 @@ def curriculum_cards(figures: dict[str, tuple[str, str]]) -> Iterator[tuple[str,
 
 
 def _index(all_curricula: dict[str, Curriculum]) -> str:
-    head = ["| curriculum | tasks | frames | tasks that need memory | what it is |", "|---|--:|--:|--:|---|"]
+    head = [
+        "| curriculum | version | fingerprint | tasks | frames | tasks that need memory | what it is |",
+        "|---|--:|---|--:|--:|--:|---|",
+    ]
     rows = [
-        f"| [`{name}`]({name}.md) | {len(c.tasks):,} | {c.num_frames:,} | {_need_memory(c)} | {_purpose(name)} |"
+        f"| [`{name}`]({name}.md) | {c.version} | {c.fingerprint} | {len(c.tasks):,} | {c.num_frames:,} "
+        f"| {_need_memory(c)} | {_purpose(name)} |"
         for name, c in all_curricula.items()
     ]
     words = "Every curriculum with a name. Run one with `ctgraph-rl curriculum=NAME`."

@@ -20,8 +20,11 @@ def metric_cards() -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each card, and of the list of them, in Markdown."""
     values = metrics.of_matrix(EXAMPLE, TRAINED)
     found = metrics.definitions()
-    rows = [f"| [`{name}`]({name}.md) | `{each.formula}` | {escaped(each.source)} |" for name, each in found.items()]
-    head = ["| metric | formula | source |", "|---|---|---|"]
+    rows = [
+        f"| [`{name}`]({name}.md) | `{each.id}` | `{each.formula}` | {escaped(each.source)} |"
+        for name, each in found.items()
+    ]
+    head = ["| metric | id | formula | source |", "|---|---|---|---|"]
     words = "Every metric of `metrics.json`. R is the performance matrix; tasks and blocks count from 1."
     listing = "\n".join([*head, *rows])
     yield "metrics/index.md", f"# Metric cards\n\n{words}\n\n{listing}\n"

@@ -109,6 +109,8 @@ def test_every_agent_method_detector_and_metric_has_a_card(cards):
     for group in ("agent", "cell", "method", "detector"):
         assert {f"{group}s/{entry.name}.md" for entry in catalogue(group)} <= pages
     assert {f"metrics/{name}.md" for name in metrics.definitions()} <= pages
+    listed = cards["metrics/index.md"]
+    assert all(f"| `{each.id}` | `{each.formula}` |" in listed for each in metrics.definitions().values())
 
 
 def test_cards_show_settings_variants_results_and_examples(cards):
