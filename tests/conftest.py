@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import pickle
 import shlex
 import shutil
 import signal
@@ -87,12 +88,26 @@ def errors_as_users_see_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 
 
+@pytest.fixture(scope="session")
+def composed() -> dict[tuple[str, ...], bytes]:
+    """What ``compose`` has made of overrides."""
+    return {}
+
+
 @pytest.fixture
-def compose() -> Iterator[Callable[..., DictConfig]]:
-    """Composes a configuration from overrides, as the command line does."""
+def compose(composed: dict[tuple[str, ...], bytes]) -> Iterator[Callable[..., DictConfig]]:
+    """Composes a configuration from overrides, as the command line does, and those of the same overrides once."""
     GlobalHydra.instance().clear()
     with of_hydra(hydra.initialize_config_dir)(packages.conf_dir()):
-        yield lambda *overrides, **how: hydra.compose("config", overrides=[*overrides], **how)
+
+        def compose(*overrides: str, **how: Any) -> DictConfig:
+            if how:
+                return hydra.compose("config", overrides=[*overrides], **how)
+            if overrides not in composed:
+                composed[overrides] = pickle.dumps(hydra.compose("config", overrides=[*overrides]))
+            return pickle.loads(composed[overrides])
+
+        yield compose
 
 
 @pytest.fixture

@@ -51,12 +51,15 @@ def all_digests() -> dict[str, Any]:
 def _builders(group: str) -> dict[str, Any]:
     """Return what builds each tiny agent, or each method."""
     import hydra
+    import pytest
+    from helpers.sweeping import compose_once
 
     from ctgraph_rl.packages import conf_dir
     from ctgraph_rl.runs import config
 
     made = {}
-    with hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+    with pytest.MonkeyPatch.context() as patch, hydra.initialize_config_dir(conf_dir(), version_base="1.3"):
+        compose_once(patch)
         for path in sorted(Path(conf_dir(), group).glob("*.yaml")):
             cfg = hydra.compose("config", overrides=[f"{group}={path.stem}"])
             small = METHODS.get(path.stem, [])

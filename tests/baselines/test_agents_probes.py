@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of, others_slow
+from helpers.small_agents import AGENTS, GREEDY, ONE_HOT_TASK, Q_LEARNERS, RECURRENT, agent_of
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -116,13 +116,13 @@ def learn_probe(compose, name: str, num_batches: int, **probe) -> float:
     return found[-1]
 
 
-@pytest.mark.parametrize("name", others_slow(AGENTS, "a2c", "dqn", "lstm_ppo", "mohqa"))
+@pytest.mark.parametrize("name", ["a2c", "dqn", "lstm_ppo", "mohqa"])
 def test_one_of_two_actions_pays(compose, name):
     assert learn_probe(compose, name, 200, shows_cue=False) == 1.0
 
 
 @pytest.mark.slow
-@every_agent
+@pytest.mark.parametrize("name", ["a2c", "dqn", "lstm_ppo", "mohqa"])
 def test_what_pays_depends_on_the_observation(compose, name):
     assert learn_probe(compose, name, 300) == 1.0
 

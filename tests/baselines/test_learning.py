@@ -51,17 +51,14 @@ def test_reinforce_learns_a_goal_of_ct_fo_b1(build_agent):
     assert found == 1.0
 
 
-@pytest.mark.parametrize(
-    ("name", "goal"), [("lstm_ppo", (1, 2)), ("lstm_ppo", (2, 1)), ("drqn", (1, 2)), ("qrdqn_lstm", (2, 1))]
-)
+@pytest.mark.parametrize(("name", "goal"), [("lstm_ppo", (1, 2)), ("drqn", (1, 2)), ("qrdqn_lstm", (2, 1))])
 def test_agents_with_memory_learn_ct_su_b1(build_agent, name, goal):
     _, found = learnt(build_agent, name, ct_su_b1(goal))
 
     assert found == 1.0
 
 
-@pytest.mark.parametrize("name", ["a2c", "dqn", "ppo"])
-@pytest.mark.parametrize("goal", [(1, 2), (2, 2)])
+@pytest.mark.parametrize(("name", "goal"), [("a2c", (1, 2)), ("dqn", (1, 2)), ("ppo", (1, 2)), ("ppo", (2, 2))])
 def test_agents_without_memory_reach_their_ceiling_on_ct_su_b1_and_not_more(build_agent, name, goal):
     task = ct_su_b1(goal)
 

@@ -64,7 +64,7 @@ def within_specs(env: CTGraphEnv, data: TensorDictBase) -> bool:
 
 
 @examples(6)
-@given(batches(least=2), seeds, st.sampled_from([0, 1, 7, 2**32 - 4]))
+@given(batches(least=2), seeds, st.sampled_from([0, 7, 2**32 - 4]))
 def test_any_row_of_any_batch_equals_its_task_alone(batch, seed, first_row):
     data = rollout(CTGraphEnv(batch, seed=seed, first_row=first_row), seed, 12)
 
@@ -148,7 +148,7 @@ def shows(task: Task, seen: torch.Tensor, shown_id: int) -> bool:
     return bool(fits.flatten(1).all(1).any())
 
 
-@examples(8)
+@examples(6)
 @given(batches(), seeds)
 def test_the_data_of_any_tasks_lie_within_the_specs_and_follow_the_papers_tree_step_by_step(batch, seed):
     env, rng, states = CTGraphEnv(batch, seed=seed), random.Random(seed), [(HOME, ())] * len(batch)
@@ -250,7 +250,7 @@ def broken(draw: Any) -> tuple[Any, dict[str, Any]]:
     return target, {name: draw(st.sampled_from(ILLEGAL[name])) for name in names}
 
 
-@examples(125)
+@examples(80)
 @given(broken())
 def test_every_broken_field_is_named_with_its_value_in_one_value_error(target_and_values):
     target, values = target_and_values
@@ -301,7 +301,7 @@ def test_every_range_with_too_few_unique_ids_is_named_with_the_number_it_needs(b
     assert needs == [wanted[kind] for kind in KINDS if kind in short]
 
 
-@examples(50)
+@examples(30)
 @given(st.integers(2, 12) | st.integers(2, 2**63), st.integers(1, 70) | st.integers(1, 10**6))
 def test_a_graph_is_legal_as_long_as_its_states_fit_int64(b, d):
     if d < 64 and sum(counts_of(b, d).values()) < 2**63:

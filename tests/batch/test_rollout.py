@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.oracles import record, scripts, surjective
+from helpers.small_agents import others_slow
 from helpers.task_families import FAMILIES, MIXED
 from torchrl.envs import StepCounter, TransformedEnv
 
@@ -48,9 +49,10 @@ def test_the_fast_path_gives_the_data_of_the_standard_path(tasks, kernel):
     assert_same(steps, data)
 
 
-@every_family
-def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(tasks):
+@pytest.mark.parametrize("name", others_slow(FAMILIES, *list(FAMILIES)[::3]))
+def test_the_environment_gives_the_same_data_alone_and_when_it_is_wrapped(name):
     """By the tensor engine; test_native.py compares the kernel's with it."""
+    tasks = FAMILIES[name]
     alone, inner = (CTGraphEnv(rows_of(tasks), seed=3, kernel="off") for _ in range(2))
     wrapped = TransformedEnv(inner, StepCounter(step_count_key="steps"))
     actions = actions_of(tasks, 30)

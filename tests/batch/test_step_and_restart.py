@@ -22,7 +22,7 @@ def test_a_step_and_its_restarts_in_one_call_give_the_data_of_two(tasks, monkeyp
     for env in (once, twice):
         env.reset()
 
-    for action in likely(tasks, 60):
+    for action in likely(tasks, 40):
         after = twice.step_data(action)
         expected = after, twice.restart_data(after["done"], after["observation"])
         found = once.step_and_restart_data(action)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -144,6 +145,21 @@ def test_nothing_runs_where_nobody_can_be_asked(tiny_submission, tiny_home, tmp_
     assert code == 2
     assert "give --yes to agree" in capsys.readouterr().err
     assert in_process == []
+
+
+@pytest.mark.parametrize(("end", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_verification_that_is_stopped_says_how_to_go_on_and_ends_with_the_code_of_its_signal(
+    tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys, end, code
+):
+    folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
+    monkeypatch.setattr(verify, "read_submission", lambda path, config_dir: replace(tiny_submission, path=path))
+    monkeypatch.setattr(verify, "rescore", lambda submission: [])
+    monkeypatch.setattr(verify, "run_plan", lambda plan, means: signal.raise_signal(end))
+    before = signal.getsignal(signal.SIGTERM)
+
+    assert call(monkeypatch, tiny_home, folder, "--yes", "--number=7") == (code, {})
+    assert "no process is left; with --number 7 the same command resumes" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_nothing_of_others_runs_without_bubblewrap_unless_the_user_says_so(

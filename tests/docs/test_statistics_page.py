@@ -47,6 +47,9 @@ def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
     ("rule", "shape", "n"),
     [
         *(pytest.param("**Gaffke**", *of, marks=pytest.mark.slow) for of in (("bounded", 3), ("skewed", 5))),
+        pytest.param("BCa bootstrap", "skewed", 10, marks=pytest.mark.slow),
+        ("Hoeffding", "bounded", 10),
+        ("empirical Bernstein", "bounded", 20),
         *(("Student t", "skewed", 5), ("Anderson", "skewed", 20)),
     ],
 )
@@ -60,8 +63,20 @@ def test_times_are_computed_again(coverage):
 
 
 @pytest.mark.slow
-def test_the_whole_page_is_made_again(coverage):
-    assert coverage.page() == PAGE.read_text(encoding="utf-8")
+def test_other_numbers_are_computed_again(coverage):
+    assert cells("interquartile mean of three tasks", "covers, width")[2] == coverage.of_middle_means(10)
+    for how, name in (
+        ("weighted", "**forward transfer, both sides weighted**"),
+        ("drawn again", "forward transfer, both sides drawn again"),
+    ):
+        assert cells(name, "covers, no end below")[1] == coverage.of_transfer(how, 5)
+
+
+def test_each_table_has_the_lines_and_columns_of_its_rules(coverage, monkeypatch):
+    monkeypatch.setattr(coverage, "cell", lambda rule, shape, n: cells(shape, rule)[coverage.SEEDS.index(n)])
+    of_means = [block for block in PAGE.read_text(encoding="utf-8").split("\n\n") if block.startswith("| returns")]
+
+    assert coverage.of_means() == of_means[0]
 
 
 def test_the_rules_of_the_package_cover_and_students_does_not():

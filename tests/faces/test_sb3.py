@@ -135,15 +135,6 @@ def test_their_check_env_has_nothing_to_say_about_one_hot_observations():
 
 
 @pytest.mark.slow
-def test_ppo_learns_ct_fo_b1():
-    model = PPO("MlpPolicy", ids("CT-FO-B1", 8), n_steps=128, batch_size=128, learning_rate=1e-3, ent_coef=0.01, seed=0)
-
-    model.learn(10_240)
-
-    assert mean_return(model, "CT-FO-B1") >= 0.9
-
-
-@pytest.mark.slow
 def test_dqn_learns_ct_fo_b1():
     schedule = {"learning_starts": 500, "exploration_fraction": 0.7, "target_update_interval": 200}
     model = DQN(

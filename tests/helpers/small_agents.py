@@ -227,8 +227,8 @@ def names_in(group: str) -> list[str]:
 
 CHOICES = [
     *((agent, {}) for agent in AGENTS),
-    *(("lstm_ppo", {"cell": cell}) for cell in names_in("cell")),
-    *(("drqn", {"cell": cell}) for cell in names_in("cell") if cell != "backpropamine"),  # whose state is not stored
+    *(("lstm_ppo", {"cell": cell}) for cell in names_in("cell") if cell != "lstm"),  # which both agents have
+    *(("drqn", {"cell": cell}) for cell in ("attention", "frames", "min_gru")),
     *(("ppo", {"method": method}) for method in names_in("method")),
     *(("ppo", {"method": "mask_ri", "detector": detector}) for detector in names_in("detector")),
 ]

@@ -2,13 +2,15 @@
 
 Hydra parses each file once in a process, and finds and merges those of equal choices once. A configuration is what the
 choices of groups give, with settings on top of it. The first is kept for equal choices of equal files, the second is
-done each time. Files of this package and of Hydra stay equal while tests run.
+done each time. Files of this package and of Hydra stay equal while tests run. What is kept is pickled: OmegaConf takes
+six times as long to copy it.
 """
 
 from __future__ import annotations
 
 import copy
 import json
+import pickle
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +23,7 @@ from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.defaults_list import DefaultsList
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 
 from ctgraph_rl import packages
@@ -67,7 +70,7 @@ def compose_once(patch: pytest.MonkeyPatch) -> None:
         source = SourcesRegistry.instance().resolve(scheme)
         patch.setattr(source, "load_config", _parsed_once(source.load_config))
     lists: dict[Any, DefaultsList] = {}
-    merged: dict[int, Any] = {}
+    merged: dict[int, bytes] = {}
     own = {"pkg://hydra.conf", f"file://{packages.conf_dir()}", "structured://"}
 
     def list_once(repo: Any, config_name: str | None, overrides_list: list[Any], **how: Any) -> DefaultsList:
@@ -86,9 +89,10 @@ def compose_once(patch: pytest.MonkeyPatch) -> None:
         if not any(kept.defaults is defaults for kept in lists.values()):
             return compose_from_defaults_list(loader, defaults, repo)
         if id(defaults) not in merged:
-            merged[id(defaults)] = compose_from_defaults_list(loader, defaults, repo)
-        return copy.deepcopy(merged[id(defaults)])
+            merged[id(defaults)] = pickle.dumps(compose_from_defaults_list(loader, defaults, repo))
+        return pickle.loads(merged[id(defaults)])
 
+    patch.setattr(OverridesParser, "parse_rule", _read_once(OverridesParser.parse_rule))
     patch.setattr(CachingConfigRepository, "__init__", _of_one_delegate)
     patch.setattr(config_loader_impl, "create_defaults_list", list_once)
     patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
@@ -114,13 +118,25 @@ def _chooses(repo: Any, override: Any) -> bool:
 
 
 def _parsed_once(load_config: Callable[..., Any]) -> Callable[..., Any]:
-    parsed: dict[Any, Any] = {}
+    parsed: dict[Any, bytes] = {}
 
     def load(source: Any, config_path: str) -> Any:
         path = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
         key = (path, source.provider, path.exists() and path.read_bytes())
         if key not in parsed:
-            parsed[key] = load_config(source, config_path)
-        return copy.deepcopy(parsed[key])
+            parsed[key] = pickle.dumps(load_config(source, config_path))
+        return pickle.loads(parsed[key])
 
     return load
+
+
+def _read_once(parse_rule: Callable[..., Any]) -> Callable[..., Any]:
+    """Of one override, which says the same each time; Hydra's functions, such as ``range``, are always the same."""
+    read: dict[Any, bytes] = {}
+
+    def parse(parser: OverridesParser, text: str, rule_name: str) -> Any:
+        if (text, rule_name) not in read:
+            read[text, rule_name] = pickle.dumps(parse_rule(parser, text, rule_name))
+        return pickle.loads(read[text, rule_name])
+
+    return parse

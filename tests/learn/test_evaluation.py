@@ -36,6 +36,12 @@ def test_a_reference_policy_of_another_environment_is_refused():
         evaluate(OptimalPolicy(CTGraphEnv([surjective()])), [surjective()])
 
 
+@pytest.mark.parametrize(("tasks", "found"), [([surjective(), 3], "Task, int"), ([], "none"), ("x", "str")])
+def test_what_is_no_list_of_tasks_is_refused(tasks, found):
+    with pytest.raises(ValueError, match=f"^tasks must be a list with at least one Task, got {found}$"):
+        evaluate(OptimalPolicy, tasks)
+
+
 def test_changing_goals_are_measured_over_the_episodes_of_a_row():
     result = evaluate(first_branch, [CHANGING], num_episodes=4000, episodes_per_row=100)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.scripted import DECISION_ID, ONE, TWO, curriculum
+from helpers.small_agents import others_slow
 from torch import nn
 
 import curricula
@@ -129,9 +130,13 @@ def test_a_module_that_gives_no_logits_is_refused_with_what_to_write(module, mes
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n in ("ct8", "su_b1_4tasks") else pytest.mark.slow) for n in curricula.names()]
+    "name",
+    others_slow(
+        ("ct8", "su_b1_4tasks", "cartpole_3lengths", "co_hard", "ct28_one_branch", "su_b1_changing_goals"),
+        *("ct8", "su_b1_4tasks"),
+    ),
 )
-def test_a_function_with_a_second_argument_task_id_plays_every_curriculum(name):
+def test_a_function_with_a_second_argument_task_id_plays_every_kind_of_curriculum(name):
     curriculum = curricula.load(name)
     lengths = []
 

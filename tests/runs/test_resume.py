@@ -172,13 +172,13 @@ def test_memory_and_replay_go_on_over_hidden_boundaries(learner, kind):
         (name, kind)
         for place, name in enumerate(AGENTS)
         for number, kind in enumerate(CURRICULA)
-        if name == "a2c" or kind == "announced" or (place + number) % 5 == 0
+        if name == "a2c" or kind == "announced" or (place + number) % 9 == 0
         if not (name == "rl2" and kind.startswith("gymnasium"))  # it needs CT-graphs
     ],
 )
 def test_one_agent_in_every_kind_of_curriculum_and_every_agent_in_some_go_on_as_if_never_stopped(learner, name, kind):
-    """From every state for one agent in every kind and for every agent in one kind; else from three."""
-    check_some(learner(CURRICULA[kind], name), None if name == "a2c" or kind == "announced" else 1)
+    """From every state for one agent in two kinds; else from three."""
+    check_some(learner(CURRICULA[kind], name), None if name == "a2c" and kind in ("announced", "hidden") else 1)
 
 
 def test_a_state_may_be_used_again_for_resuming_does_not_change_it(learner):

@@ -204,6 +204,8 @@ def test_the_images_of_each_kind_of_state_are_shown():
     words = [text.get_text() for text in axes.texts]
     kinds = ["home", "0", "wait", *"2345678", "decision", "9", "10", "11", "end", "12", "13", "14", "15", "fail", "1"]
     assert words == kinds
+    places = [axes.texts[words.index(kind)].get_position() for kind in ("home", "wait")]
+    assert places == [(-0.06, -0.5), (-0.06, -1.72)]
     ids = [int(word) for word in words if word.isdecimal()]
     for number, image in zip(ids, axes.images, strict=True):
         assert np.array_equal(image.get_array(), ct_fo_b1().images.images[number].numpy())

@@ -1,5 +1,7 @@
 """What a policy does, counted; an episode step by step and as a film."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -152,6 +154,13 @@ def test_a_film_ends_after_most_frames_and_changes_no_random_state(tmp_path):
     with Image.open(tmp_path / "long.gif") as film:
         assert film.n_frames == 5
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_film_without_pillow_names_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+
+    with pytest.raises(ModuleNotFoundError, match=r"^GIFs need pillow: pip install 'ctgraph_rl\[plot\]'$"):
+        save_gif(Player(ct_fo_b1(), OptimalPolicy), tmp_path / "a.gif")
 
 
 @pytest.mark.parametrize("wrong", [{"seconds": 0}, {"most_frames": 0}, {"size": 10}])

@@ -27,9 +27,9 @@ from ctgraph_rl.report.terminal import label_notes
 
 @pytest.fixture
 def section(tmp_path):
-    """Three seeds of an agent, whose values go over the whole scale."""
+    """Three seeds of an agent, whose values go over the whole scale and beyond 1."""
     for seed, value in enumerate((0.3, 0.5, 0.7)):
-        write_run(tmp_path / f"{seed}", seed=seed, performance=((0.0, math.nan), (1.0, value), (1 - value, 0.9)))
+        write_run(tmp_path / f"{seed}", seed=seed, performance=((0.0, math.nan), (1.5, value), (1 - value, 0.9)))
     return sections(find_runs([tmp_path])[0])[0]
 
 
@@ -91,7 +91,7 @@ def test_the_mean_over_all_tasks_is_of_evaluations_of_all_of_them(section):
 
     assert [frames for frames, _ in curve] == [0, 1000, 2000]
     assert math.isnan(curve[0][1])
-    assert [value for _, value in curve[1:]] == pytest.approx([0.65, 0.8])
+    assert [value for _, value in curve[1:]] == pytest.approx([0.9, 0.8])
 
 
 def test_few_seeds_are_thin_lines_beside_their_mean_and_no_band(section):
