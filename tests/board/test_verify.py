@@ -147,14 +147,22 @@ def test_nothing_runs_where_nobody_can_be_asked(tiny_submission, tiny_home, tmp_
     assert in_process == []
 
 
-@pytest.mark.parametrize(("end", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def interrupted(plan, means):
+    raise KeyboardInterrupt
+
+
+def terminated(plan, means):
+    signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("run_plan", "code"), [(terminated, 143), (interrupted, 130)])
 def test_a_verification_that_is_stopped_says_how_to_go_on_and_ends_with_the_code_of_its_signal(
-    tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys, end, code
+    tiny_submission, tiny_home, tmp_path, monkeypatch, in_process, capsys, run_plan, code
 ):
     folder = shutil.copytree(tiny_submission.path, tmp_path / "submission")
     monkeypatch.setattr(verify, "read_submission", lambda path, config_dir: replace(tiny_submission, path=path))
     monkeypatch.setattr(verify, "rescore", lambda submission: [])
-    monkeypatch.setattr(verify, "run_plan", lambda plan, means: signal.raise_signal(end))
+    monkeypatch.setattr(verify, "run_plan", run_plan)
     before = signal.getsignal(signal.SIGTERM)
 
     assert call(monkeypatch, tiny_home, folder, "--yes", "--number=7") == (code, {})

@@ -148,10 +148,8 @@ def test_every_agent_goes_on_as_if_never_stopped(learner, name):
     others_slow(
         CURRICULA,
         "hidden",
-        "ids with observations",
         "by episode, together",
         "at random",
-        "drift",
         "changing goals",
         "gymnasium, hidden with ids",
     ),

@@ -25,7 +25,6 @@ with tarfile.open(ARCHIVE) as _archive:
     CELLS: dict[str, dict[str, Any]] = json.load(_archive.extractfile("cells.json"))
 """For each run its command line, and its directory in ``runs`` and ``stopped``."""
 
-every_run = pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
 every_run_some_slow = pytest.mark.parametrize(
     "cell",
     [
@@ -89,7 +88,7 @@ def test_the_same_command_finds_a_finished_run_and_shows_it(command, stored, cap
     assert files(run_dir) == files(stored / "runs" / cell["directory"])
 
 
-@every_run
+@every_run_some_slow
 def test_the_agents_of_a_finished_and_of_a_stopped_run_are_loaded_as_they_were_saved(stored, cell):
     finished, stopped = (stored / kind / cell["directory"] for kind in ("runs", "stopped"))
     checkpoint = Checkpoints(stopped / CHECKPOINTS).newest()

@@ -374,6 +374,7 @@ def test_stopped_experts_of_a_group_are_resumed_as_a_group_bit_by_bit(monkeypatc
     assert all(same(one, other) for one, other in zip(experts("experts"), whole, strict=True))
 
 
+@pytest.mark.slow
 def test_experts_of_a_stopped_group_begin_again_where_one_is_needed_alone(monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         stop_after(patch, 1)

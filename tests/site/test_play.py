@@ -295,7 +295,7 @@ def test_a_browser_plays_to_the_goal_by_keys_from_a_file_opened_by_hand(tmp_path
         [*words, "--virtual-time-budget=20000", f"file://{tmp_path}/tutorials/page.html#{link}"],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
 
     said = re.search(r'data-found="([^"]*)"', done.stdout)

@@ -18,7 +18,7 @@ from baselines.parts.learner import Learner
 from ctgraph_rl import Block, agent, learn_curriculum
 from ctgraph_rl.runs.train import new_agent
 
-CURRICULUM = of(Block(ONE, 64), Block(TWO, 64), Block(ONE, 48), task_id="one_hot")
+CURRICULUM = of(Block(ONE, 32), Block(TWO, 32), Block(ONE, 16), task_id="one_hot")
 PROTOCOL = {key for key in vars(agent.Agent) if not key.startswith("_")} | set(agent.Agent.__annotations__)
 
 

@@ -131,7 +131,7 @@ def inside(spec: Any) -> None:
                 found[name] = error.strerror
     print(json.dumps(found), flush=True)
     end = time.monotonic() + spec.get("beats", 0)
-    while time.monotonic() < end:
+    while time.monotonic() < end and not Path("enough").exists():
         with open("beat", "a") as file:
             file.write("x")
         time.sleep(0.02)

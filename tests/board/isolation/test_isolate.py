@@ -89,6 +89,8 @@ if what == "daemon" and os.fork() == 0:
                 file.write("x")
             time.sleep(0.02)
 if what == "daemon":
+    while not Path("beat").exists():
+        time.sleep(0.01)
     time.sleep(float(sys.argv[2]))
 """
 
@@ -226,7 +228,7 @@ def test_no_process_is_left_behind_also_after_an_interrupt(place, closed, is_int
             raise KeyboardInterrupt
 
     try:
-        run(place, closed, "daemon", "20" if is_interrupted else "0.5", watch=watch)
+        run(place, closed, "daemon", "60" if is_interrupted else "0.1", watch=watch)
     except KeyboardInterrupt:
         assert is_interrupted
     there = beats(place)
