@@ -35,7 +35,7 @@ MIXED = [
 ]
 
 
-def rows_of(env, num_steps=60, rows=slice(None)):
+def rows_of(env, num_steps=30, rows=slice(None)):
     """Data of an environment under the script of these rows of a batch of eight."""
     return record(env, scripts(num_steps, 8)[:, rows])
 

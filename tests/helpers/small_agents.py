@@ -47,10 +47,13 @@ POLICY_GRADIENTS = tuple(name for name, kind in KINDS.items() if issubclass(kind
 RECURRENT = tuple(name for name in AGENTS if KINDS[name].memory)
 
 LESS = {name: [f"agent.batch_size={4 if name in RECURRENT else 32}"] for name in Q_LEARNERS}
-SMALL = {"num_envs": 16, "num_steps": 8, "hidden_size": 8, "num_epochs": 2, "num_updates": 3}
-SMALL_AGENT = {
-    name: [*(f"agent.{key}={min(its[key], value)}" for key, value in SMALL.items() if key in its), *LESS.get(name, [])]
+FEWER = {
+    name: [f"agent.{key}={min(its[key], most)}" for key, most in (("num_epochs", 2), ("num_updates", 3)) if key in its]
     for name, its in YAML.items()
+}
+SMALL_AGENT = {
+    name: ["agent.num_envs=16", "agent.num_steps=8", "agent.hidden_size=8", *FEWER[name], *LESS.get(name, [])]
+    for name in YAML
 }
 """Overrides that make each agent small."""
 

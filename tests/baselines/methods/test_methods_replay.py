@@ -207,7 +207,7 @@ def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(compose)
 
     attached.learn(batches(attached, ONE, 1)[0])
 
-    assert sizes == {attached.agent.minibatch_size: 16}
+    assert sizes == {attached.agent.minibatch_size: 8}
 
 
 # All tasks at once
