@@ -23,12 +23,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import quiet_where_nobody_reads
 from ctgraph_rl.packages import check_packages, conf_dir, first_imports
 from ctgraph_rl.portable import Restart, become_portable, restart
 from ctgraph_rl.runs.config import check_one_cell, composed, explain, in_sweep, of_hydra
 from ctgraph_rl.runs.settings import in_digits, names_in
-from ctgraph_rl.runs.sweep import sweepable
+from ctgraph_rl.runs.sweep import Sweeper, sweepable
 
 
 def run(cfg: DictConfig, run_dir: Path) -> float | None:
@@ -79,6 +80,21 @@ def show(run_dir: Path, report: bool) -> None:
     print(f"report: {write_report([shown]).page}" if report else f"{how} makes a page of figures and tables")
 
 
+def show_sweep(run_dirs: Sequence[Path]) -> None:
+    """Print the table of a sweep that is done, if it is not long, and the command that shows more."""
+    here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
+    folder = terminal_text(shlex.quote(str(here)))
+    if not (run_dirs[0] / LOG).exists():
+        print(f"ctgraph-rl collectives {folder} makes a page of figures and tables")
+    elif len(run_dirs) > MOST_IN_TABLE:
+        print(f"ctgraph-rl results {folder} prints a table")
+    else:
+        from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
+
+        print_table(run_dirs)
+        print(f"\nctgraph-rl report {folder} makes a page of figures and tables of all runs there")
+
+
 class CellError(RuntimeError):
     """What stopped a cell of a sweep, in words: not every exception can travel between processes."""
 
@@ -97,6 +113,9 @@ Choices, GROUP=NAME:
 Settings, KEY=VALUE; the yaml files of conf/ say what each means:
 {settings}
 --hydra-help shows the options that Hydra adds."""
+
+MOST_IN_TABLE = 50
+"""Cells of a sweep whose results are read at its end."""
 
 SEARCHERS = ("ax", "nevergrad", "optuna")
 """Sweepers of Hydra that search for what makes the value of a run best."""
@@ -164,7 +183,10 @@ def main() -> None:
                     print(settings_help(given))
                     return
                 sys.argv = ["ctgraph-rl", *sweepable(in_digits(words))]
+                Sweeper.done = ()
                 _job()
+                if Sweeper.done:
+                    show_sweep(Sweeper.done)
         except Restart:
             restart(environment, arguments)
     except (Stop, *ERRORS) as error:

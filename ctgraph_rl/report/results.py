@@ -13,7 +13,7 @@ from typing import Any
 from ctgraph_rl import metrics, parsers
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
-from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.escape import csv_text, terminal_text
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
@@ -296,6 +296,14 @@ def _missing(run: Run | None, metric: str | None) -> str | None:
     if metric is None or _value(run, metric) is not None:
         return None
     return run.metrics[metric]["undefined"] if metric in run.metrics else "another version, without this metric"
+
+
+def print_table(run_dirs: Sequence[Path]) -> None:
+    """Print the most important measures of runs."""
+    runs, problems = find_runs(run_dirs)
+    print(FORMATS["text"](selected(table(runs)), modifications(runs), LEGENDS["exact"]))
+    for problem in problems:
+        print(terminal_text(f"left out: {problem.reason}"), file=sys.stderr)
 
 
 def main() -> None:

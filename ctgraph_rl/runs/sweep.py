@@ -12,7 +12,7 @@ from contextlib import contextmanager, redirect_stderr
 from copy import deepcopy
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, ValueType
@@ -72,6 +72,9 @@ class Sweeper(Base):
         status: only report the status of each cell.
         variants: settings that change together, each combined with all of ``params``; None: there are none.
     """
+
+    done: ClassVar[Sequence[Path]] = ()
+    """Run directories of the last sweep of this process that is done."""
 
     def __init__(
         self,
@@ -137,6 +140,8 @@ class Sweeper(Base):
             self._show(cells, found, len(batch) - len(cells))
         if any(state != DONE for state, _ in found.values()):
             sys.exit(1)
+        if not self.status:
+            Sweeper.done = list(cells)
 
     def _combined(self, variant: Mapping[str, Any], arguments: Sequence[str]) -> list[list[str]]:
         """Return all combinations of a variant with what is swept; the last value of a setting counts."""

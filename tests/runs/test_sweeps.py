@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.made_runs import make_run
 from helpers.sweeping import UNLUCKY, sweep
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.plugins import Plugins
@@ -25,6 +26,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from ctgraph_rl.log.files import locked
+from ctgraph_rl.run import MOST_IN_TABLE, show_sweep
 from ctgraph_rl.runs import job
 from ctgraph_rl.runs.config import explain
 from ctgraph_rl.runs.status import SHOWN, RunOutcome, Status, SweepProgress, lock_holder, report, status_of
@@ -47,8 +49,24 @@ def test_a_second_start_does_only_what_is_missing(learned, monkeypatch, capsys):
 
     assert (first, second) == (0, 0)
     assert len(before) == 2 and len(learned) == len(set(learned)) == 6
-    assert capsys.readouterr() == (ALL_DONE.format(2) + ALL_DONE.format(6), "")
+    lines = capsys.readouterr().out.splitlines(keepends=True)
+    said = [line for line in lines if line.startswith("sweep of")]
+    assert said == [ALL_DONE.format(2), ALL_DONE.format(6)] and said[0] == lines[0]
+    assert lines[-1] == "ctgraph-rl report runs/su_b1_4tasks makes a page of figures and tables of all runs there\n"
     assert sorted(path.name for path in Path("runs").iterdir()) == ["multirun.yaml", "su_b1_4tasks"]
+
+
+def test_a_sweep_that_is_done_ends_with_its_table_and_what_to_do_next(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folders = [make_run(tmp_path, seed) for seed in (0, 1)]
+
+    show_sweep(folders)
+    lines = capsys.readouterr().out.splitlines()
+    show_sweep(folders * MOST_IN_TABLE)
+
+    assert any(line.split()[:2] == ["average", "performance"] for line in lines)
+    assert lines[-1] == "ctgraph-rl report . makes a page of figures and tables of all runs there"
+    assert capsys.readouterr().out == "ctgraph-rl results . prints a table\n"
 
 
 def test_a_failing_cell_stops_no_other_and_is_tried_again(learned, monkeypatch, capsys):
@@ -106,7 +124,7 @@ def test_a_cell_that_another_process_runs_is_left_to_it(learned, monkeypatch, ca
 
     assert code == 1
     assert [path.name.split("-")[1] for path in learned] == ["seed1", "seed0", "seed2"]
-    numbers, busy, _ = capsys.readouterr().out.splitlines()[1:]
+    numbers, busy, _ = capsys.readouterr().out.splitlines()[-3:]
     assert numbers == "sweep of 3 cells: 2 done, 0 failed, 1 in use, 0 missing"
     assert busy.startswith(f"  in use   seed=1  by process {os.getpid()} on {socket.gethostname()} since ")
 
