@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
@@ -17,6 +18,7 @@ from ctgraph_rl.collective.summary import COLLECTIVE, FILES, described, read_col
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.learn.collective import ExchangeLike, Member, learn_collective
 from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder, members_of
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
@@ -28,6 +30,10 @@ from ctgraph_rl.runs.interrupt import Interrupt
 from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished
 from ctgraph_rl.runs.status import marked_if_it_fails
 from ctgraph_rl.runs.train import Participant, execute
+from ctgraph_rl.tasks.curriculum import Curriculum
+
+LONG_ID = 1000
+"""Numbers of a one-hot task id above which a collective warns."""
 
 Runs = Sequence[tuple[Any, Path]]
 """The configuration and the directory of each member."""
@@ -102,6 +108,7 @@ def _learn(cfg: Any, runs: Runs, exchange: ExchangeLike, run_dir: Path, *, inter
     """Build the objects of all members, let them learn, and write the results."""
     checkpoints = Checkpoints(run_dir / CHECKPOINTS, cfg.checkpoint_seconds, cfg.resume == "strict", interrupt)
     jobs, random = _jobs(runs, interrupt)
+    _warn_of_long_ids([job.curriculum for job in jobs])
     exchange.connect([job.agent for job in jobs])
     if _is_replaced(cfg, runs):
         checkpoints.clear()
@@ -139,6 +146,19 @@ def _learn(cfg: Any, runs: Runs, exchange: ExchangeLike, run_dir: Path, *, inter
         execute(participants, [None] * len(jobs) if saved is None else saved["members"], learn, progress)
         write_summary(run_dir)
         checkpoints.clear()
+
+
+def _warn_of_long_ids(curricula: Sequence[Curriculum]) -> None:
+    """Say on standard error, before members learn, that their task ids make them slow and large."""
+    longest = max(curricula, key=lambda each: each.protocol.length(len(each.tasks)))
+    length = longest.protocol.length(len(longest.tasks))
+    if longest.protocol.task_id == "one_hot" and length > LONG_ID:
+        print(
+            f"note: each observation of {terminal_text(longest.name)} has a task id of {length:,} numbers, which are "
+            "inputs of every network and mask, so members are slow and large; protocol.task_id=at_boundaries gives ids "
+            "to learners without observations of them",
+            file=sys.stderr,
+        )
 
 
 def _jobs(runs: Runs, interrupt: Interrupt) -> tuple[list[Job], list[torch.Tensor]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from ctgraph_rl.agent import Agent
 from ctgraph_rl.checks import takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, run_loop
+from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -24,7 +26,7 @@ def learn_curriculum(
     agent: Agent,
     seed: int = 0,
     log: RunLog | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     device: torch.device | str = "cpu",
     saved: Mapping[str, Any] | None = None,
     checkpoint: OfferCheckpoint | None = None,
@@ -41,7 +43,7 @@ def learn_curriculum(
         agent: the learner.
         seed: the environment's seed, in [0, 2**63).
         log: where measurements are appended; default: a new one in memory.
-        progress: is updated after every batch.
+        progress: is updated after every batch; True: a bar on a terminal and in a notebook, lines elsewhere.
         device: where the environment lives.
         saved: a state that ``checkpoint`` was given, to resume from with the same bits as if the run had never stopped.
             The agent is built as it was, and the log holds what it held then.
@@ -72,7 +74,11 @@ def learn_curriculum(
         if checkpoint is not None:
             checkpoint(lambda: make_states()[0], at_block_end)
 
-    run_loop(members, progress, offer)
+    with ExitStack() as stack:
+        if isinstance(progress, bool):
+            bar = ProgressBar(len(curriculum.blocks), curriculum.num_frames)
+            progress = stack.enter_context(bar) if progress else None
+        run_loop(members, progress, offer)
     for error in members.failed.values():
         raise error
     return log

@@ -1,10 +1,11 @@
-"""A progress bar on a terminal, a line every ten seconds elsewhere."""
+"""A progress bar on a terminal, and in a notebook with ipywidgets; a line every ten seconds elsewhere."""
 
 from __future__ import annotations
 
 import math
 import time
 from datetime import timedelta
+from importlib.util import find_spec
 from types import TracebackType
 
 from rich.console import Console
@@ -29,7 +30,7 @@ class ProgressBar:
         self.done = done
         self.console = Console(stderr=True) if console is None else console
         self._bar = Progress(BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console)
-        self._live = self.console.is_terminal
+        self._live = self.console.is_terminal or (self.console.is_jupyter and find_spec("ipywidgets") is not None)
         self._task = self._bar.add_task(self.beginning, completed=done, total=num_frames)
         self._start = self._last_line = time.perf_counter()
 

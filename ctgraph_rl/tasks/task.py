@@ -102,6 +102,12 @@ class Task:
     resumes: ClassVar[bool] = True
     """See `TaskLike`."""
 
+    def __repr__(self) -> str:
+        """Return graph, goal and images, in one line."""
+        graph = self.graph
+        shape = f"b={graph.branching_factor}, d={graph.depth}, p={graph.wait_prob:g}"
+        return f"<Task {shape}, goal {'.'.join(map(str, self.goal)):.40}, {self.images!r:.80}>"
+
     def __post_init__(self) -> None:
         make_fields_plain(self)
         self._check_parts()

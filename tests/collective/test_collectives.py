@@ -11,8 +11,9 @@ import torch
 from helpers.kill_runs import equal
 from helpers.sweeping import command_line, sweep
 
-from ctgraph_rl import RunLog
+from ctgraph_rl import RunLog, packages
 from ctgraph_rl.collective import __main__ as collectives
+from ctgraph_rl.collective import job
 from ctgraph_rl.collective.summary import metrics, read_collective
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.load import load
@@ -296,3 +297,14 @@ def test_a_folder_without_collectives_is_refused(monkeypatch, capsys):
 
     assert end.value.code == 2
     assert "no collective.jsonl in or below .: run one with exchange=l2d2c" in capsys.readouterr().err
+
+
+def test_long_task_ids_are_warned_of_before_members_learn(capsys):
+    curricula = [packages.curriculum_named(name) for name in ("ct2_interfering", "ct28")]
+
+    job._warn_of_long_ids(curricula[:1])
+    first = capsys.readouterr().err
+    job._warn_of_long_ids(curricula)
+
+    assert first == ""
+    assert "each observation of ct28 has a task id of 16,368 numbers" in capsys.readouterr().err

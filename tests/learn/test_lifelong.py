@@ -358,3 +358,12 @@ def test_a_policy_sees_no_hidden_state_in_the_data():
 
     allowed = {"observation", "is_init", "step_count", "episode_reward", "outcome", "leaf"}
     assert keys <= allowed | {"done", "terminated", "truncated", "action"}
+
+
+def test_a_bar_shows_progress_where_it_is_asked_for(capsys):
+    learn_curriculum(curriculum(Block(ONE, 16), Block(TWO, 16)), Scripted(num_steps=4), progress=True)
+    shown = capsys.readouterr().err
+    learn_curriculum(curriculum(Block(ONE, 16), Block(TWO, 16)), Scripted(num_steps=4), progress=False)
+
+    assert shown.startswith("block 2/2  32/32 frames  ")
+    assert capsys.readouterr().err == ""

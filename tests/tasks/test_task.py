@@ -133,3 +133,9 @@ def test_the_image_seed_is_that_of_the_image_set_and_none_for_one_hot():
     seeds = [surjective(image_seed=7).image_seed, one_hot().image_seed]
 
     assert seeds == [7, None]
+
+
+def test_a_task_is_shown_in_one_short_line():
+    task = Task(CTGraph(2, 2, 0.5), (1, 2), surjective().observations, PaperImages(5))
+
+    assert repr(task) == "<Task b=2, d=2, p=0.5, goal 1.2, PaperImages(num_images=5, seed=1, size=12)>"
