@@ -8,7 +8,7 @@ from baselines.parts.catalogue import catalogue
 
 NOTE = (
     "cell= is what an agent with memory remembers with. Without memory, or with cell=none, an agent acts on the\n"
-    "present observation alone: where that does not show the state, its return is at most the memoryless ceiling of\n"
+    "present observation only: where that does not show the state, its return is at most the memoryless ceiling of\n"
     "the task, which ctgraph-rl curricula describe NAME shows."
 )
 """What an agent without memory loses."""

@@ -225,7 +225,7 @@ class MOHQA(QLearner):
         num_features: width of phi.
         learning_rate: of RMSprop.
         gamma: discount factor.
-        predict_sum: predict q + u, as the targets do; False: q alone, as published.
+        predict_sum: predict q + u, as the targets do; False: only q, as published.
         eligibility_steps: tau, over which eligibility falls to 1/e.
         hebbian_share: share of the features, rounded up, whose eligibility rises, and share of those whose falls.
         hebbian_change: by how much.

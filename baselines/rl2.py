@@ -133,7 +133,7 @@ class RL2(PPO):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from a batch; return mean losses and the success rates of the first and last episodes of trials.
 
-        The last step of a batch only provides the value to bootstrap from, so nothing is learned from one step alone.
+        The last step of a batch only provides the value to bootstrap from, so a batch of one step teaches nothing.
         """
         losses = super().learn(batch) if batch.shape[1] > 1 else {}
         ends = batch["next"][batch["next", "done"].squeeze(-1)]

@@ -5,7 +5,7 @@ has them: on ctgraph_rl.sb3.SB3VecEnv, and on what its make_vec_env makes of the
 own defaults on 8 rows. Every round lets each learn for a while, one after the other, so what slows the machine down
 slows all of them; frames per second are medians of the rounds. Then each learns from scratch with several seeds until
 it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations does not count. Seconds are those of one
-core. --cells measures LSTM-PPO with each cell in place of the LSTM, alone. Ctrl-C ends a measurement, and what was
+core. --cells measures only LSTM-PPO, with each cell in place of the LSTM. Ctrl-C ends a measurement, and what was
 measured until then is printed.
 
 --device cuda measures benchmarks.agent_ladder instead, --startup how long a run takes to its first step,
@@ -213,7 +213,7 @@ def on_device(device: torch.device, options: argparse.Namespace) -> str:
 
 
 def beside_products(agents: list[str], rounds: int) -> str:
-    """Format how fast agents learn, LSTM-PPO also with pixel noise, beside their matrix products alone."""
+    """Format how fast agents learn, LSTM-PPO also with pixel noise, beside only their matrix products."""
     task = ct_su_b1(GOAL)
     noisy = replace(task, observations=replace(task.observations, read_noise=10))
     pairs = [*((name, label, TASKS[label]) for name, label in PAIRS), ("lstm_ppo", "CT-SU-B1, noise", noisy)]
@@ -245,7 +245,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--device", default=None, help="instead: PPO and LSTM-PPO on one device, such as cuda")
     parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
     parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
-    parser.add_argument("--roofline", action="store_true", help="instead: learning beside its matrix products alone")
+    parser.add_argument("--roofline", action="store_true", help="instead: learning beside only its matrix products")
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
@@ -281,7 +281,7 @@ def learned(options: argparse.Namespace) -> list[Contender]:
     """Let agents learn for as long as the options say, or until Ctrl-C; return them with their measurements."""
     console = Console(stderr=True)
     if not find_spec("sb3_contrib"):
-        missing = "Stable-Baselines3 is missing, ours are measured alone: pip install 'ctgraph_rl[benchmark]'"
+        missing = "Stable-Baselines3 is missing, only ours are measured: pip install 'ctgraph_rl[benchmark]'"
         console.print(missing, markup=False, soft_wrap=True)
     measured = list(contenders(options.agents) if options.cells is None else cells(options.cells))
     learners = [contender.make(0) for contender in track(measured, "building", console=console)]

@@ -1,4 +1,4 @@
-"""What bounds learning: its matrix products, timed alone beside it, for `baselines.benchmark`."""
+"""What bounds learning: its matrix products, timed separately, for `baselines.benchmark`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def table(learners: Sequence[tuple[str, str, Callable[[], int]]], rounds: int) -
         learners: agent, task, and what learns from a batch and returns its frames, which is one that has learnt.
         rounds: how often each is measured.
     """
-    columns = ["agent", "task", "steps/s", "multiply-adds a step", "products alone, steps/s", "share of products"]
+    columns = ["agent", "task", "steps/s", "multiply-adds a step", "only products, steps/s", "share of products"]
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for agent, task, learn in learners:
         times = [_measured(learn) for _ in range(rounds)]
@@ -83,7 +83,7 @@ def table(learners: Sequence[tuple[str, str, Callable[[], int]]], rounds: int) -
 
 
 def _measured(learn: Callable[[], int]) -> tuple[float, float, float]:
-    """Return seconds an environment step, those of its products alone, and its multiply-adds."""
+    """Return seconds an environment step, those of only its products, and its multiply-adds."""
     start = time.process_time()
     frames = sum(learn() for _ in range(4))
     seconds = time.process_time() - start

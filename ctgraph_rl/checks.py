@@ -44,7 +44,7 @@ def require(*rules: tuple[bool, str]) -> None:
 def nearest(word: str, choices: Iterable[str]) -> str | None:
     """Return the choice that a misspelt word probably stands for, ignoring case; None if none is near.
 
-    Initials count as a name, such as ``lr`` for ``learning_rate``, and so does a part of one name alone.
+    Initials count as a name, such as ``lr`` for ``learning_rate``; a part of a single name counts, too.
     """
     known = {choice.lower().replace("-", "_"): choice for choice in choices}
     word = word.lower().replace("-", "_")

@@ -1,4 +1,4 @@
-"""The console script ``ctgraph-rl``: a first word chooses a command, settings alone start a run."""
+"""The console script ``ctgraph-rl``: a first word chooses a command, a setting starts a run."""
 
 from __future__ import annotations
 

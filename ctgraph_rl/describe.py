@@ -189,7 +189,7 @@ def _other_blocks(curriculum: Curriculum) -> Sheet:
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(block.tasks):
             rows.append((str(number), labels[task], f"{block.num_frames:,}"))
-    note = f"Tasks are of {type(curriculum.tasks[0]).__name__}: difficulty and ceilings are known of CT-graphs alone."
+    note = f"Tasks are of {type(curriculum.tasks[0]).__name__}: difficulty and ceilings are known only of CT-graphs."
     return Sheet("Blocks", {"block": "r", "task": "l", "frames": "r"}, tuple(rows), (note,))
 
 

@@ -1,8 +1,8 @@
 """Files in directories that others may have made: written whole and never through a link, read within limits.
 
 Every file of the package is written here. A file is written beside its place and renamed, so what was there, a link
-too, is replaced and not followed. Folders that the package names itself are refused where they are links. What the
-user names, such as ``--csv FILE``, is taken as it is: `write_named`.
+too, is replaced and not followed. Folders that the package names itself are refused where they are links. A
+name that the user gives, such as ``--csv FILE``, is followed: `write_named`.
 """
 
 from __future__ import annotations

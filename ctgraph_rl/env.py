@@ -29,7 +29,7 @@ from ctgraph_rl.tasks.task import Task
 class CTGraphEnv(EnvBase):
     """A batch of CT-graphs, ``batch_size=[len(tasks)]``; every row has its own task.
 
-    A row's trajectory depends on (seed, row number, its actions) alone: rows 4..7 of a batch of eight equal a batch of
+    A row's trajectory depends only on (seed, row number, its actions): rows 4..7 of a batch of eight equal a batch of
     four with ``first_row=4``. Rows may differ in every field of `Task` but the kind and size of the observations.
 
     Observation keys, for N rows:
@@ -189,7 +189,7 @@ class CTGraphEnv(EnvBase):
         """A copy of the rows' states, to go back to with ``reset(TensorDict(state=state), set_state=True)``.
 
         It holds the hidden Markov state: a planner may see it, a policy may not. Rows of it may be put in any order, to
-        branch several rows off one; their further randomness is that of their own row numbers. With a ``_reset`` mask,
+        branch several rows off one; their further randomness is that of their row numbers. With a ``_reset`` mask,
         give a clone: TorchRL writes into the TensorDict of a partial reset.
         """
         fields = {field: value.clone() for field, value in self.rows.state._asdict().items()}

@@ -1,4 +1,4 @@
-"""CT-graphs as Gymnasium environments: one alone, and a batch with all three autoreset modes.
+"""CT-graphs as Gymnasium environments: a single one, and a batch with all three autoreset modes.
 
 Importing this module registers the ids ``ctgraph/CTGraph-v0``, ``ctgraph/CT-FO-B1-v0`` and so on;
 ``gymnasium.make("ctgraph_rl.gym:ctgraph/CT-SU-B1-v0")`` imports and makes in one.
@@ -50,7 +50,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
     Args:
         task: see `make_task`, as for ``config`` and ``changes``.
         config: see `make_task`.
-        task_pool: the tasks that `set_task` may be given. Default: the task alone.
+        task_pool: the tasks that `set_task` may be given. Default: only the task.
         task_ids: the id of each task of the pool, such as ``curriculum.task_ids``. Observations are then a dict of
             ``observation`` and ``task_id``, uint8 [num_task_ids]: the id as one-hot.
         num_task_ids: length of ``task_id``; None: just enough.
@@ -148,7 +148,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
     """A batch of CT-graphs, equal step for step to `gymnasium.vector.SyncVectorEnv` of as many `CTGraphGymEnv`.
 
-    Row i has the random stream of its own seed, ``seed + i`` or ``seed[i]``. What is returned is not changed later.
+    Row i has the random stream of seed ``seed + i``, or ``seed[i]``. Returned arrays are not changed later.
 
     Args:
         num_envs: number of rows.

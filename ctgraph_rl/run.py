@@ -49,10 +49,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float | None:
     check_packages()
     with first_imports():
         from ctgraph_rl.collective import job  # here: --help and a wrong setting need no torch
-        from ctgraph_rl.report.style import require_packages  # here: as above
 
-    if cfg.report:
-        require_packages()
     run_dirs = job.run_cells(cfg, run_dir)
     if cfg.report or not in_sweep():
         for each in run_dirs:

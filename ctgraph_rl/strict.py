@@ -1,6 +1,6 @@
 """Readers of files of other people: one for each format, which takes what has one meaning and refuses the rest.
 
-What two programs could read as two things is refused, such as a key that is there twice, and so is what would take more
+They refuse what two programs could read as two things, such as a key that is there twice, and what would take more
 memory or time than its file says. Every error is a ``ValueError`` of one line.
 """
 
@@ -143,7 +143,7 @@ class _Plain(yaml.SafeLoader):
     def construct_number(self, node: Any) -> Any:
         """Return an integer or a float in decimal digits."""
         text = self.construct_scalar(node)
-        shown = f"{text:.40} is read as a number by some programs alone: put it in quotes, or write decimal digits"
+        shown = f"{text:.40} is a number to some programs, a text to others: put it in quotes, or write decimal digits"
         require(
             (NUMBER.fullmatch(text) is not None, shown), (LONG_NUMBER.search(text) is None, f"{text:.40}: too long")
         )

@@ -66,7 +66,7 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
 
     Args:
         tasks: a task or several.
-        num_decisions: k in 0..d; 0 gives all goals, d the task alone.
+        num_decisions: k in 0..d; 0 gives all goals, d only the task.
     """
 
     def vary(task: Task) -> Iterable[Task]:
@@ -322,7 +322,7 @@ def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Ob
 
 
 def _with_room(images: ImageSet, num_images: int, exact: bool = False) -> ImageSet:
-    """A generated set of at least, or exactly, so many images; any other set as it is."""
+    """A generated set of at least, or exactly, so many images; any other set unchanged."""
     settable = "num_images" in {field.name for field in fields(images) if field.init}  # type: ignore[arg-type]
     fits = images.num_images == num_images if exact else images.num_images >= num_images
     return images if fits or not settable else replace(images, num_images=num_images)  # type: ignore

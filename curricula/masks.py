@@ -52,7 +52,7 @@ def ct8_md(num_frames: int = 102_400) -> Curriculum:
 
 
 def single_task(depth: int = 2, num_frames: int = 102_400) -> Curriculum:
-    """One task alone, the second goal of CT8 multi-depth at a depth, without a task id: how far plain exploration goes.
+    """A single task, the second goal of CT8 multi-depth at a depth, without a task id: how far plain exploration goes.
 
     Args:
         depth: d; 0, ..., 0, 1 is the goal.

@@ -89,7 +89,7 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
     Args:
         num_frames: frames per task.
         seed_set: which of the five sets of image seeds, 1..5.
-        agent: the task of one agent alone, 0..27; None: all tasks one after the other, which is ours.
+        agent: the task of a single agent, 0..27; None: all tasks one after the other, which is ours.
     """
     tasks = _of_agent([*chain(*_inconsistent())], agent)
     evaluation = Evaluation(num_episodes=50)
@@ -97,7 +97,7 @@ def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: in
 
 
 def ct28_one_branch(num_frames: int = 51_200) -> Curriculum:
-    """The first family of CT28 alone with image seed 9, depth 2 to 8; the published file is not valid JSON.
+    """The first family of CT28 by itself with image seed 9, depth 2 to 8; the published file is not valid JSON.
 
     Args:
         num_frames: frames per task.
@@ -169,7 +169,7 @@ def ct20(num_frames: int = 102_400, agent: int | None = None) -> Curriculum:
 
     Args:
         num_frames: frames per task.
-        agent: the task of one agent alone, 0..19; None: all tasks one after the other, which is ours.
+        agent: the task of a single agent, 0..19; None: all tasks one after the other, which is ours.
     """
     return _two_families("ct20", L2D2C, deepest=11, num_frames=num_frames, agent=agent)
 
@@ -182,7 +182,7 @@ def mosaic_ladder(num_frames: int = 102_400, agent: int | None = None) -> Curric
 
     Args:
         num_frames: frames per task.
-        agent: the task of one agent alone, 0..25; None: all tasks one after the other, which is ours.
+        agent: the task of a single agent, 0..25; None: all tasks one after the other, which is ours.
     """
     return _two_families("mosaic_ladder", MOSAIC, deepest=14, num_frames=num_frames, agent=agent)
 

@@ -239,7 +239,7 @@ def random_graphs(num_frames: int = 51_200, image_seed: int = 1, num_tasks: int 
     """A large set of random surjective graphs that share their images: which features are invariant?
 
     Section 3.5 of the paper: n graphs differ in branching factor (2 or 3), depth (2, 3 or 4), wait probability (0 or
-    0.5) and goal. What the images mean, and waiting at wait states, is common to all.
+    0.5) and goal. All share the meaning of images, and waiting at wait states.
 
     Args:
         num_frames: frames per task.

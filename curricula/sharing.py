@@ -1,7 +1,7 @@
 """The sequences of L2D2-C: agents that learn the same tasks in different orders and exchange what they know.
 
 Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. Fully observable graphs of depth 2; a task is an image seed and
-one of four goals, and its id counts both: 4 (seed - 1) + goal. An agent of its own evaluated 25 episodes; when, and
+one of four goals, and its id counts both: 4 (seed - 1) + goal. A separate agent evaluated 25 episodes; when, and
 whether actions were greedy, is not known: block ends and greedy actions are our choice. Whether agents saw the task
 ids of the files is not known either.
 """

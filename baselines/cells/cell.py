@@ -26,7 +26,7 @@ class Cell(TakesNumbers, nn.Module):
     """What an agent remembers with: it reads features, step after step, and writes what the heads read.
 
     A class that derives from it defines `state_keys`, `zeros` and `step`, and `sequence` where there is a faster way
-    than step by step. A parameter of its own, outside PyTorch's layers, needs a ``reset_parameters``. A cell reads the
+    than step by step. A parameter outside PyTorch's layers needs a ``reset_parameters``. A cell reads the
     features of the observation and, if set, the agent's own last action and reward; never the time.
 
     Args:
@@ -39,7 +39,7 @@ class Cell(TakesNumbers, nn.Module):
 
     state_keys: tuple[str, ...] = ()
     """The keys of its state in the data. A key that begins with `ctgraph_rl.learn.collect.UNSTORED` is carried from
-    step to step, and batches hold its value at their first step alone, which is all that `sequence` needs."""
+    step to step, and batches hold its value at their first step only, which is all that `sequence` needs."""
 
     memory: ClassVar[bool] = True
     """Whether it can hold anything of earlier steps."""

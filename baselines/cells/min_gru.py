@@ -1,4 +1,4 @@
-"""minGRU: a GRU whose gate reads the input alone, so that all steps are computed at once.
+"""minGRU: a GRU whose gate reads only the input, so that all steps are computed at once.
 
 Feng et al. 2024 (arXiv 2410.01201): z = sigmoid(W_z x + b_z), h <- (1 - z) h + z (W_h x + b_h).
 """

@@ -8,7 +8,7 @@ from baselines.cells.cell import Cell, CellState, linear_layer
 
 
 class NoMemory(Cell):
-    """A linear layer with ReLU that reads the present step alone; see `Cell` for the arguments."""
+    """A linear layer with ReLU that reads only the present step; see `Cell` for the arguments."""
 
     memory = False
     holds = "nothing"

@@ -1,7 +1,7 @@
 """ADWIN on the return: a window of episodes is cut where the mean returns of its two parts differ.
 
 Bifet and Gavalda 2007 (SDM), "Learning from time-changing data with adaptive windowing"; the detector is that of the
-library River. What is a suspicion, and when a label is accepted, are our choices.
+library River. We chose what counts as a suspicion, and when a label is accepted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """SWOKS: sliced Wasserstein distances from the past, and a test whether they have grown.
 
-Dick et al. 2024 (CoLLAs), arXiv 2405.19047, here after the equations, without their code. What samples of a trial do,
-what is kept of a label to which the learner returns, and how often a sample has to be new are our choices.
+Dick et al. 2024 (CoLLAs), arXiv 2405.19047, here after the equations, without their code. We chose the
+use of samples of a trial, what is kept of a label to which the learner returns, and how often a sample has to be new.
 """
 
 from __future__ import annotations

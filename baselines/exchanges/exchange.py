@@ -17,7 +17,7 @@ from ctgraph_rl.learn.messages import Fields, Message
 
 
 class Exchange(TakesNumbers):
-    """An exchange without messages, from which others derive: each member learns alone.
+    """An exchange without messages, from which others derive: no member learns from another.
 
     Args:
         num_members: learners of the collective.

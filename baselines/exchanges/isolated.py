@@ -1,4 +1,4 @@
-"""No exchange: the members of a collective learn alone. What any other exchange is compared with."""
+"""No exchange: no member of a collective learns from another. Other exchanges are compared with it."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from baselines.exchanges.exchange import Exchange
 
 
 class Isolated(Exchange):
-    """`Exchange` as it is."""
+    """`Exchange` without changes."""

@@ -1,6 +1,6 @@
 """L2D2-C: learners ask each other for masks of the task that they learn, and take over the best one.
 
-Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. That the first query is after the first batch is our choice.
+Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. We chose to query first after the first batch.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """MOSAIC: learners find out by embeddings who learns a similar task, and combine masks of those who do better.
 
 Nath et al. 2025 (arXiv 2506.05577), repository DMIU-ShELL/MOSAIC, where each member has one task. Its detection of task
-changes is not here: a new task begins without an embedding. That the first query is after the first batch is ours.
+changes is not here: a new task begins without an embedding. We chose to query first after the first batch.
 """
 
 from __future__ import annotations

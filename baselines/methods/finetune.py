@@ -8,7 +8,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Finetune(Method):
-    """The agent learns one task after the other as it is. Nothing is stored, and any agent will do."""
+    """The agent learns one task after the other, unchanged. Nothing is stored, and any agent will do."""
 
     needs_boundaries = False
 

@@ -24,7 +24,7 @@ class MaskShared(Masks):
     """`Masks` whose scores are a linear combination of own scores and of c that were received.
 
     Each weight tensor l has s = sum_i a_i s_i + a_own s_own, where a is the softmax of c + 1 trained numbers b_l; the
-    received scores s_i are fixed. What is received replaces what was before, of which the own scores keep their share
+    received scores s_i are fixed. Received scores replace those before, of which the own scores keep their share
     (`receive`). Without an exchange nothing is received, and this is `Masks` with random scores for each task.
 
     Stored are 4 P bytes more for each of the c received scores.
@@ -69,7 +69,7 @@ class MaskShared(Masks):
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
-        """Start with own scores alone."""
+        """Start with only the own scores."""
         self._keep(self.received[:0])
         super().start_task(task)
 

@@ -174,7 +174,7 @@ class TaskMethod(Method):
         return self.started.index(task) if task in self.started else 0
 
     def present_with(self, task: int, inside: Tensor, kept: Tensor) -> Tensor | None:
-        """Return the present weights with a part that each task has of its own; None if that is the present one.
+        """Return the present weights with the part that belongs to the present task; None if that is the present one.
 
         Args:
             task: its id.

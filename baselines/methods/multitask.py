@@ -14,7 +14,7 @@ from ctgraph_rl.tasks.switch import ByEpisode
 class Multitask(Finetune):
     """One block with all tasks and frames replaces the curriculum's; each environment changes tasks at every episode.
 
-    The agent is as it is. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
+    The agent is unchanged. Nothing is stored, and nothing can be forgotten. Without task ids only tasks that look
     different can all be solved.
     """
 
@@ -24,7 +24,7 @@ class Multitask(Finetune):
         """Return the curriculum of one block.
 
         Raises:
-            ValueError: for one task alone, and ids that are given at boundaries.
+            ValueError: for a single task, and ids that are given at boundaries.
         """
         super().prepare(curriculum)
         tasks = curriculum.tasks

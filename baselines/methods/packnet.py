@@ -28,7 +28,7 @@ class PackNet(TaskMethod):
 
     The k-th of K tasks keeps, of each weight matrix, the largest 1 / (K - k + 1) of the weights that are free; pruned
     ones are 0 and free for later tasks. A task acts with the weights of the tasks up to it. Biases are those of the
-    first task, and each task has output layers of its own, see `Heads`. A task that returns trains those alone.
+    first task, and each task has separate output layers, see `Heads`. A task that returns trains only those.
 
     Stored are each weight's owner, 2 P bytes, whether it may change and whether the present task uses it, 2 P bytes,
     its value, 4 P bytes, and the output layers.

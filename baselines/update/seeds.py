@@ -1,7 +1,7 @@
 """Several seeds as one batch: agents of equal structure whose networks act and learn in the same operations.
 
-Weights are stacked for forward passes and gradient steps alone. Between two calls each agent has its own, so saving,
-evaluation and the hooks at task changes are those of an agent alone.
+Weights are stacked only for forward passes and gradient steps. Between two calls each agent has its own, so saving,
+evaluation and the hooks at task changes are those of a single agent.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def why_not_together(agent: Agent) -> str | None:
 class SeedGroup:
     """Agents of one configuration with different seeds, which act and learn together.
 
-    Each draws from its own generator, in the order in which it draws from torch's global one when alone.
+    Each draws from its own generator, in the order in which it draws from torch's global one in a run of one seed.
 
     Args:
         agents: at least one, each as `ctgraph_rl.runs.train.new_agent` returns it; `why_not_together` has no objection.

@@ -18,7 +18,7 @@ from baselines.update.update import UpdateState, over_seeds, stacked, unstacked
 
 
 def named_tensors(learner: Learner) -> dict[str, Tensor]:
-    """Return a learner's parameters and buffers by name, in an order that depends on its structure alone."""
+    """Return a learner's parameters and buffers by name, in an order that depends only on its structure."""
     return {
         f"{path}.{name}" if path else name: value
         for path, module in learner.named_modules()

@@ -41,7 +41,7 @@ Update = Callable[["Learner", UpdateState, Data], dict[str, Tensor]]
 def update(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
-    It has no branch on data and depends on its arguments alone. With several seeds these are minibatches [seeds, items,
+    It has no branch on data and depends only on its arguments. With several seeds these are minibatches [seeds, items,
     ...], and results are [seeds].
 
     Args:
@@ -134,5 +134,5 @@ def stacked(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def unstacked(tensor: Tensor) -> Tensor:
-    """Return the parameters of several seeds as they are, [seeds, ...]: a view of what `stacked` returned."""
+    """Return the parameters of several seeds without a copy, [seeds, ...]: a view of what `stacked` returned."""
     return tensor.mT if tensor.ndim == 3 else tensor

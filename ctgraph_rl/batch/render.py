@@ -1,6 +1,6 @@
 """Pictures of the rows of a batch: the current observation on the left, the tree and the position in it on the right.
 
-Nothing here knows an environment: `render` is a function of its arguments alone. Trees are placed in pixels, drawn at
+Nothing here knows an environment: `render` depends only on its arguments. Trees are placed in pixels, drawn at
 twice the size in palette numbers, and brought to size and to RGB by the mean of 2x2 pixels.
 """
 

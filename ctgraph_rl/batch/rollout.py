@@ -152,11 +152,11 @@ def _tensors(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowStat
 
 
 def _chosen(rows: Rows, policy: TensorPolicy, steps: Steps, t: int, start: RowState) -> Tensor:
-    """Return the actions of a policy at step t; it must leave the rows as they are at the start."""
+    """Return the actions of a policy at step t; it must not change the rows."""
     params = rows.params
     action = policy(steps.observation[t], steps.is_init[t])
     same = rows.params is params and all(map(operator.is_, rows.state, start))
-    require((same, "a policy must leave the rows as they are during a rollout: change them between two rollouts"))
+    require((same, "a policy must not change the rows during a rollout: change them between two rollouts"))
     _check_actions(rows, action, steps.action.shape[1:])
     return action
 

@@ -23,7 +23,7 @@ class TensorEngine:
     _draws: DrawsAhead
 
     def bind(self, params: RowParams, tables: Tables) -> None:
-        """Take parameters; draws made ahead stay as long as they are those of the rows' streams and uses."""
+        """Take parameters; draws made ahead stay while they fit the rows' streams and uses."""
         draws = getattr(self, "_draws", None)
         if draws is None or not draws.serve(params, tables.uses):
             self._draws = DrawsAhead(params, tables.uses)

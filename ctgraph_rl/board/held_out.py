@@ -48,7 +48,7 @@ def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]
 
 
 def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
-    """Return what is learned: a seed each, with images and goals of its own, and the submitted configuration.
+    """Return what is learned: a seed each, with other images and goals, and the submitted configuration.
 
     Args:
         submission: with the configuration.
@@ -108,7 +108,7 @@ def drawn(text: str, most: int) -> int:
 def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     """Return a curriculum with other images and goals, and all else alike: what its tasks share, they share still.
 
-    Tasks that are no CT-graphs stay, and the seeds alone are other ones.
+    Tasks that are no CT-graphs stay, and only the seeds change.
 
     Every generated image set gets another seed, equal ones the same. The branches of every decision state are renamed,
     in all tasks alike, so that goals that share their first decisions do so afterwards. Image sets without a seed stay.

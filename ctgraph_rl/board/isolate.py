@@ -72,7 +72,7 @@ class Isolation(NamedTuple):
             return []
         inside = "it sees no files but its folder, the code, Python and the programs of the system"
         other = "no other process, socket, shared memory, keyring, device or terminal"
-        return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes its folder alone", other]
+        return [f"bubblewrap {self.bubblewrap}", "no network", inside, "it changes only its folder", other]
 
     def missing(self) -> list[str]:
         """Return a text for each thing that the code of others could do here."""
@@ -238,7 +238,7 @@ def _process(
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process, those that it started as far as they are seen, and its group."""
+    """Kill a process, those of its children that can be seen, and its group."""
     started = [] if process.poll() is not None else [each for each, _ in _family(process.pid)]
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
@@ -383,7 +383,7 @@ def main() -> None:
 
 def _limit(limits: Limits, is_confined: bool) -> None:
     """Set the limits that the system holds, of this process and of each that it starts."""
-    import resource  # here: POSIX systems alone have it
+    import resource  # here: only POSIX systems have it
 
     wanted = {
         resource.RLIMIT_DATA: limits.memory,

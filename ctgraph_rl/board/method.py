@@ -31,7 +31,7 @@ given:                      # the information that the learner is given; null: a
   boundaries: null          # announced or hidden
   task_id: null             # hidden, one_hot or at_boundaries
   guide_frames: null        # frames of a block over which a policy that navigates acts in the learner's place
-bytes_per_task: 0           # bytes that the learner keeps for each further task; 0 for weights of a constant size alone
+bytes_per_task: 0           # bytes that the learner keeps for each further task; 0 if only weights of a constant size
 tuning:
   how: null                 # how settings were chosen, and over which values; not tuned if they were not
   seeds: []                 # the seeds of the runs by which they were chosen; none of them may be submitted

@@ -126,7 +126,7 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
 
 
 def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> RerunCell:
-    """Return what is learned again for the seeds of a group, or for one that was alone."""
+    """Return what is learned again for the seeds of a group, or for a single seed."""
     runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
     job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
     return RerunCell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))

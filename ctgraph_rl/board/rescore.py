@@ -1,7 +1,7 @@
 """Level *rescored* of a verification: what a submission says is what its own logs give.
 
 All metrics and evaluations are computed again from the logs and compared, digit by digit on one kind of machine. It
-runs no code of the submission. What the logs say may still be made up: a rerun finds that.
+runs no code of the submission. Logs may still be made up: a rerun finds that.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ def _value(cells: Sequence[str] | None) -> str:
 
 
 def _number(cell: str) -> object:
-    """Return a cell as a number, or as it is."""
+    """Return a cell as a number if it is one, else its text."""
     try:
         return float(cell)
     except ValueError:

@@ -174,7 +174,7 @@ def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
 def oracle_rule(config: Mapping[str, Any]) -> Rule:
     """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
 
-    A class of `baselines` goes by the name of the module that defines it alone: what other names stand for is unknown.
+    A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.
     """
     groups = {part: config.get(part) for part in ("method", "detector")}
     names = {part: str(each.get("_target_")) for part, each in groups.items() if isinstance(each, Mapping)}

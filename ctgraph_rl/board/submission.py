@@ -348,7 +348,7 @@ def experts_of(log: RunLog) -> list[dict[str, Any]]:
 
 
 def packed(content: bytes) -> bytes:
-    """Return the content of a log as it is in a submission: equal bytes for equal logs."""
+    """Return the content of a submitted log: equal bytes for equal logs."""
     return gzip.compress(content, mtime=0)
 
 

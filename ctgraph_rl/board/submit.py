@@ -72,7 +72,7 @@ def submit(
         only: values of settings by dotted names, such as ``{"curriculum.depth": 4}``; runs with others are left out.
 
     Returns:
-        The submission, as it is read from its folder.
+        The submission, read from its folder.
 
     Raises:
         ValueError: for runs that cannot be submitted; names every broken rule, before anything is written.

@@ -91,7 +91,7 @@ ABIS = {"x86_64": Abi(0xC000003E, 0, X32), "aarch64": Abi(0xC00000B7, 1)}
 """By the names that Python gives to machines."""
 
 BY_ARGUMENTS = ("ioctl", "socket", "clone", "prctl")
-"""Calls that are refused with some arguments alone."""
+"""Calls that are refused only with some arguments."""
 
 MISSING = ("clone3", "memfd_create", "memfd_secret", "io_uring_setup", "io_uring_enter", "io_uring_register", "shmget")
 """Calls that are refused as if this kernel lacked them: libraries then take others."""

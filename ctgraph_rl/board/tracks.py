@@ -2,7 +2,7 @@
 
 A track fixes curriculum, protocol, budget and seeds; agent, cell and method are free. ``ctgraph-rl -m track=small
 agent=ppo method=ewc`` runs exactly what the track ``small`` asks for. A ladder has several rungs, each with a
-curriculum of its own, and a learner may be given less than the track gives: each of these is a `Variant`.
+separate curriculum, and a learner may be given less than the track gives: each of these is a `Variant`.
 """
 
 from __future__ import annotations

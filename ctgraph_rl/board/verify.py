@@ -244,7 +244,7 @@ def checks_of_plan(plan: Plan, outcomes: Mapping[int, Outcome]) -> list[Check]:
 def level_of(checks: Sequence[Check]) -> str:
     """Return the highest level of which, and of those before it, all checks have passed.
 
-    A submission whose files or reruns are not as it says has none. What could not be decided, and lower scores on
+    A submission whose files or reruns are not as it says has none. An open question, or lower scores on
     held-out seeds, only keep it from the next level.
     """
     reached = NONE
@@ -266,7 +266,7 @@ def write_verification(
     Args:
         submission: what was verified.
         checks: of all levels.
-        plan: what was run; None for files alone.
+        plan: what was run; None if only files were checked.
         means: with which limits and isolation.
     """
     content: dict[str, Any] = {

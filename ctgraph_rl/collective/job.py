@@ -23,6 +23,7 @@ from ctgraph_rl.log.files import CHECKPOINTS, METRICS, locked, member_folder, me
 from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.report.objective import check_objective, objective_of
+from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.runs import config, seeds
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Failures
@@ -46,6 +47,8 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
         The directories of single runs; those of a collective's members are within its own.
     """
     check_objective(cfg.objective, cfg.experts)
+    if cfg.report:
+        require_packages()
     if "exchange" not in cfg:
         return seeds.run_cells(cfg, run_dir)
     run_collective(cfg, run_dir)

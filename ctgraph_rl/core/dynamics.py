@@ -67,7 +67,7 @@ Batch = TypeVar("Batch", RowState, Shown)
 
 
 def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:
-    """Return the rows of a mask, bool [N], as they are in one value, and the others as they are in another."""
+    """Return one value in the rows of a mask, bool [N], and another value in the others."""
     pairs = zip(new, old, strict=True)
     return type(new)(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
@@ -295,7 +295,7 @@ def reset(
 def restart(
     state: RowState, mask: Tensor | None, params: RowParams, uses: Uses, words: Words | None = None
 ) -> tuple[RowState, Tensor]:
-    """`reset` that leaves no row finished: return the states, and the observations alone."""
+    """`reset` that leaves no row finished: return only the states and the observations."""
     state = begin(state, mask, params, uses)
     words = words_of(state.tick, params, uses) if words is None else words
     return state, observe(state, words, params, uses)

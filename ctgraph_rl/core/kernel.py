@@ -2,7 +2,7 @@
 
 It is compiled once, by the machine's C compiler, into a folder of the user's; without a compiler all else works. The
 name of the file holds the SHA-256 of its content, and a library that does not agree with it is not loaded, but made
-again. What the functions give are the bits of the tensor code, so it does not matter which of the two has run.
+again. The functions give the bits of the tensor code, so it does not matter which of the two has run.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def captures(device: torch.device | None) -> bool:
 
 
 class Region:
-    """A function of tensors with memory of its own for its arguments and its results.
+    """A function of tensors with separate memory for its arguments and its results.
 
     On a GPU the first `WARM_UP` calls run the function; then it is captured as a CUDA graph, and each further call
     copies the arguments and launches the graph. Elsewhere every call runs the function, on copies of the arguments and
@@ -32,7 +32,7 @@ class Region:
 
     Args:
         function: takes and returns tensors by key. It must not branch on data, make the host wait, or change the shapes
-            of its results. What it writes into tensors of others, such as weights, must stay where it is.
+            of its results. Tensors of others that it writes to, such as weights, must stay in place.
     """
 
     def __init__(self, function: Callable[[dict[Any, Tensor]], Tensors]) -> None:

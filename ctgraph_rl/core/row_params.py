@@ -71,7 +71,7 @@ class RowParams(NamedTuple):
     x: ObservationParams
     g: RewardParams
     bank: Tensor  # uint8 [B, *shape]
-    noise_bank: Tensor  # uint8 [B', *shape]; empty for noise of its own for every observation
+    noise_bank: Tensor  # uint8 [B', *shape]; empty for separate noise in every observation
     normal_table: Tensor
 
 

@@ -115,7 +115,7 @@ def learn_collective(
 ) -> RunLog:
     """Let the members of a collective learn in lock-step, a batch each in turn, with messages between batches.
 
-    A member that takes over nothing has the bits of `learn_curriculum` alone. One that has finished its curriculum
+    A member that takes over nothing has the bits of `learn_curriculum`. One that has finished its curriculum
     still answers the others.
 
     Args:
@@ -221,7 +221,7 @@ class _Learner:
         return not self.is_done
 
     def state(self) -> dict[str, Any]:
-        """Return all that the rest of this member's run depends on; a run alone cannot resume it."""
+        """Return all that the rest of this member's run depends on; only a collective can resume it."""
         if self.has_learned:
             with self.drawing():
                 [state] = self.steps.state()

@@ -49,7 +49,7 @@ def evaluate(
 ) -> TensorDict:
     """Play the same number of episodes on every task, all in one batch, and equally many in every environment.
 
-    The environment is one of its own, and torch's global generator is left as it was found.
+    The environment is a separate one, and torch's global generator is left as it was found.
 
     Args:
         policy: what plays; a class such as `ctgraph_rl.policies.OptimalPolicy` is built on the environment, and a plain
@@ -66,8 +66,8 @@ def evaluate(
 
     Returns:
         ``episode_reward`` float32, ``step_count`` int64, ``outcome`` uint8 and ``leaf`` int64, each
-        [tasks, num_episodes, 1], as they are at the end of the episodes; those of a row follow each other. CT-graphs
-        alone have ``outcome`` and ``leaf``.
+        [tasks, num_episodes, 1], at the end of the episodes; those of a row follow each other. Only CT-graphs
+        have ``outcome`` and ``leaf``.
 
     Raises:
         ValueError: for values out of range, a task with changing goals and one episode a row, a reference policy that
@@ -102,7 +102,7 @@ def evaluate(
 def _built_on(env: EnvBase, policy: type) -> Policy:
     """Return a policy whose class is built on the environment that it acts in."""
     known = isinstance(env, CTGraphEnv) or not issubclass(policy, RandomPolicy)
-    require((known, f"{policy.__name__} plays CT-graphs alone: it knows their hidden state; give a policy of your own"))
+    require((known, f"{policy.__name__} plays only CT-graphs: it knows their hidden state; give a policy of your own"))
     try:
         return policy(env)
     except TypeError as error:

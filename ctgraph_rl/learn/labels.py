@@ -16,8 +16,8 @@ from ctgraph_rl.tasks.kinds.task_like import TaskLike
 def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
     """Return the label that acted in most frames of each task so far, by the task's position.
 
-    Each task of a block with several counts with an equal share of its frames. The learner knows nothing of this: it
-    is an oracle's in evaluation alone.
+    Each task of a block with several counts with an equal share of its frames. The learner knows nothing of this:
+    only evaluation uses it, as an oracle.
     """
     acted, blocks, ends = (log.training(name).tolist() for name in ("acted_label", "block", "frames"))
     starts = [0.0, *ends]
@@ -41,7 +41,7 @@ class Span(NamedTuple):
 
 
 def label_spans(log: RunLog) -> tuple[Span, ...]:
-    """Return the spans of labels of a run in time order; empty without labels of its own."""
+    """Return the spans of labels of a run in time order; empty unless the learner labels tasks itself."""
     spans: list[Span] = []
     for m in log.of_kind("training"):
         if m.get("acted_label") is None:

@@ -1,6 +1,6 @@
 """The loop over curricula: members learn in lock-step, a batch each, and one object couples them.
 
-A run alone is one member. Seeds that are stacked are several members of one `Lockstep`: they share an environment and
+A single run is one member. Seeds that are stacked are several members of one `Lockstep`: they share an environment and
 learn as one. Learners that exchange messages are a `Lockstep` each, and `ctgraph_rl.learn.collective` couples them.
 """
 
@@ -76,7 +76,7 @@ class Coupling(Protocol):
 class Group(Protocol):
     """Learners that act and learn as one, such as `Alone` and `baselines.update.seeds.SeedGroup`.
 
-    Between two calls each agent is as if it had learned alone.
+    Between two calls each agent is as if no other had learned beside it.
     """
 
     @property
@@ -201,7 +201,7 @@ class Lockstep:
         self._batches = self._learn_batches(saved)
 
     def _make_env(self, device: torch.device) -> EnvBase:
-        """Return an environment with the rows of each seed as it has them alone, one seed after the other."""
+        """Return an environment with the rows of each seed as in a single run, one seed after the other."""
         num_envs = self.group.agents[0].num_envs
         count = len(self.seeds)
         tasks = count * self.curriculum.blocks[0].rows(num_envs)

@@ -1,4 +1,4 @@
-"""Messages between learners: what they may hold is checked, and some are lost or late, by a random stream of their own.
+"""Messages between learners: what they may hold is checked, and some are lost or late, by a separate random stream.
 
 A message holds tensors and numbers by name. A receiver refuses one whose kind, names, shapes or values are not those
 that its exchange states, and counts it.

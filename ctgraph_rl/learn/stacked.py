@@ -43,8 +43,8 @@ def learn_together(
 ) -> dict[int, FloatingPointError]:
     """Let agents with different seeds learn a curriculum as `learn_curriculum` lets one.
 
-    Each seed has the rows of the environment, the generator, the evaluations and the log that it has alone; no seed's
-    numbers depend on another's data. Losses and actions differ from those of a run alone by rounding. A seed with a
+    Each seed has the rows of the environment, the generator, the evaluations and the log of a single run; no seed's
+    numbers depend on another's data. Losses and actions differ from those of a single run by rounding. A seed with a
     loss or weight that is not finite has failed: it measures nothing from then on, and the others learn on as ever.
 
     Args:

@@ -1,8 +1,8 @@
 """Names, labels, sources, settings and reasons as text, whatever they hold: one function for each kind of output.
 
 They may come from other people. `terminal_text` also serves HTML, where the template escapes what it gives, and JSON,
-whose own quoting is enough. What cannot be printed, such as escape sequences, marks of writing direction and halves of
-surrogate pairs, is shown as in Python, ``\\x1b``.
+whose own quoting is enough. Characters that cannot be printed, such as escape sequences, marks of writing direction and
+halves of surrogate pairs, are shown as in Python, ``\\x1b``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _printable(text: str) -> str:
 
 
 def markdown_text(text: object) -> str:
-    """Return one line that Markdown shows as it is: no link, no image, no HTML, no formula and no end of a cell."""
+    """Return one line that Markdown shows unchanged: no link, no image, no HTML, no formula and no end of a cell."""
     line = terminal_text(text)
     if _INACTIVE.fullmatch(line):
         return line
@@ -61,12 +61,12 @@ def markdown_text(text: object) -> str:
 
 
 def latex_text(text: object) -> str:
-    """Return one line that LaTeX shows as it is, after the end of a table's row too."""
+    """Return one line that LaTeX shows unchanged, after the end of a table's row too."""
     return "".join(_LATEX.get(character, character) for character in terminal_text(text))
 
 
 def figure_text(text: object) -> str:
-    """Return one line that matplotlib shows as it is, without formulas."""
+    """Return one line that matplotlib shows unchanged, without formulas."""
     return terminal_text(text).replace("$", r"\$")
 
 
@@ -97,5 +97,5 @@ def from_csv(cell: str) -> str:
 
 
 def utf8_text(text: object) -> object:
-    """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; any other value as it is."""
+    """Return a text that UTF-8 can hold, with halves of surrogate pairs as in Python; any other value unchanged."""
     return text.encode("utf-8", "backslashreplace").decode() if isinstance(text, str) else text

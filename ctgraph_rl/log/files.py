@@ -48,7 +48,7 @@ def members_of(folder: Path) -> list[Path]:
 
 @contextmanager
 def locked(folder: Path, waiting: Callable[[], object] | None = None) -> Iterator[None]:
-    """Work in a directory alone; the lock ends with the process, however that ends.
+    """Keep other processes out of a directory; the lock ends with the process, however that ends.
 
     Args:
         folder: an existing directory, on a file system with POSIX locks.

@@ -15,7 +15,7 @@ Every line is one JSON object with a ``kind``. Schema 1:
   ``found_rate``, the share of rows that have reached the goal by then; ``exact_rate``, the success rate of the best
   search; else as ``evaluation``.
 
-What is not finite, such as a mean over no episodes, is null. ``seconds`` is the time since the start of the run, and
+Numbers that are not finite, as means of no episodes, are null. ``seconds`` is the time since the start of the run, and
 the only field that differs between two equal runs. A reader in three lines, for what `RunLog.read` does not give::
 
     import json
@@ -57,7 +57,7 @@ FEW_CELLS, CELLS_OF_A_BYTE = 10**4, 16
 """Cells that a table of a log of any size may have, and more for each byte of its file."""
 
 SCHEMA = 1
-"""Raised when a line means something else than before; fields may be added without."""
+"""Raised when the meaning of a line changes; fields may be added without."""
 
 BEGINNING = b'{"kind": "run"'
 """Of the first line of a run's log."""

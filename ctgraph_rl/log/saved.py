@@ -26,7 +26,7 @@ _GLOBALS = re.compile(
     r"|torch \w+Storage|torch\.storage UntypedStorage|torch [a-z]\w*\d\w*|torch (bool|device|Size)"
     r"|collections OrderedDict|_codecs encode|(__builtin__|builtins) (set|complex)"
 )
-"""What a pickle of tensors and plain values names; `torch.load` alone also lets it make arrays of any size."""
+"""What a pickle of tensors and plain values names; `torch.load` by itself also lets it make arrays of any size."""
 
 _FOLLOWS = {"_codecs encode": "BINUNICODE", "collections OrderedDict": "EMPTY_TUPLE"}
 """What these are called with, so that no result is made larger again and again."""

@@ -41,7 +41,7 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
     Args:
         log: a whole run.
         curriculum: what was learned.
-        experts: for each of ``curriculum.tasks``, the log of an agent that learned it alone.
+        experts: for each of ``curriculum.tasks``, the log of an agent that learned only this task.
 
     Raises:
         ValueError: for the log of another curriculum, by its fingerprint, and another number of experts.
@@ -92,11 +92,11 @@ OF_GRAPHS = (
     *(f"{policy}_entropies" for policy in POLICIES),
     *("random_frames", "search_episodes"),
 )
-"""Inputs that CT-graphs alone have."""
+"""Inputs that only CT-graphs have."""
 
 
 def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> dict[str, Any]:
-    """Return the inputs that CT-graphs alone have, all but those of first blocks."""
+    """Return the inputs that only CT-graphs have, all but those of first blocks."""
     if not are_graphs(tasks):
         return dict.fromkeys(OF_GRAPHS, Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}"))
     return {
@@ -248,7 +248,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
 
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
-    """Return the intervals of each task in the block that trains it first, which must train it alone."""
+    """Return the intervals of each task in the block that trains it first, which must train no other."""
     blocks, tasks = curriculum.trained, range(len(curriculum.tasks))
     firsts = {task: i for i, block in reversed([*enumerate(blocks)]) for task in block}
     first = [firsts[task] for task in tasks]

@@ -1,7 +1,7 @@
 """A run's log as tidy tables: one row per evaluation of a task, one row per training interval.
 
 CSV always, Parquet with ``pip install 'ctgraph_rl[tables]'``. The first columns say which run a row is of, so that the
-tables of many runs can be put below each other. What is undefined or was not measured is an empty cell, or null. A
+tables of many runs can be put below each other. Undefined and unmeasured values are empty cells, or null. A
 reader in three lines::
 
     import csv

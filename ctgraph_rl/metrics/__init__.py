@@ -2,7 +2,7 @@
 
 A metric is a function with ``@defined`` in any module of this folder: it is an attribute here, computed wherever the
 inputs that its arguments name are there, and gives its value with its meaning or the reason why it has none, where
-nothing is imputed. The modules import each other alone; logs, recorders and reports use them.
+nothing is imputed. The modules import only each other; logs, recorders and reports use them.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def summary(performance: Tensor, trained: Trained) -> dict[str, Metric]:
 
 
 def of_matrix(performance: Tensor, trained: Trained) -> dict[str, Metric]:
-    """Compute all metrics of the performance matrix alone, those of `summary` first; arguments as there."""
+    """Compute all metrics that need only the performance matrix, those of `summary` first; arguments as there."""
     return of_inputs({"performance": performance, "trained": trained})
 
 

@@ -123,10 +123,10 @@ def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
     bounds=of_changes_but_one,
 )
 def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
-    """F: the drop on each task from the end of its own block to the end.
+    """F: the drop on each task from the end of its block to the end.
 
     The mean is over all T tasks, so the last one adds a 0: smaller than -BWT of `backward_transfer` by (T-1)/T.
-    Undefined unless each task is trained once, alone.
+    Undefined unless each task is trained once, in a block without others.
 
     Args:
         curves: the evaluations of a run.

@@ -314,7 +314,7 @@ def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
 
 
 def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, Any, Any]:
-    """Every two evaluations of a task in a row, with trainings of one task alone between them, in order for each task.
+    """Every two evaluations of a task in a row, with only blocks of one task between them, in order for each task.
 
     Returns:
         The position of the last training between, the number of the evaluated task and the value, [pairs] each.

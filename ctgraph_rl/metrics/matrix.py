@@ -53,7 +53,7 @@ def backward_transfer(performance: Tensor, trained: Trained | None = None) -> Te
     """BWT = 1/(T-1) sum_{j<T} (R[T, j] - R[j, j]).
 
     The change on each earlier task from right after its own block to the end; negative when tasks are forgotten.
-    Undefined for a single task, and unless each task is trained once, alone, in order.
+    Undefined for a single task, and unless each task is trained once, in a block without others, in order.
 
     Example:
         >>> R = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]])
@@ -81,7 +81,7 @@ def forgetting(performance: Tensor, trained: Trained | None = None) -> Tensor:
 def accuracy_over_time(performance: Tensor, trained: Trained | None = None) -> Tensor:
     """A: mean over all pairs of a block i and a task j that was trained by then.
 
-    Undefined unless each task is trained once, alone, in order. Defined for a single task.
+    Undefined unless each task is trained once, in a block without others, in order. Defined for a single task.
     """
     _in_order(performance, trained)
     return _pairs(performance, torch.ge)
@@ -145,7 +145,7 @@ def isolated_forgetting(performance: Tensor, trained: Trained | None = None, sca
 
     The source smooths curves over 20 evaluations first: `Curves.smoothed`; its tables show the value times 10. Tasks
     may be trained again: blocks of other tasks after the first training count, and none that trains the task itself.
-    The source's code counts the first cycle of tasks alone, or of more cycles a task's own later trainings, too.
+    The source's code counts only the first cycle of tasks, or of more cycles a task's own later trainings, too.
     Undefined where a block trains several tasks, and for a single task.
 
     Args:

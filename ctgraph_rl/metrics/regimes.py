@@ -77,7 +77,7 @@ class RegimeTable(Sequence[Regime]):
 
     @classmethod
     def of(cls, regimes: Sequence[Regime]) -> RegimeTable:
-        """Return regimes as a table; a table as it is."""
+        """Return regimes as a table; a table unchanged."""
         if isinstance(regimes, RegimeTable):
             return regimes
         names = {task: i for i, task in enumerate(dict.fromkeys(each.task for each in regimes))}

@@ -1,7 +1,7 @@
 """Forward transfer against experts, by areas under evaluation curves.
 
 Areas under a curve are means of its evaluations or trapezoids, as a definition says; both need evaluations at equal
-distances. An expert is an agent that learned one task alone, with the frames and evaluations that the task has in the
+distances. An expert is an agent that learned a single task, with the frames and evaluations that the task has in the
 curriculum; its curve is an argument.
 """
 

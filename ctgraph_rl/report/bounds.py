@@ -81,7 +81,7 @@ def bounds_of_curriculum(curriculum: Curriculum, evaluations: int = 1) -> Bounds
 
     Args:
         curriculum: what they learn.
-        evaluations: of each task, after those before training; those of sums over time need it alone.
+        evaluations: of each task, after those before training; only those of sums over time need it.
     """
     if not are_graphs(curriculum.tasks):
         return _bounds_of_others(curriculum, evaluations)
@@ -109,7 +109,7 @@ def _bounds_of_others(curriculum: Curriculum, evaluations: int) -> BoundsOfRuns:
 
 
 def curriculum_of(run: Run) -> Curriculum | None:
-    """Return what a run learned, from its directory or as it is published; None where neither has its fingerprint."""
+    """Return what a run learned, from its directory or the published one; None where neither has its fingerprint."""
     found: Curriculum | None
     try:
         found = Curriculum.from_json(run.path / CURRICULUM)

@@ -118,7 +118,7 @@ SENTENCES: dict[str, Callable[[str], str]] = {
 
 
 class Line(NamedTuple):
-    """A row as it is shown."""
+    """A row in the form that is shown."""
 
     agent: str
     measure: str
@@ -145,7 +145,7 @@ class Page(NamedTuple):
 
 
 def pages(rows: Sequence[Row]) -> Iterator[Page]:
-    """The rows as they are shown, for each curriculum."""
+    """The rows in the form that is shown, for each curriculum."""
     for curriculum in dict.fromkeys(row.curriculum for row in rows):
         its = [row for row in rows if row.curriculum == curriculum]
         notes = list(dict.fromkeys(row.note for row in its if row.note))

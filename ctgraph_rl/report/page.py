@@ -180,7 +180,7 @@ def _rendered(name: str, about: Mapping[str, Any]) -> str:
 
 
 def _one_line(value: Any) -> Any:
-    """Return a text without control characters; what is HTML already and what is no text as it is."""
+    """Return a text without control characters; HTML, and what is no text, unchanged."""
     return terminal_text(value) if type(value) is str else value
 
 

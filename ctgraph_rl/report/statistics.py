@@ -261,7 +261,7 @@ def interquartile_mean(
 ) -> Estimate:
     """Return the mean of the middle half of all values of all tasks, with a bootstrap stratified by task.
 
-    Seeds have random weights, each task's of their own; where bounds are known, one more value stands at them, as in
+    Seeds have random weights, others for each task; where bounds are known, one more value stands at them, as in
     Gaffke's interval. Only from ten seeds on: with fewer the interval of unbounded values covers far less than it says.
 
     Args:

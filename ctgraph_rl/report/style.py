@@ -107,7 +107,7 @@ def agent_style(position: int, agent: str = "") -> dict[str, Any]:
 
 
 def short(name: str) -> str:
-    """A name that fits into a figure: its middle is left out; for matplotlib, which shows it as it is."""
+    """A name that fits into a figure: its middle is left out; for matplotlib, which shows it unchanged."""
     name = terminal_text(name)
     half = LONGEST_NAME // 2
     return figure_text(name if len(name) <= LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}")

@@ -230,7 +230,7 @@ def print_problems(problems: Iterable[Problem], runs: Sequence[Run]) -> bool:
 
 
 def group_size(run: Run) -> int:
-    """Return how many seeds a run was trained with, itself among them; 1 for a run alone."""
+    """Return how many seeds a run was trained with, itself among them; 1 for a single run."""
     together = run.about.get("together")
     return len(together) if isinstance(together, list) and together else 1
 

@@ -26,7 +26,7 @@ from ctgraph_rl.log.saved import content_of, read_plain
 from ctgraph_rl.runs.interrupt import Interrupt
 
 FORMAT = 1
-"""Raised when a checkpoint means something else than before."""
+"""Raised when the meaning of a checkpoint changes."""
 
 KEPT = 2
 """Checkpoints that are kept, the newest."""

@@ -45,7 +45,7 @@ PARTS = {"evaluation": "every=5120", "protocol": "task_id=one_hot"}
 RESUME = ("warn", "strict")
 
 STALE = "stale"
-"""Of ``overwrite``: what was run with other code alone is run again."""
+"""Of ``overwrite``: only what was run with other code is run again."""
 
 SAID = (
     (

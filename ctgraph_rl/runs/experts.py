@@ -1,4 +1,4 @@
-"""Single-task experts: each task of a curriculum learned alone, by the same agent with the same budget and protocol.
+"""Single-task experts: each learned one task of a curriculum, by the same agent with the same budget and protocol.
 
 Forward transfer and relative performance compare with them. An expert is a run like any other; it is kept in a folder
 under the hash of all that its numbers depend on, so that no run trains it twice.
@@ -39,7 +39,7 @@ EXPERT = "single-task expert"
 
 
 class Expert(NamedTuple):
-    """An agent that learned one task alone."""
+    """An agent that learned a single task."""
 
     task: int  # position in the curriculum's tasks, from 1
     fingerprint: str  # of the single-task curriculum
@@ -66,7 +66,7 @@ class Expert(NamedTuple):
 
 
 def expert_curriculum(curriculum: Curriculum, task: TaskLike) -> Curriculum:
-    """A task of a curriculum alone: the frames of the block that trains it first, the same evaluation and task id.
+    """A curriculum of one task: the frames of the block that trains it first, the same evaluation and task id.
 
     Raises:
         ValueError: if that block trains other tasks, too.
@@ -183,7 +183,7 @@ def is_of_group(run_dir: Path) -> bool:
 
 
 def begun_with(run_dir: Path) -> list[int]:
-    """Return the seeds with which a run was begun as one batch; none if it was begun alone, or not at all."""
+    """Return the seeds with which a run was begun as one batch; none if it was begun as a single run, or not at all."""
     return list((RunLog.begun(run_dir / LOG) or {}).get("together", ()))
 
 

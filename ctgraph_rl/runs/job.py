@@ -81,7 +81,7 @@ class Job:
         make_method = method_of(cfg)
         make_alone = config.target(cfg, "agent")
         curriculum = curriculum_of(cfg, make_method())
-        for task in curriculum.tasks if cfg.experts else ():  # what an agent cannot learn alone is refused first
+        for task in curriculum.tasks if cfg.experts else ():  # refuses first what an agent cannot learn
             new_agent(expert_curriculum(curriculum, task), make_alone, cfg.seed)
         agent = new_agent(curriculum, with_method(make_alone, make_method, curriculum), cfg.seed, device)
         return cls(cfg, curriculum, agent, make_alone, device=device, interrupt=interrupt)
@@ -99,7 +99,7 @@ class Job:
 
         Args:
             run_dir: the directory.
-            together: the seeds of the group that the run is trained in, if it is not alone.
+            together: the seeds of the group that the run is trained in, if there are others.
             experts: of each task, if they were trained before.
         """
         cfg = self.cfg
@@ -141,13 +141,13 @@ class Job:
         return {**as_before(settings), "versions": versions(), **changed}
 
     def expert(self, alone: Curriculum, run_dir: Path, together: Sequence[int] = ()) -> tuple[Agent, RunDirectory]:
-        """Build an agent that learns a task alone, as `new_agent` does, and prepare its directory."""
+        """Build an agent that learns a single task, as `new_agent` does, and prepare its directory."""
         agent = new_agent(alone, self.make_alone, self.cfg.seed, self.device)
         saved = self._checkpoints(run_dir)
         return agent, RunDirectory(run_dir, self._of_experts, saved, together, console=self._console)
 
     def learn_alone(self, alone: Curriculum, run_dirs: RunDirs) -> Failures:
-        """Let an agent learn a task alone, or resume what was begun so; what a group has half learned begins again."""
+        """Let an agent learn a single task, or resume what was begun so; what a group has half learned begins again."""
         agent, where = self.expert(alone, run_dirs[self.cfg.seed])
         if is_of_group(where.run_dir) and where.checkpoints.newest_frames != alone.num_frames:
             where.checkpoints.clear()

@@ -151,7 +151,7 @@ def _labelled(run_dir: Path, make_method: Callable[[], MethodLike], detector: An
 
 
 def _with(run_dir: Path, make: Any, stored: Any) -> Callable[..., Any]:
-    """Return a class with the settings that a run stored, as far as it takes them; another function as it is."""
+    """Return a class with the settings that a run stored, as far as it takes them; another function unchanged."""
     if not (isinstance(make, type) and isinstance(stored, Mapping)):
         return make
     takes = parameters_of(make)

@@ -1,6 +1,6 @@
 """Run directories as data: each log is read once, and only what tables and figures need is kept of it.
 
-Runs of one configuration but for the seed belong together; one that names no agent is shown alone, under its directory.
+Runs of one configuration but for the seed belong together; one that names no agent is shown apart, by its directory.
 A directory that cannot be read is a `Problem` with its reason, and never a number.
 """
 
@@ -114,12 +114,12 @@ class Run:
 
     @property
     def alike(self) -> tuple[tuple[str, str], str]:
-        """Equal for runs that differ in seed and code alone."""
+        """Equal for runs that differ only in seed and code."""
         return self.group, json.dumps(self.settings, sort_keys=True)
 
     @property
     def configuration(self) -> tuple[tuple[str, str], str, str]:
-        """Equal for runs that differ in their seed alone."""
+        """Equal for runs that differ only in their seed."""
         return *self.alike, json.dumps(self.code, sort_keys=True)
 
 
@@ -131,7 +131,7 @@ class Problem(NamedTuple):
 
 
 BySeed = Mapping[int, Run | None]
-"""Runs that differ in their seed alone; None for a seed that only other agents have."""
+"""Runs that differ only in their seed; None for a seed that only other agents have."""
 
 
 def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:

@@ -73,7 +73,7 @@ class Recorder:
             finished is shown: ``finished`` is true, ``frames`` is the curriculum's number of frames, so that nothing is
             learned again, ``log`` and ``metrics`` hold its results, `evaluate` returns what was measured then, and no
             file is changed.
-        logger: where measurements go as they are made, too: the name of a file in ``conf/logger``, such as
+        logger: where measurements also go, at once: the name of a file in ``conf/logger``, such as
             ``"tensorboard"``, or a function that builds a logger of TorchRL in a folder.
         checkpoint_seconds: time between two checkpoints within a block, >= 0.
 
@@ -117,7 +117,7 @@ class Recorder:
         require(
             (isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r}"),
             (is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"),
-            ("seed" not in (about or {}), "about must leave out the seed, which is an argument of its own"),
+            ("seed" not in (about or {}), "about must leave out the seed, which is a separate argument"),
             (is_json_object(about), f"about must be plain JSON values by name, got {about!r}"),
             (_is_code(code), f"code must be a list of classes and functions, such as [MyAgent], got {code!r}"),
             *true_or_false(overwrite=overwrite, resume=resume),
@@ -217,7 +217,7 @@ class Recorder:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
 
         A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
-        it are removed, as they are made again.
+        it are removed, since they are made again.
 
         Args:
             state: a function that makes what the learner needs to learn on, as tensors and plain Python values, such as

@@ -201,7 +201,7 @@ def _defaults(name: str) -> Iterator[Any]:
 
 
 def as_typed(message: str, settings: Mapping[str, Any], typed: Iterable[str]) -> str:
-    """Return a message about values with the names of settings as they are typed: ``curriculum.depth`` for ``depth``.
+    """Return a message about values with the names of settings that are typed: ``curriculum.depth`` for ``depth``.
 
     A word that is no name elsewhere is one only where a rule begins, as in ``depth must be``, and before a ``=``.
 

@@ -150,7 +150,7 @@ def report(statuses: Mapping[str, Status], repeated: int = 0, most: int | None =
 
     Args:
         statuses: each cell by its settings.
-        repeated: cells that are left out, as they are there twice.
+        repeated: cells that are left out, since they are there twice.
         most: cells that are named; None: all.
     """
     counts = Counter(found.state for found in statuses.values())

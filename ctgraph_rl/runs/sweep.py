@@ -184,9 +184,9 @@ class Sweeper(Base):
     def cells(self, batch: Sequence[Overrides]) -> dict[Path, Overrides]:
         """Return the cells by their run directories; of equal ones only the first.
 
-        What has changed since one was run is kept, unless all are run again.
+        Changes of code since a cell was run are kept, unless all are run again.
 
-        Cells that choose the same files and set the same values differ in these alone, so only the first of them is
+        Cells that choose the same files and set the same values differ only in these, so only the first of them is
         composed.
 
         Raises:
@@ -265,7 +265,7 @@ class Sweeper(Base):
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
         """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
 
-        Cells that were begun together stay together, and one that was begun alone stays alone.
+        Cells that were begun together stay together, and one that was begun by itself stays so.
         """
         assert self.config is not None
         if not self.config.together:
@@ -303,7 +303,7 @@ def _key(setting: str) -> str:
 
 
 def _job(others: Overrides, seeds: Sequence[str]) -> Overrides:
-    """Return the settings of a job that runs cells which differ in their seeds alone."""
+    """Return the settings of a job that runs cells which differ only in their seeds."""
     own = [f"seed={seed}" for seed in seeds[:1] if seed]
     group = ["together=true", f"+seeds=[{','.join(seeds)}]"] if len(seeds) > 1 else []
     return (*others, *own, *group)

@@ -1,4 +1,4 @@
-"""Trackers: a run's measurements in CSV files, TensorBoard, W&B, MLflow or Trackio, as they are made.
+"""Trackers: a run's measurements in CSV files, TensorBoard, W&B, MLflow or Trackio, while it learns.
 
 ``logger=NAME`` on the command line chooses one of TorchRL's loggers. The run's own files do not depend on it, and what
 goes wrong with it cannot stop a run that has begun.
@@ -112,7 +112,7 @@ class Tracker:
 
 
 def logger_of(given: Any) -> Callable[..., Any] | None:
-    """Return what builds a logger in a folder: a function as it is, or that of a name in ``conf/logger``.
+    """Return what builds a logger in a folder: a function unchanged, or that of a name in ``conf/logger``.
 
     Raises:
         ValueError: for an unknown name, with the one that was probably meant, and for what is neither.

@@ -199,7 +199,7 @@ class RunDirectory:
     run_dir: Path
     config: Mapping[str, Any]
     checkpoints: Checkpoints
-    together: Sequence[int] = ()  # the seeds of the group that the run is trained in; none for one that is alone
+    together: Sequence[int] = ()  # the seeds of the group that the run is trained in; none for a single run
     experts: Sequence[Expert] | None = None
     listeners: Sequence[Callable[[dict[str, Any]], object]] = ()
     console: Console | None = None
@@ -293,7 +293,7 @@ def execute(
     learn: Callable[[Sequence[RunLog]], Failures],
     progress: ProgressBar,
 ) -> Failures:
-    """Let agents learn, each into its directory: a run alone, seeds as one batch, or members that exchange messages.
+    """Let agents learn, each into its directory: a single run, seeds as one batch, or members that exchange messages.
 
     Args:
         participants: the agents.
@@ -319,10 +319,10 @@ def execute(
 
 
 def _same_group(run_dir: Path, together: Sequence[int]) -> tuple[bool, str]:
-    """The rule that a run is resumed with the seeds beside it with which it was begun, or alone if it was alone."""
+    """The rule that a run is resumed with the seeds beside it with which it was begun, if there were any."""
     before = (RunLog.begun(run_dir / LOG) or {}).get("together", [])
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"
-    began = f"{run_dir} was begun {f'with the seeds {before} together' if before else 'alone'}"
+    began = f"{run_dir} was begun {f'with the seeds {before} together' if before else 'by itself'}"
     return before == list(together), f"{began}: resume it with {how}, or start again with overwrite=true"
 
 

@@ -159,7 +159,7 @@ class Curriculum:
 
     @property
     def segments(self) -> tuple[tuple[Block, ...], ...]:
-        """The blocks between two announced boundaries: each alone, or all of them where boundaries are hidden."""
+        """The blocks between two announced boundaries: each separately, or all of them where boundaries are hidden."""
         announced = self.protocol.boundaries == "announced"
         return tuple((block,) for block in self.blocks) if announced else (self.blocks,)
 

@@ -124,7 +124,7 @@ def _plain_task(task: TaskLike) -> dict[str, Any]:
 
 
 def type_name(kind: type) -> str:
-    """Our own types by name alone, so that they may move between modules; a user's with the module."""
+    """Our own types only by name, so that they may move between modules; a user's with the module."""
     return kind.__qualname__ if kind.__module__.startswith("ctgraph_rl.") else f"{kind.__module__}.{kind.__qualname__}"
 
 

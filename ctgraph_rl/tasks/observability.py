@@ -56,7 +56,7 @@ def state_entropy(task: Task, policy: str = "random") -> float:
     0 for a fully observable task. Wait states are counted once for every step in them.
 
     Args:
-        task: any task; its goal counts for the optimal policy alone.
+        task: any task; its goal counts only for the optimal policy.
         policy: ``random``, uniform over the b + 1 actions; ``navigation``, waits at wait states and decides uniformly;
             ``optimal``, waits at wait states and decides for the goal.
 
@@ -97,4 +97,4 @@ def _index_rule(task: Task) -> tuple[bool, str]:
     b = task.graph.branching_factor
     x = task.observations
     own = not (x.legacy_index and b > 2 and any(map(x.is_unique, PLACED)))
-    return own, f"observability is exact only for ids of their own, not a legacy_index with branching_factor={b}"
+    return own, f"observability is exact where no states share an id, not with a legacy_index with branching_factor={b}"

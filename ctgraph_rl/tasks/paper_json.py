@@ -1,6 +1,6 @@
 """The JSON parameters of Table 3 of the paper, with its names and its meaning.
 
-What such a file leaves out has a default: ``graph_shape`` alone is a file. Rewards are those of the paper, their noise
+Keys that a file leaves out have defaults: ``graph_shape`` is enough. Rewards are those of the paper, their noise
 is additive, and an episode ends in the end state. Files of the authors' implementation are of another kind: they have a
 section ``image_dataset``, and `ctgraph_rl.tasks.reference` reads them.
 """

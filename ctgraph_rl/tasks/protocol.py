@@ -187,7 +187,7 @@ class Protocol:
         task_ids: the id of each of the curriculum's ``tasks``, all different; None: their positions, from 0.
         guide_frames: frames after each announced boundary over which the share of new episodes in which a policy that
             navigates acts in the learner's place falls from 1 to 0. It waits where it must and decides at random, so
-            the learner need not find its first rewards. 0: the learner acts alone.
+            the learner need not find its first rewards. 0: only the learner acts.
 
     Raises:
         ValueError: for values out of range, and ids given at boundaries that are hidden.

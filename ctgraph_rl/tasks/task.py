@@ -293,7 +293,7 @@ class Task:
 
     @property
     def is_deterministic(self) -> bool:
-        """Whether actions alone decide an episode: a policy without chance plays the same one again and again."""
+        """Whether only actions decide an episode: a policy without chance plays the same one again and again."""
         x = self.observations
         ranges = ((x.wait_ids, x.unique_waits), (x.decision_ids, x.unique_decisions), (x.home_ids, False))
         drawn = any(first != last and not unique for (first, last), unique in ranges)

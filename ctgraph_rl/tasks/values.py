@@ -385,7 +385,7 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
 def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
     b = task.graph.branching_factor
     shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
-    own = f"ids of their own, not a legacy_index with branching_factor={b}, where states share ids"
+    own = f"ids that no two states share, not a legacy_index with branching_factor={b}, where they do"
     return [*_needle_rules(task, "memoryless"), (not shares, f"the memoryless ceiling is exact only for {own}")]
 
 

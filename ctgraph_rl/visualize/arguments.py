@@ -64,7 +64,7 @@ def select(arguments: argparse.Namespace) -> Selection:
     changes = {name: value for name, value in given.items() if value is not None}
     changes |= {"fully_observable": False} if arguments.surjective else {}
     if arguments.run is not None:
-        require((arguments.name is None and not changes, "--run has a curriculum of its own: choose one with --task"))
+        require((arguments.name is None and not changes, "--run names the curriculum: choose its task with --task"))
         return _of_run(arguments.run, arguments.task)
     policy = None if arguments.policy is None else POLICIES[arguments.policy]
     return _named(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
@@ -79,7 +79,7 @@ def _named(name: str | None, number: int, changes: dict[str, Any], config_dir: P
         return _called(name, make_task(config=name, **changes))
     if not own and "-" in name:  # as in the paper's labels and in no curriculum's name
         return _called(name.upper(), make_task(name.upper(), **changes))
-    require((not changes, f"the tasks of a curriculum are as they are: {name} takes no {', '.join(changes)}"))
+    require((not changes, f"the tasks of a curriculum cannot be changed here: {name} takes no {', '.join(changes)}"))
     return _of_curriculum(curriculum_of(name, config_dir), number)
 
 

@@ -81,7 +81,7 @@ def _first_ids(task: Task, kind: StateType, most: int) -> list[int]:
 
 
 def _stored(task: Task, ids: list[int]) -> Tensor:
-    """The first image of each id as it is stored."""
+    """The first stored image of each id."""
     return task.images.bank(0)[[place * task.images.num_variants for place in ids]]
 
 

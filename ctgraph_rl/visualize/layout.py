@@ -2,7 +2,7 @@
 
 A tree with few end states is laid out whole, a larger one as the paths to some of them. Nodes are heap indices: branch
 a of node n is b * n + a, and the root is 0. Time and memory grow with the nodes laid out, not with the tree. The pixels
-of `ctgraph_rl.batch.render` have a rasteriser and places of their own, for the speed of whole batches.
+of `ctgraph_rl.batch.render` have a separate rasteriser and places, for the speed of whole batches.
 """
 
 from __future__ import annotations

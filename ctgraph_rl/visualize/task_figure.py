@@ -28,7 +28,7 @@ RING: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markeredgecol
 
 
 def task_figure(task: Task, **overlays: Any) -> Any:
-    """A figure of its own, of a size that fits, for `draw_task` with the same arguments."""
+    """A new figure of a size that fits, for `draw_task` with the same arguments."""
     graph = task.graph
     side_by_side = graph.num_end_states if graph.num_end_states <= MOST_LEAVES else MOST_PATHS
     beside = 0.9 if overlays.get("policy") or overlays.get("values") else 0.65
@@ -303,7 +303,7 @@ class _TaskPicture:
 
 
 def _probabilities(choice: Any, branching_factor: int) -> list[float]:
-    """Action probabilities as they are given; a greedy action has all."""
+    """Action probabilities as given; a greedy action has all."""
     if not isinstance(choice, Sequence) and getattr(choice, "ndim", 0) == 0:
         return [float(action == int(choice)) for action in range(max(branching_factor, int(choice)) + 1)]
     return [float(chance) for chance in choice]

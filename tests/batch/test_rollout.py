@@ -179,7 +179,7 @@ def test_a_policy_that_changes_the_rows_is_refused(change):
         changes.get(change, rows.reset)()
         return torch.zeros(2, dtype=torch.int64)
 
-    with pytest.raises(ValueError, match="a policy must leave the rows as they are during a rollout"):
+    with pytest.raises(ValueError, match="a policy must not change the rows during a rollout"):
         rollout(rows, policy, Steps.empty(rows, 3))
 
 

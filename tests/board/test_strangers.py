@@ -76,7 +76,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "alias bomb": (lambda folder: (folder / "config.yaml").write_text(BOMB), "anchors (&name) are not read"),
     "base 60": (
         lambda folder: (folder / "method.yaml").write_text("name: " + ":".join(["59"] * 20_000)),
-        "is read as a number by some programs alone",
+        "is a number to some programs, a text to others",
     ),
     "long file": (lambda folder: (folder / "method.yaml").write_text("a: " + "1:" * 200_000), "the limit is 65,536"),
     "sparse file": (sparse, "has files of more than 1,073,741,824 bytes, more: remove them"),

@@ -27,7 +27,7 @@ class Masks(TaskMethod):
     dL/ds = c dL/dw. Classes that derive from it say how a new task's scores are initialised.
 
     Stored are c, the scores of each of the curriculum's tasks and those of the present one: 4 P bytes each; a mask
-    alone could be kept in P bits.
+    without scores could be kept in P bits.
 
     Args:
         backbone_seed: c and the initial scores of each slot come from this seed, so that agents with different seeds
@@ -135,7 +135,7 @@ class Masks(TaskMethod):
 
     @torch.no_grad()
     def scores_of(self, task: int) -> Tensor:
-        """Return a copy of the scores of a task that has started, float32 [P]; of the present one as they are now."""
+        """Return a copy of the scores of a task that has started, float32 [P]; of the present one, its scores now."""
         slot = self.started.index(task)
         return flat(self.current_scores()) if slot == self.slot else self.scores[slot].clone()
 

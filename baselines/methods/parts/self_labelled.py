@@ -34,7 +34,7 @@ class SelfLabelled:
     oracle and announced boundaries that is ``protocol.task_id=at_boundaries``, bit for bit.
 
     Args:
-        method: any lifelong-learning method that learns the curriculum as it is.
+        method: any lifelong-learning method that learns the curriculum unchanged.
         detector: what gives the labels.
     """
 
@@ -59,7 +59,7 @@ class SelfLabelled:
         require(
             (
                 how.task_id == "hidden",
-                f"{detector} gives tasks labels of its own: set protocol.task_id=hidden, got {how.task_id}",
+                f"{detector} labels tasks itself: set protocol.task_id=hidden, got {how.task_id}",
             ),
             (
                 hidden,

@@ -56,7 +56,7 @@ class Weights:
 
     @torch.no_grad()
     def write_parts(self, parts: Sequence[Tensor]) -> None:
-        """Set each parameter to the values of its own vector, [n] each."""
+        """Set each parameter to the values of its vector, [n] each."""
         for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.copy_(part.view_as(parameter))
 

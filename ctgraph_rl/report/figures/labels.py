@@ -22,7 +22,7 @@ NOT_LEARNED = 0.35
 """Opacity of frames that were not learned from."""
 
 SEVERAL = (0.85, 0.85, 0.85)
-"""Colour of blocks with several tasks, and of labels that acted in them alone."""
+"""Colour of blocks with several tasks, and of labels that acted only in them."""
 
 
 def label_strips(section: Section) -> CaptionedFigure | None:

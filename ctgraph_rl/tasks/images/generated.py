@@ -73,8 +73,8 @@ class GroupedImages(SquareImages):
 
         within = D (1 - (1 - s_i)^2),    between = D (1 - (1 - s_i)^2 (1 - s_g)^2)
 
-    are the expected distances of two images of one group and of two groups, and the shares follow from them. What came
-    out for a seed is in `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
+    are the expected distances of two images of one group and of two groups, and the shares follow from them. The
+    values of a seed are in `distances`; more cells come closer. A share s of n cells is s n of them rounded at random
     up or down, so at least one is redrawn when within >= D (1 - (1 - 1 / c^2)^2), the least value allowed.
 
     No image occurs twice: one drawn before is left out. Longer groups begin with the shorter ones.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
 WITH_TABLE = ("gymnasium.envs.toy_text.frozen_lake", "gymnasium.envs.toy_text.cliffwalking")
-"""Modules of environments that step by their table of transitions ``P`` alone."""
+"""Modules of environments that step only by their table of transitions ``P``."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class GymTask:
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """The shape of an observation as it is shown."""
+        """The shape of an observation that is shown."""
         space = spaces_of(self)[0]
         if _is_integer(space):
             return (int(space.n),)

@@ -123,7 +123,7 @@ def test_a_learner_of_ones_own_with_continuous_actions_is_measured():
     [
         (lambda: make_agent("ppo", CONTINUOUS), r"agents of baselines choose from discrete actions, .* float32 \[1\]"),
         (lambda: make_agent("rl2", curricula.load("frozen_lake_4maps")), "RL2 needs CT-graphs"),
-        (lambda: evaluate(OptimalPolicy, [LAKE], 1), "OptimalPolicy plays CT-graphs alone"),
+        (lambda: evaluate(OptimalPolicy, [LAKE], 1), "OptimalPolicy plays only CT-graphs"),
         (lambda: _learn(protocol=Protocol(guide_frames=64)), "protocol.guide_frames=64 needs CT-graphs, not GymTask"),
         (lambda: _learn(blocks=(Block((LAKE, replace(LAKE, label="b")), 64, Drift(1)),)), "which GymTask has not"),
     ],
