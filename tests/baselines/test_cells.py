@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
 import pytest
 import torch
-from helpers.small_agents import batches, parameters_equal, saved_and_loaded
+from helpers.small_agents import batches, others_slow, parameters_equal, saved_and_loaded
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import nn
@@ -139,8 +139,10 @@ def test_what_a_cell_reads_of_its_own_past_is_a_setting_and_nothing_at_the_start
     assert not torch.equal(value[1], changed[1])
 
 
-@every_cell
-@pytest.mark.parametrize("agent", ["lstm_ppo", pytest.param("drqn", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "agent"),
+    others_slow(product(CELLS, ["lstm_ppo", "drqn"]), *product(["attention", "backpropamine", "gru"], ["lstm_ppo"])),
+)
 def test_an_agent_with_a_cell_is_saved_and_restored_bit_by_bit(name, agent):
     if agent == "drqn" and any(key.startswith(UNSTORED) for key in make(name).state_keys):
         pytest.skip("replay needs a state that is stored")

@@ -100,6 +100,7 @@ def test_an_honest_submission_is_rerun_and_a_second_call_repeats_no_run(
     assert len(in_process) == 2
 
 
+@pytest.mark.slow
 def test_an_edited_sum_of_an_agent_is_found_by_a_rerun_alone(
     tiny_home, tiny_track, method, tmp_path, monkeypatch, in_process
 ):

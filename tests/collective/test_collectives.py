@@ -65,6 +65,7 @@ def stop_at_save(monkeypatch, count: int) -> None:
     monkeypatch.setattr(Checkpoints, "save", stopped)
 
 
+@pytest.mark.slow
 def test_members_of_an_isolated_collective_are_the_runs_that_their_settings_name(monkeypatch, capsys):
     assert command_line(monkeypatch, *TINY, "exchange=isolated", "exchange.num_members=2") == 0
     assert "2 members, Isolated, l2d2c_2x2: learned" in capsys.readouterr().out

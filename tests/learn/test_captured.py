@@ -100,7 +100,7 @@ def test_no_step_of_the_tensor_engine_needs_the_host(name, request):
     assert {value.device for value in (*steps, *batch.state)} == {META}
 
 
-@pytest.mark.parametrize("name", others_slow(POLICY_GRADIENTS, "lstm_ppo", "ppo_rnd"))
+@pytest.mark.parametrize("name", others_slow(POLICY_GRADIENTS, "lstm_ppo"))
 def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swapped, request):
     env = CTGraphEnv([confounding(p=0.3)] * 16, kernel="off")
     agent = agent_of(compose, name, env).to(META)

@@ -383,6 +383,7 @@ def test_what_follows_a_checkpoint_may_be_anything(copied, complete):
     assert unlike(complete, copied.parents[1]) == []
 
 
+@pytest.mark.slow
 def test_an_expert_that_lost_its_measurements_is_noticed_and_trained_again(tmp_path, monkeypatch):
     (tmp_path / "whole").mkdir()
     monkeypatch.chdir(tmp_path / "whole")

@@ -84,6 +84,7 @@ def stop_after_a_block(monkeypatch, start, *overrides: str) -> None:
         start(*overrides)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_resumed_after_a_setting_was_added(command, monkeypatch):
     whole = (command() / AGENT).read_bytes()
     stop_after_a_block(monkeypatch, command, "overwrite=true")

@@ -331,7 +331,7 @@ def check_close(one: AgentWithMethod, other: AgentWithMethod) -> None:
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-2)
 
 
-@pytest.mark.parametrize("name", others_slow(COMPILED, "cka_rl", "clear", "ewc", "packnet"))
+@pytest.mark.parametrize("name", others_slow(COMPILED, "cka_rl", "ewc"))
 def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(compose, monkeypatch, name):
     eager = two_tasks(compose, name)
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
