@@ -9,10 +9,11 @@ tree. Levels count decisions: level k has b^k wait states and, below the depth, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.core.graph import CTGraph, StateType
+from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
 
 POLICIES: dict[str, Callable[[CTGraph], tuple[float, float, bool]]] = {
@@ -72,6 +73,74 @@ def state_entropy(task: Task, policy: str = "random") -> float:
             open_bits += _bits(visits[kind], 1 if knows_goal else task.graph.branching_factor)
     arrived = sum(visits[StateType.END].values())
     return open_bits / (1 + sum(sum(of_kind.values()) for of_kind in visits.values()) + 1 - arrived)
+
+
+def transition_entropy(task: Task, policy: str = "navigation", informed: bool = True) -> float:
+    """Return the least bits a step that a predictor of the next observation and reward can need.
+
+    Ids of different kinds of states never overlap, so who sees the observations and actions of an episode knows the
+    state, and only two things are open: whether a wait state is left, and which of its ids a state shows. With v(kind)
+    the expected visits of an episode, l(kind) = log2 of the ids that a state of this kind draws from, 0 for unique
+    ones, a the probability to wait at a wait state, c that to decide at a decision state, n = 1 + v(W) + v(D) steps,
+    and h the binary entropy,
+
+        n H = l(W) + v(D) (c l(W) + (1 - c) l(F)) + v(W) (1 - a) l(F)
+              + sum over levels k of v(W, k) a (h(p) + p l(W) + (1 - p) l(D, or E at the last level)).
+
+    Rewards follow from the state and add nothing. Without information, neither the last observation nor the action,
+    a predictor needs the entropy of how often each pair of observation and reward comes.
+
+    Args:
+        task: whose rewards are no chance: the needle, without noise.
+        policy: see `state_entropy`.
+        informed: False gives the entropy of the pairs alone.
+
+    Raises:
+        ValueError: as for `state_entropy`, and for rewards, goals and images that are drawn, and an extra last step.
+    """
+    x, p = task.observations, task.graph.wait_prob
+    drawn = task.reward_std or task.goal_change or x.read_noise or x.read_rotation or x.reward_cue
+    fixed = task.reward_fn == Needle() and not drawn and not task.extra_end_step
+    require(
+        (policy in POLICIES, f"policy must be one of {', '.join(POLICIES)}, got {policy!r}"),
+        _index_rule(task),
+        (fixed, "the entropy of transitions is exact for a Needle reward, with no noise, change or extra step"),
+    )
+    waits, decides, knows_goal = POLICIES[policy](task.graph)
+    visits = _visits(task.graph, waits, decides)
+    count = {kind: sum(of_kind.values()) for kind, of_kind in visits.items()}
+    steps = 1 + count[StateType.WAIT] + count[StateType.DECISION]
+    bits = {kind: 0.0 if x.is_unique(kind) else math.log2(1 + x.ids(kind)[1] - x.ids(kind)[0]) for kind in StateType}
+    if not informed:
+        return _pair_bits(visits, bits, task, knows_goal) / steps
+    wait, fail = bits[StateType.WAIT], bits[StateType.FAIL]
+    stay = sum(-share * math.log2(share) for share in (p, 1 - p) if share) + p * wait
+    total = wait + count[StateType.DECISION] * (decides * wait + (1 - decides) * fail)
+    for level, v in visits[StateType.WAIT].items():
+        onward = bits[StateType.END if level == task.graph.depth else StateType.DECISION]
+        total += v * (waits * (stay + (1 - p) * onward) + (1 - waits) * fail)
+    return total / steps
+
+
+def _pair_bits(
+    visits: Mapping[StateType, dict[int, float]], bits: Mapping[StateType, float], task: Task, knows_goal: bool
+) -> float:
+    """-sum over pairs of c log2(c / n), where a pair of observation and reward comes c times in an episode's n steps.
+
+    Equal pairs are one group, (their expected number together, log2 of how many there are).
+    """
+    b = 1 if knows_goal else task.graph.branching_factor
+    arrived = sum(visits[StateType.END].values())
+    goal = 1.0 if task.observations.is_unique(StateType.END) else b**-task.graph.depth
+    groups = [(1 - arrived, bits[StateType.FAIL])]
+    for kind, by_level in visits.items():
+        if task.observations.is_unique(kind):
+            groups += [(v, level * math.log2(b)) for level, v in by_level.items()]
+        else:
+            shares = (goal, 1 - goal) if kind == StateType.END else (1.0,)
+            groups += [(share * sum(by_level.values()), bits[kind]) for share in shares]
+    total = sum(count for count, _ in groups)
+    return sum(count * (wide - math.log2(count / total)) for count, wide in groups if count > 0)
 
 
 def _visits(graph: CTGraph, waits: float, decides: float) -> dict[StateType, dict[int, float]]:

@@ -1,0 +1,60 @@
+"""A GRU: a recurrent network that predicts the next pair of observation and reward from all that came before."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
+
+from baselines.models.model import Symbols, Transitions
+
+
+class GRUModel:
+    """An embedding of observation and action, a GRU over the rows, and logits of all pairs.
+
+    It is not reset where an episode ends: the home state tells it. Learning minimises the mean bits by Adam.
+
+    Args:
+        symbols: the images and rewards.
+        hidden_size: width of the embedding and the GRU.
+        num_epochs: passes over the data of a call of `learn`.
+        learning_rate: of Adam.
+        seed: of the first weights and the order of rows.
+    """
+
+    def __init__(
+        self,
+        symbols: Symbols,
+        hidden_size: int = 64,
+        num_epochs: int = 40,
+        learning_rate: float = 0.01,
+        seed: int = 0,
+    ) -> None:
+        self.num_actions = symbols.num_actions
+        self.num_epochs = num_epochs
+        self.generator = torch.Generator(device="cpu").manual_seed(seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.embedding = nn.Embedding(len(symbols.images) * symbols.num_actions, hidden_size, device="cpu")
+            self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True, device="cpu")
+            self.head = nn.Linear(hidden_size, symbols.num_pairs, device="cpu")
+        layers = nn.ModuleList([self.embedding, self.gru, self.head])
+        self.optimiser = torch.optim.Adam(layers.parameters(), learning_rate)
+
+    def learn(self, transitions: Transitions) -> None:
+        """See `Predictor`; minibatches of 16 rows."""
+        for _ in range(self.num_epochs):
+            for rows in torch.randperm(len(transitions.pair), generator=self.generator).split(16):
+                batch = Transitions(*(each[rows] for each in transitions))
+                self.optimiser.zero_grad()
+                self._nats(batch).mean().backward()
+                self.optimiser.step()
+
+    @torch.no_grad()
+    def bits(self, transitions: Transitions) -> Tensor:
+        """See `Predictor`."""
+        return self._nats(transitions) / torch.tensor(2.0, device="cpu").log()
+
+    def _nats(self, transitions: Transitions) -> Tensor:
+        memory, _ = self.gru(self.embedding(transitions.image * self.num_actions + transitions.action))
+        return cross_entropy(self.head(memory).movedim(-1, 1), transitions.pair, reduction="none")

@@ -1,0 +1,162 @@
+"""What predictors learn from and how they are scored: bits a step above the exact entropy of the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ctgraph_rl.checks import require
+from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.learn.collect import InitialState, Policy, collect
+from ctgraph_rl.policies import NavigationPolicy
+from ctgraph_rl.tasks.observability import transition_entropy
+from ctgraph_rl.tasks.task import Task, ct_graphs
+
+
+class Transitions(NamedTuple):
+    """Steps of rows in time order, int64 [rows, steps] each."""
+
+    image: Tensor  # number of the image before the step
+    action: Tensor
+    pair: Tensor  # number of the pair of image and reward after it
+
+
+class Symbols:
+    """The images and rewards of tasks as numbers, so that predictors give them probabilities.
+
+    Args:
+        tasks: whose images differ in nothing but their pixels, without noise or rotation on read.
+
+    Raises:
+        ValueError: for tasks whose images vary on read, or differ in shape.
+    """
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        tasks = ct_graphs(tasks, "a model of the environment")
+        varied = any(task.observations.read_noise or task.observations.read_rotation for task in tasks)
+        shapes = {task.observation_shape for task in tasks}
+        require(
+            (not varied, "a model numbers images: tasks need read_noise=0 and read_rotation=0"),
+            (len(shapes) == 1, f"tasks of a model need observations of one shape, got {sorted(shapes)}"),
+        )
+        banks = {task.images: task.images.bank(0).flatten(1) for task in tasks}
+        self.images = torch.cat(list(banks.values())).unique(dim=0)
+        paid = {reward for task in tasks for reward in (0.0, task.goal_reward, task.fail_reward)}
+        steps = {task.step_reward for task in tasks}
+        every = sorted({reward + step for reward in paid for step in steps})
+        self.rewards = torch.tensor(every, dtype=torch.float32, device="cpu")
+        self.num_actions = max(task.num_actions for task in tasks)
+
+    @property
+    def num_pairs(self) -> int:
+        """Pairs of an image and a reward."""
+        return len(self.images) * len(self.rewards)
+
+    def of(self, batch: TensorDictBase) -> Transitions:
+        """Return the transitions of a batch that an agent learns from, [rows, steps] in time order.
+
+        Raises:
+            ValueError: for an image that no task has.
+        """
+        reward = (batch["next", "reward"].squeeze(-1).unsqueeze(-1) - self.rewards).abs().argmin(-1)
+        seen = self._numbers(batch["observation"], batch.ndim)
+        after = self._numbers(batch["next", "observation"], batch.ndim)
+        return Transitions(seen, batch["action"], after * len(self.rewards) + reward)
+
+    def _numbers(self, observation: Tensor, num_dims: int) -> Tensor:
+        flat = observation.flatten(num_dims).flatten(0, num_dims - 1)
+        weights = torch.arange(1, flat.shape[1] + 1, dtype=torch.float64, device="cpu").sqrt()
+        sums, order = (self.images.double() @ weights).sort()
+        found = order[torch.searchsorted(sums - 0.5e-6, flat.double() @ weights).sub(1).clamp(min=0)]
+        require(((self.images[found] == flat).all().item(), "the data show an image that is none of the tasks'"))
+        return found.view(observation.shape[:num_dims])
+
+
+class Predictor(Protocol):
+    """Gives the next observation and reward probabilities, from the observations and actions so far."""
+
+    def learn(self, transitions: Transitions) -> None:
+        """Learn from data, in addition to what was learned before."""
+        ...
+
+    def bits(self, transitions: Transitions) -> Tensor:
+        """Return -log2 of the probability that each step's pair had before it came, float [rows, steps]."""
+        ...
+
+
+def experience(
+    task: Task,
+    symbols: Symbols,
+    policy: Policy | type = NavigationPolicy,
+    num_rows: int = 64,
+    num_steps: int = 256,
+    seed: int = 0,
+    initial_state: InitialState | None = None,
+) -> Transitions:
+    """Return what a policy meets in a task.
+
+    Args:
+        task: the task.
+        symbols: of it and all tasks that the predictor meets.
+        policy: an agent's ``policy``, which samples, or a class of `ctgraph_rl.policies`.
+        num_rows: rows side by side.
+        num_steps: steps of each; episodes follow each other.
+        seed: of the environment and of torch's generator, which is left as it was.
+        initial_state: of an agent with memory.
+    """
+    env = CTGraphEnv([task] * num_rows, seed)
+    acts = policy(env) if isinstance(policy, type) else policy
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        [batch] = collect(env, acts, num_rows * num_steps, num_steps, initial_state)
+    return symbols.of(batch)
+
+
+def learned_share(model: Predictor, test: Transitions, task: Task, policy: str = "navigation") -> float:
+    """Return how much of what can be predicted is predicted: 1 is the exact model, 0 knows frequencies alone.
+
+    1 - (bits - H) / (U - H), with the exact H and U of `transition_entropy` with and without information. It is below 0
+    for a predictor that is wrong and sure.
+
+    Args:
+        model: the predictor.
+        test: transitions of the named policy that it has not learned from.
+        task: what they are of.
+        policy: the name of the policy; see `transition_entropy`.
+    """
+    exact = transition_entropy(task, policy)
+    frequencies = transition_entropy(task, policy, informed=False)
+    return 1 - (model.bits(test).double().mean().item() - exact) / (frequencies - exact)
+
+
+def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Task], num_steps: int = 256) -> Tensor:
+    """Return `learned_share` of each task after each of them was learned in order, float64 [tasks + 1, tasks].
+
+    Metrics of the performance matrix take it, such as ``forgetting(matrix, [[0], [1]])``. Data are of a policy that
+    navigates; test data have a seed of their own.
+
+    Args:
+        make: builds the predictor of symbols, such as `baselines.models.table_model.TableModel`.
+        tasks: what is learned, one after the other.
+        num_steps: steps of each of 64 rows to learn from, and as many to test.
+
+    Example:
+        >>> from baselines.models.table_model import TableModel
+        >>> from ctgraph_rl.metrics import forgetting
+        >>> from ctgraph_rl.tasks.configurations import ct_fo_b1
+        >>> tasks = [ct_fo_b1(goal=(1, 1)), ct_fo_b1(goal=(2, 2))]
+        >>> round(forgetting(performance_matrix(TableModel, tasks), [[0], [1]]).value, 2) > 0
+        True
+    """
+    symbols = Symbols(tasks)
+    model = make(symbols)
+    test = [experience(task, symbols, num_steps=num_steps, seed=1) for task in tasks]
+    rows = [[learned_share(model, each, task) for each, task in zip(test, tasks, strict=True)]]
+    for learned in tasks:
+        model.learn(experience(learned, symbols, num_steps=num_steps))
+        rows.append([learned_share(model, each, task) for each, task in zip(test, tasks, strict=True)])
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")

@@ -1,0 +1,40 @@
+"""A table: how often each pair of observation and reward followed an observation and an action."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from baselines.models.model import Symbols, Transitions
+
+
+class TableModel:
+    """Counts, which are the exact model of a fully observable task in the end; it sees one observation and action.
+
+    After counts n(c, s) of a pair s in a context c, P(s | c) = (n(c, s) + P(s)) / (n(c) + 1), with the share of all
+    steps P(s) = (n(s) + 1) / (n + S) over S pairs; so a context that never came gives the frequencies.
+
+    Args:
+        symbols: the images and rewards.
+    """
+
+    def __init__(self, symbols: Symbols) -> None:
+        self.num_actions = symbols.num_actions
+        contexts = len(symbols.images) * symbols.num_actions
+        self.counts = torch.zeros(contexts, symbols.num_pairs, dtype=torch.float64, device="cpu")
+
+    def learn(self, transitions: Transitions) -> None:
+        """See `Predictor`."""
+        where = (self._context(transitions).flatten(), transitions.pair.flatten())
+        self.counts.index_put_(where, torch.ones_like(where[0], dtype=torch.float64), accumulate=True)
+
+    def bits(self, transitions: Transitions) -> Tensor:
+        """See `Predictor`."""
+        context = self._context(transitions)
+        every = self.counts.sum(0) + 1
+        share = (every / every.sum())[transitions.pair]
+        found = self.counts[context, transitions.pair] + share
+        return -(found / (self.counts.sum(1)[context] + 1)).log2()
+
+    def _context(self, transitions: Transitions) -> Tensor:
+        return transitions.image * self.num_actions + transitions.action
