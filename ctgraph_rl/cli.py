@@ -37,6 +37,7 @@ COMMANDS = {
     "export": Command("ctgraph_rl.log.export", "write a run in the format of another program"),
     "methods": Command("baselines.methods.__main__", "list the lifelong-learning methods"),
     "play": Command("ctgraph_rl.visualize.play", "play a CT-graph, or watch a policy play it"),
+    "profile": Command("ctgraph_rl.profile.__main__", "score an agent on ten learning properties"),
     "report": Command("ctgraph_rl.report.__main__", "make a page of figures and tables of runs"),
     "results": Command("ctgraph_rl.report.results", "print a table of runs over seeds"),
     "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that anybody can check"),

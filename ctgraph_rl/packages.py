@@ -6,7 +6,7 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import torch
 
     from ctgraph_rl.tasks.curriculum import Curriculum
+    from ctgraph_rl.tasks.task import Task
 
 HERE = Path(__file__).resolve().parent
 
@@ -177,3 +178,23 @@ def class_named(module: str, name: str) -> type | None:
     home = import_module(module)  # its name is another one if it moved
     kind = getattr(home, name, None)
     return kind if isinstance(kind, type) and kind.__module__ == home.__name__ else None
+
+
+def profile_properties() -> Mapping[str, Any]:
+    """Return the properties of a profile by their curricula; see `curricula.profile`.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    return import_module("curricula.profile").PROPERTIES
+
+
+def taught_share(policy: Any, task: Task, initial_state: Any = None) -> float:
+    """Return how much of a model a table learns from a policy's data; see `baselines.models.table_model.taught_share`.
+
+    Raises:
+        ValueError: see `check_packages`.
+    """
+    check_packages()
+    return import_module("baselines.models.table_model").taught_share(policy, task, initial_state)

@@ -31,7 +31,7 @@ FLOORS = (
     ("runs", "baselines"),
     ("visualize", "hydra_plugins"),
     ("report",),
-    ("collective", "board"),
+    ("collective", "board", "profile"),
     ("cli", "run", "describe", "compare", "testing", "benchmark"),
     ("benchmarks",),
 )
@@ -41,6 +41,7 @@ TOP = {
     "curricula.__main__": "a command of cli.py",
     "baselines.__main__": "a command of cli.py",
     "baselines.methods.__main__": "a command of cli.py",
+    "ctgraph_rl.profile.__main__": "a command that starts a sweep",
 }
 """Modules that stand above all floors, and why."""
 

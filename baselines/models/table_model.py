@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.models.model import Symbols, Transitions
+from baselines.models.model import Symbols, Transitions, experience, learned_share
+from ctgraph_rl.learn.collect import InitialState, Policy
+from ctgraph_rl.tasks.task import Task
 
 
 class TableModel:
@@ -38,3 +40,17 @@ class TableModel:
 
     def _context(self, transitions: Transitions) -> Tensor:
         return transitions.image * self.num_actions + transitions.action
+
+
+def taught_share(policy: Policy | type, task: Task, initial_state: InitialState | None = None) -> float:
+    """Return `learned_share` of a table that learns from a policy's data, on data of a policy that navigates.
+
+    Args:
+        policy: see `experience`.
+        task: where it acts.
+        initial_state: of an agent with memory.
+    """
+    symbols = Symbols([task])
+    model = TableModel(symbols)
+    model.learn(experience(task, symbols, policy, initial_state=initial_state))
+    return learned_share(model, experience(task, symbols, seed=1), task)

@@ -135,6 +135,22 @@ def play() -> ArgumentParser:
     return parser
 
 
+def profile() -> ArgumentParser:
+    """Train an agent on ten small curricula, one for each learning property of the paper, and score it.
+
+    Settings are those of ctgraph-rl -m, such as agent=lstm_ppo seed=range(5). Cells use all cores, and the same command
+    resumes. Runs go to runs/profile, and the page shows every agent there. Folders in place of settings only score the
+    runs in them, those of a Recorder, too. A score is 0 at the floor of an agent without the property and 1 at the
+    optimum. The exit code is 1 if cells are not done.
+    """
+    parser = _parser(profile)
+    parser.add_argument("words", nargs="+", metavar="SETTING=VALUE|FOLDER", help="what to train, or runs to score")
+    parser.add_argument("--config-dir", type=Path, help="a folder with an agent of your own, agent/NAME.yaml")
+    parser.add_argument("--out", type=Path, help="where the page goes (default: profile/ within the first folder)")
+    _add_agent(parser)
+    return parser
+
+
 def report() -> ArgumentParser:
     """Write a page of figures and tables of runs."""
     parser = _parser(report)

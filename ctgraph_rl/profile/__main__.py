@@ -1,0 +1,58 @@
+"""The command ``ctgraph-rl profile``: train an agent on ten small curricula, one a learning property, and score it."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from ctgraph_rl import parsers, run
+from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.refuse import refused_by
+from ctgraph_rl.profile.profile_page import text_table, write_profile
+from ctgraph_rl.report.style import require_packages
+
+FOLDER = "hydra.sweep.dir"
+LAUNCHER = "hydra/launcher"
+
+USUAL = {"curriculum": "glob(profile_*)", FOLDER: "runs/profile"}
+"""Settings of the sweep that the command line may replace."""
+
+
+def main() -> None:
+    """Train where there are settings, then write and print the profile; the exit code is 1 where cells are not done."""
+    parser = parsers.profile()
+    arguments = parser.parse_args()
+    settings = [word for word in arguments.words if "=" in word]
+    folders = [word for word in arguments.words if "=" not in word]
+    complete = True
+    with refused_by(parser):
+        require_packages()
+    if settings:
+        given = {**USUAL, **dict(word.split("=", 1) for word in settings)}
+        folders.append(given[FOLDER])
+        complete = _train(given, arguments.config_dir)
+    out = arguments.out or Path(folders[0], "profile")
+    with refused_by(parser):
+        scores = write_profile(folders, out, arguments.agent)
+    print(terminal_lines(text_table(scores)))
+    print(f"profile: {terminal_text(out / 'profile.md')}")
+    sys.exit(0 if complete else 1)
+
+
+def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
+    """Run the sweep; return whether all cells are done, and leave where it could not begin."""
+    on_all_cores = [] if LAUNCHER in settings or not find_spec("joblib") else [f"{LAUNCHER}=joblib"]
+    own = [] if config_dir is None else [f"--config-dir={config_dir}"]
+    sys.argv = ["ctgraph-rl", "-m", *own, *on_all_cores, *(f"{key}={value}" for key, value in settings.items())]
+    try:
+        run.main()
+    except SystemExit as end:
+        if end.__context__ is not None or end.code != 1:  # an error, or a signal, and not a sweep with gaps
+            raise
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main()
