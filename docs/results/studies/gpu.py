@@ -141,8 +141,12 @@ def section(report: Mapping[str, Any] | None) -> str:
     about, tests = report["machine"], report.get("tests", {"said": "not run"})
     text = f"Measured on {about['device']}, driver {about['driver']}, commit {report['commit']}.\n"
     text += f"Tests marked `cuda`: {tests['said']}.\n"
-    for name, yardstick in {"environment": ladder.COPY, "learning": learning.ENVIRONMENT}.items():
-        text += f"\n{ladder.table(report.get(name, []), yardstick)}\n"
+    environment = report.get("environment", [])
+    fewest = min((row["rows"] for row in environment), default=0)
+    shown = [row for row in environment if row["rows"] == fewest]
+    text += (
+        f"\n{ladder.table(shown, ladder.COPY)}\n\n{ladder.table(report.get('learning', []), learning.ENVIRONMENT)}\n"
+    )
     return text + "".join(f"\n{line}\n" for line in jobs(report.get("learning", [])))
 
 
