@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-from ctgraph_rl.checks import at_least_one, require, takes_numbers
+from ctgraph_rl.checks import at_least_one, is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot, PaperImages
@@ -12,7 +13,8 @@ from ctgraph_rl.tasks.observations import Observations
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
 from curricula.axes import all_goals, given_goals, random_goals
-from curricula.order import cycle, sequence
+from curricula.draws import below, generator
+from curricula.order import OneOrMore, Tasks, cycle, sequence
 from curricula.published import environment, full_mdp, goal_of
 
 SWOKS = "Dick et al. 2024, CoLLAs, arXiv 2405.19047; github.com/JupiLogy/swoks"
@@ -21,6 +23,9 @@ DICK_2020 = "Dick et al. 2020, Frontiers in Neurorobotics 14, 578675; github.com
 NM = "Ben-Iwhiwhu et al. 2022, Neural Networks; github.com/dlpbc/nm-metarl"
 
 UNANNOUNCED = Protocol(boundaries="hidden")
+
+MOST_LIVES = 10_000
+"""Each takes two blocks."""
 
 
 def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
@@ -38,25 +43,67 @@ def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
     return sequence("swoks_2x4", cycle(tasks, 2), num_frames, version=1, source=SWOKS, protocol=UNANNOUNCED)
 
 
-def penn_a_swap(num_frames: int | None = None, depth: int = 2, num_rows: int = 256, seed: int = 0) -> Curriculum:
+def penn_a_swap(
+    num_frames: int | None = None, depth: int = 2, num_rows: int = 256, seed: int = 0, num_lives: int | None = None
+) -> Curriculum:
     """The goal swap of evolved neuromodulated networks: a goal, then unannounced another one, drawn uniformly.
 
     There a trial had 100 episodes and the swap came at a random one of the episodes 35 to 65. Here each row plays a
     trial, and the swap comes after the frames that 50 of the longest episodes take: frames, not episodes, are counted,
     and the moment does not vary. An agent's fitness was the mean of 4 trials; how often to evaluate is our default.
 
+    With ``num_lives`` rows play one trial after the other, of 100 of the longest episodes, each with two goals and a
+    swap after 35 to 65 of them. The rows of a trial swap at once, and begin with all goals equally. A row of an
+    evaluation plays 100 episodes, of a goal that stays, and held out of one that is drawn again after 50 of them.
+
     Args:
         num_frames: frames of each half, all rows together; None: 50 episodes of 2 d + 3 steps for each row.
         depth: 2 or 3.
         num_rows: trials side by side, for the default of ``num_frames``.
-        seed: draws the two goals.
+        seed: draws the goals, and the moments of swaps.
+        num_lives: trials of a row, one after the other, without ``num_frames``; None: one.
     """
-    require((depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"), *at_least_one(num_rows=num_rows))
+    require(
+        (depth in (2, 3), f"depth must be 2 or 3, as published, got {depth!r}"),
+        *at_least_one(num_rows=num_rows),
+        (
+            num_lives is None or is_int(num_lives, 1, MOST_LIVES),
+            f"num_lives must be in 1..{MOST_LIVES}, got {num_lives!r}",
+        ),
+        (num_lives is None or num_frames is None, "num_frames is of one life: leave it out with num_lives"),
+    )
     unique = (False, False)
     config = environment(depth, (2, 2), (3, 3), (4, 4), fail_reward=-0.4, unique=unique)
-    tasks = random_goals(Task.from_json(config, (1,) * depth), 2, seed)
-    frames = 50 * _longest_episode(depth) * num_rows if num_frames is None else num_frames
-    return sequence("penn_a_swap", tasks, frames, version=1, source=PENN_A, protocol=UNANNOUNCED)
+    task = Task.from_json(config, (1,) * depth)
+    episode = _longest_episode(depth) * num_rows
+    evaluation = None
+    if num_lives is None:
+        tasks: Sequence[OneOrMore] = random_goals(task, 2, seed)
+        frames = [50 * episode if num_frames is None else num_frames] * 2
+    else:
+        goals = all_goals(task)
+        tasks, moments = _lives(goals, num_lives, seed)
+        frames = [episodes * episode for moment in moments for episodes in (moment, 100 - moment)]
+        swapped = all_goals(replace(task, goal_change=(50, 50)))
+        every = 10 if num_lives % 10 == 0 else num_lives
+        evaluation = Evaluation(
+            400, episodes_per_row=100, at_block_ends=False, every=every * 100 * episode, held_out=swapped
+        )
+    return sequence("penn_a_swap", tasks, frames, source=PENN_A, protocol=UNANNOUNCED, evaluation=evaluation)
+
+
+def _lives(goals: Tasks, num_lives: int, seed: int) -> tuple[list[Tasks], list[int]]:
+    """Draw the tasks of the rows before and after the swap of each life, and after how many episodes it comes."""
+    source = generator(seed)
+    count = len(goals)
+    tasks = []
+    moments = []
+    for _ in range(num_lives):
+        first = below(source, count)
+        second = (first + 1 + below(source, count - 1)) % count
+        tasks += [goals[first:] + goals[:first], goals[second:] + goals[:second]]
+        moments.append(35 + below(source, 31))
+    return tasks, moments
 
 
 def dick2020_pair(num_frames: int = 51_200, one_hot: bool = True) -> Curriculum:

@@ -80,7 +80,7 @@ DOORS = {
 }
 """Modules that import by name, and why."""
 
-CATALOGUES = ("baselines.methods", "curricula")
+CATALOGUES = ("baselines", "baselines.methods", "curricula")
 """Folders of one class or named sequence a file."""
 
 LONG_FILES: dict[str, str] = {}

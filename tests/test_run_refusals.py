@@ -21,7 +21,10 @@ SHORT = ("curriculum.num_frames=1024", "agent.num_envs=64", "agent.num_steps=8",
 
 REFUSED = [
     (["curriculum=su_b2"], ["error: unknown curriculum 'su_b2': there are ", ", ctgraph-rl curricula lists them\n"]),
-    (["agent=sarsa"], ["error: unknown agent 'sarsa': choices: a2c, cavia, dqn, drqn, lstm_ppo, maml, mohqa, ppo, "]),
+    (
+        ["agent=sarsa"],
+        ["error: unknown agent 'sarsa': choices: a2c, cavia, dqn, drqn, lstm_ppo, maml, mohqa, penn_a, "],
+    ),
     (["cell=gr"], ["error: unknown cell 'gr': did you mean 'gru'?\n"]),
     (["cell=gru", "agent=dqn"], ["agent has no cell: it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm"]),
     (["cell=gru", "agent.cell.reads_acton=true"], ["unknown setting 'agent.cell.reads_acton'", "reads_action"]),

@@ -58,6 +58,7 @@ ADDED: dict[str, dict[str, Any]] = {
         "reward_std": 0.0,
         "reward_fn": "needle",
     },
+    "curricula.penn_a_swap": {"num_lives": None},
 }
 """Settings that were added after runs had been stored, each with the value for "as before".
 

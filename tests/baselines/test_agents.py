@@ -8,6 +8,7 @@ from helpers.paths import CHECKOUT
 from helpers.small_agents import (
     ADAPTING,
     AGENTS,
+    EVOLVING,
     GREEDY,
     Q_LEARNERS,
     SAMPLED,
@@ -42,7 +43,7 @@ def test_the_agents_are_those_with_a_yaml():
     files = (CHECKOUT / "baselines").glob("*.py")
 
     found = sorted(path.stem for path in files if "\n    solves = " in path.read_text(encoding="utf-8"))
-    assert found == sorted([*AGENTS, *ADAPTING])
+    assert found == sorted([*AGENTS, *ADAPTING, *EVOLVING])
     assert "ppo_published" in YAML.keys() - set(AGENTS)
 
 

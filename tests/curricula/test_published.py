@@ -217,6 +217,22 @@ def test_penn_a_draws_every_pair_of_goals():
     assert len(pairs) == 12
 
 
+def test_each_life_of_penn_a_has_two_goals_and_a_swap_after_35_to_65_of_100_episodes():
+    lives = curricula.load("penn_a_swap", depth=3, num_rows=16, num_lives=100)
+
+    halves = list(zip(lives.blocks[::2], lives.blocks[1::2], strict=True))
+    goals = [[(a.goal, b.goal) for a, b in zip(one.tasks, two.tasks, strict=True)] for one, two in halves]
+    moments = {one.num_frames / (16 * 9) for one, _ in halves}
+    assert {one.num_frames + two.num_frames for one, two in halves} == {16 * 9 * 100}
+    assert {min(moments), max(moments)} == {35, 65}
+    assert all(len({first for first, _ in pairs}) == 8 for pairs in goals)
+    assert all(first != second for pairs in goals for first, second in pairs)
+    assert len({pair for pairs in goals for pair in pairs}) == 8 * 7
+    assert lives.protocol == Protocol(boundaries="hidden")
+    assert [lives.moment(count * 16 * 900) for count in (1, 9, 10)] == [None, None, "after"]
+    assert {task.goal_change for task in lives.evaluation.held_out} == {(50, 50)}
+
+
 @pytest.mark.parametrize(
     ("depth", "episodes", "test_episodes", "bound"),
     [(2, 40, 40, 2_805_600), (3, 50, 40, 18_018_000), (4, 120, 100, 39_626_400)],
@@ -297,6 +313,8 @@ def test_two_ids_for_one_task_are_refused():
         ("penn_a_swap", {"depth": 4}, r"depth must be 2 or 3, as published, got 4"),
         ("nm_uniform_goals", {"depth": 5}, r"depth must be 2, 3 or 4, as published, got 5"),
         ("penn_a_swap", {"seed": -1}, r"seed must be an integer >= 0, got -1"),
+        ("penn_a_swap", {"num_lives": 0}, r"num_lives must be in 1..10000, got 0"),
+        ("penn_a_swap", {"num_lives": 2, "num_frames": 9}, r"num_frames is of one life: leave it out with num_lives"),
     ],
 )
 def test_what_was_not_published_is_refused_with_the_choices(name, arguments, message):

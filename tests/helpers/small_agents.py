@@ -39,7 +39,10 @@ KINDS = {agent.name: agent.kind for agent in catalogue("agent")}
 ADAPTING = [name for name, kind in KINDS.items() if issubclass(kind, InnerLoop)]
 """Agents that need tasks which are drawn, and no method."""
 
-AGENTS = [name for name in KINDS if name not in ADAPTING]
+EVOLVING = ["penn_a"]
+"""Agents with neither a gradient step for their actions nor a method."""
+
+AGENTS = [name for name in KINDS if name not in (*ADAPTING, *EVOLVING)]
 """All others; files of conf/agent that are no agents only change some values of one."""
 
 Q_LEARNERS = tuple(name for name, kind in KINDS.items() if issubclass(kind, QLearner))

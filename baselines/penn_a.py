@@ -1,0 +1,475 @@
+"""PENN-A: a population of plastic neuromodulated networks evolves, and each learns within its life, without gradients.
+
+Ben-Iwhiwhu et al. 2020, "Evolving inborn knowledge for fast adaptation in dynamic POMDP problems" (GECCO, arXiv
+2004.12846). An individual lives several trials, a row of the environment each, and its fitness is the mean sum of their
+rewards over ``life_episodes`` episodes. It gets no reward: it must see in the image of an end state what was paid.
+
+Observations become 16 latents of an autoencoder, scaled by the largest one, logit(l / max l) clipped to [0, 1]. They
+and a constant 1 are the inputs of neurons, of which the first one acts: an output above 1/3 is action 2, one below -1/3
+action 1, else 0. At each step, five times, with x the inputs and the last outputs with a little noise,
+
+    y_i = tanh(1/2 sum over inputs and standard j of w_ji x_j),  m_i = tanh(1/2 sum over modulatory j of w_ji x_j),
+    w_ji <- clip(w_ji + m_i r (A z_j y_i + B z_j + C y_i + D), -10, 10),  z the inputs and y without noise.
+
+Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 0.1 is 0 and stays 0. So do A to D,
+g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
+
+After a generation the population is cut into segments at a random place. The best of a segment has all its children:
+clones or crossed with a random individual, then with a neuron more or less, then with all genes mutated by +-exp(-180
+|u|), u uniform in [-1, 1]. Individuals before the first segment have a child each. The best one of all stays unchanged
+and is individual 0. The autoencoder learns from what the population saw. The paper leaves open what a new neuron is:
+here standard or modulatory with equal probability, its genes uniform.
+
+A greedy evaluation plays the best individual, which is the result of evolution; the mean of the population has mutants
+that nobody would use, and training measures it. An evaluation that samples plays the population in turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn.functional import mse_loss, pad
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from baselines.cells.cell import linear_layer
+from baselines.parts.distinct import distinct
+from baselines.parts.learner import require_finite
+from baselines.parts.networks import Data, guided, highest, num_actions_of, require_weights
+from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, positive, require, require_memory
+from ctgraph_rl.learn.collect import UNSTORED
+
+PASSES = 5
+NOISE = 0.001
+THRESHOLD = 0.33
+LARGEST_WEIGHT = 10.0
+
+NEURONS = (False, False, False, False, True, True, True)
+"""Which neurons of the first individuals are modulatory; the first neuron acts."""
+
+FIRST_PRECISION = 10.0
+"""Of the mutation of zeros that gives the first individuals their genes."""
+
+WEIGHTS, OUTPUTS = f"{UNSTORED}weights", f"{UNSTORED}outputs"
+
+
+class Population(NamedTuple):
+    """Genomes, padded to the most neurons that an individual has."""
+
+    genes: Tensor  # of weights, [individuals, inputs + neurons, neurons]; 0 where there is no neuron
+    rule: Tensor  # genes of A, B, C, D and r, [individuals, 5]
+    modulates: Tensor  # which neurons are modulatory, bool [individuals, neurons]
+    size: Tensor  # neurons, int64 [individuals]
+
+    def take(self, individuals: Tensor) -> Population:
+        """Return some individuals, int64 [n]."""
+        return Population(*(value.index_select(0, individuals) for value in self))
+
+    @property
+    def num_inputs(self) -> int:
+        """Inputs of a neuron beside the neurons."""
+        return self.genes.shape[1] - self.genes.shape[2]
+
+    def within(self, size: Tensor) -> Tensor:
+        """Return which genes are of the first ``size`` neurons of each individual, bool like ``genes``."""
+        row = torch.arange(self.genes.shape[1], device=size.device).view(-1, 1)
+        column = torch.arange(self.genes.shape[2], device=size.device)
+        limit = size.view(-1, 1, 1)
+        return (row < self.num_inputs + limit) & (column < limit)
+
+    def weights(self) -> Tensor:
+        """Return the weights that individuals are born with, like ``genes``."""
+        weights = LARGEST_WEIGHT * self.genes**3
+        return torch.where(weights.abs() < 0.1, 0.0, weights)
+
+    def rates(self) -> Tensor:
+        """Return A, B, C, D and r, [individuals, 5]."""
+        cubes = self.rule**3
+        of_terms = torch.where(cubes.abs() < 0.01, 0.0, cubes)[:, :4]
+        return torch.cat([of_terms, 100 * cubes[:, 4:]], dim=1)
+
+
+def live(lives: Population, inputs: Tensor, weights: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weights and outputs after a step; tensors have their rows last meanwhile, as a sum is fastest then.
+
+    Args:
+        lives: the individual of each row.
+        inputs: of all neurons, [rows, inputs].
+        weights: [rows, inputs + neurons, neurons].
+        outputs: of the step before, [rows, neurons].
+    """
+    changing = weights.movedim(0, -1).clone(memory_format=torch.contiguous_format)
+    inputs = inputs.T
+    outputs = outputs.T
+    modulates = pad(lives.modulates, (len(inputs), 0)).T.unsqueeze(1)
+    plastic = ((changing != 0) & ~modulates).to(weights.dtype)
+    a, b, c, d, rate = lives.rates().T
+    for _ in range(PASSES):
+        seen = torch.cat([inputs, outputs])
+        seen = seen + NOISE * draw_like(seen)
+        parts = seen.unsqueeze(1) * changing
+        from_modulatory = (parts[len(inputs) :] * modulates[len(inputs) :]).sum(dim=0)
+        outputs = ((parts.sum(dim=0) - from_modulatory) / 2).tanh()
+        gain = (from_modulatory / 2).tanh() * rate
+        sources = torch.cat([inputs, outputs]).unsqueeze(1)
+        change = torch.addcmul(gain * (c * outputs + d), sources, gain * (a * outputs + b))
+        changing.addcmul_(plastic, change).clamp_(-LARGEST_WEIGHT, LARGEST_WEIGHT)
+    return changing.movedim(-1, 0), outputs.T
+
+
+class Reproduction(NamedTuple):
+    """How a generation follows from the one before."""
+
+    segment_size: int
+    crossover_prob: float
+    insert_prob: float
+    duplicate_prob: float
+    delete_prob: float
+    precision: float
+
+    def children(self, parents: Population, fitness: Tensor) -> Population:
+        """Return the next generation; its first individual is the best of this one, unchanged."""
+        chosen = winners(fitness, self.segment_size, int(torch.randint(self.segment_size, ())))
+        chosen[0] = fitness.argmax()
+        mates = torch.randint(len(fitness), fitness.shape, device=fitness.device)
+        crossed = self.crossed(parents.take(chosen), parents.take(mates))
+        return mutated(self.resized(crossed), self.precision)
+
+    def crossed(self, parents: Population, mates: Population) -> Population:
+        """Give some children the rows of a mate's genes from a random one on, as far as both have neurons."""
+        crosses = chances(parents).view(-1, 1) < self.crossover_prob
+        shared = torch.minimum(parents.size, mates.size)
+        point = (chances(parents) * (parents.num_inputs + shared)).floor().view(-1, 1)
+        row = torch.arange(parents.genes.shape[1], device=point.device)
+        from_mate = (crosses & (row >= point)).unsqueeze(-1) & parents.within(shared)
+        swapped = crosses & (torch.rand_like(parents.rule) < 0.5)
+        return parents._replace(
+            genes=torch.where(from_mate, mates.genes, parents.genes),
+            rule=torch.where(swapped, mates.rule, parents.rule),
+        )
+
+    def resized(self, population: Population) -> Population:
+        """Insert, duplicate or delete a neuron of some individuals, but never the first neuron."""
+        size = population.size
+        new = population.modulates.shape[1]
+        other = (1 + torch.rand_like(population.rule[:, 0]) * (size - 1)).long().minimum(size - 1)
+        chance = chances(population)
+        inserts = chance < self.insert_prob
+        grows = chance < self.insert_prob + self.duplicate_prob
+        shrinks = ~grows & (chance < self.insert_prob + self.duplicate_prob + self.delete_prob) & (size > 1)
+        source = torch.arange(new + 1, device=size.device).repeat(len(size), 1)
+        place = torch.where(grows, size, other).unsqueeze(-1)
+        copied = torch.where(shrinks, size - 1, torch.where(inserts, new, other)).unsqueeze(-1)
+        source = torch.where((grows | shrinks).unsqueeze(-1), source.scatter(1, place, copied), source)
+        size = size + grows.long() - shrinks.long()
+        return rearranged(population, source[:, : int(size.max())], size)
+
+
+def chances(population: Population) -> Tensor:
+    """Draw a number of [0, 1) for each individual, but 1 for the first, to which so nothing happens; [individuals]."""
+    drawn = torch.rand_like(population.rule[:, 0])
+    drawn[0] = 1
+    return drawn
+
+
+def rearranged(population: Population, source: Tensor, size: Tensor) -> Population:
+    """Return individuals whose neurons are copies of others, or new ones.
+
+    Args:
+        population: of up to n neurons.
+        source: the neuron that each is a copy of, n for a new one, int64 [individuals, neurons].
+        size: neurons of each individual.
+    """
+    inputs = population.num_inputs
+    genes = pad(population.genes, (0, 1, 0, 1))
+    genes[:, :, -1] = draw_like(genes[:, :, -1])
+    genes[:, -1] = draw_like(genes[:, -1])
+    modulates = pad(population.modulates, (0, 1))
+    modulates[:, -1] = torch.rand_like(genes[:, 0, 0]) < 0.5
+    always = torch.arange(inputs, device=size.device).expand(len(size), -1)
+    rows = torch.cat([always, inputs + source], dim=1).unsqueeze(-1)
+    genes = genes.take_along_dim(rows, dim=1).take_along_dim(source.unsqueeze(1), dim=2)
+    found = Population(genes, population.rule, modulates.gather(1, source), size)
+    return found._replace(genes=genes * found.within(size))
+
+
+def draw_like(values: Tensor) -> Tensor:
+    """Draw numbers uniformly from [-1, 1)."""
+    return 2 * torch.rand_like(values) - 1
+
+
+def mutation(genes: Tensor, precision: float) -> Tensor:
+    """Draw changes of genes: of either sign, P(|change| > x) = -ln(x) / precision for x above exp(-precision)."""
+    drawn = draw_like(genes)
+    return drawn.sign() * (-precision * drawn.abs()).exp()
+
+
+def mutated(population: Population, precision: float) -> Population:
+    """Mutate all genes of all individuals but the first."""
+    genes = population.genes.clone()
+    rule = population.rule.clone()
+    for values in (genes[1:], rule[1:]):
+        values.add_(mutation(values, precision)).clamp_(-1, 1)
+    return population._replace(genes=genes * population.within(population.size), rule=rule)
+
+
+def winners(fitness: Tensor, segment_size: int, offset: int) -> Tensor:
+    """Return the parent of each child, int64 [individuals]: itself before the offset, then the best of its segment."""
+    count = len(fitness)
+    segments = pad(fitness[offset:], (0, (offset - count) % segment_size), value=-torch.inf).view(-1, segment_size)
+    first = offset + segment_size * torch.arange(len(segments), device=fitness.device)
+    best = (first + segments.argmax(dim=1)).repeat_interleave(segment_size)
+    return torch.cat([torch.arange(offset, device=fitness.device), best])[:count]
+
+
+def first_population(count: int, num_inputs: int) -> Population:
+    """Draw the first generation; its first individual has no weights."""
+    modulates = torch.tensor(NEURONS, device="cpu").repeat(count, 1)
+    size = modulates.new_full((count,), len(NEURONS), dtype=torch.int64)
+    genes = torch.zeros(count, num_inputs + len(NEURONS), len(NEURONS), dtype=torch.float32, device="cpu")
+    return mutated(Population(genes, genes[:, :5, 0], modulates, size), FIRST_PRECISION)
+
+
+def layers(*widths: int) -> nn.Sequential:
+    """Return linear layers with ReLU."""
+    return nn.Sequential(*(part for pair in pairwise(widths) for part in (linear_layer(*pair), nn.ReLU())))
+
+
+class Autoencoder(nn.Module):
+    """Observations to latents and back, with ReLU after all layers.
+
+    Args:
+        num_pixels: numbers of an observation.
+        scale: observations are divided by it.
+        hidden_size: units between observation and latents.
+        num_latents: latents.
+    """
+
+    def __init__(self, num_pixels: int, scale: float, hidden_size: int, num_latents: int) -> None:
+        super().__init__()
+        self.scale = scale
+        self.encoder = layers(num_pixels, hidden_size, num_latents)
+        self.decoder = layers(num_latents, hidden_size, num_pixels)
+
+    def loss(self, observation: Tensor) -> Tensor:
+        """Compute the mean squared error of observations, [n, ...]."""
+        flat = observation.flatten(1) / self.scale
+        return mse_loss(self.decoder(self.encoder(flat)), flat)
+
+    def inputs(self, observation: Tensor) -> Tensor:
+        """Compute the inputs of neurons, [n, num_latents + 1]; equal observations are encoded once."""
+        examples, groups = distinct([observation])
+        latents = self.encoder(observation[examples].flatten(1) / self.scale)
+        share = latents / (latents.amax(dim=1, keepdim=True) + 1e-5)
+        return pad(share.logit(1e-5).clamp(0, 1), (0, 1), value=1.0)[groups]
+
+
+class PennA(TakesNumbers, TensorDictModuleBase):
+    """A population that evolves. It is its own policy: each row has weights that last over the episodes of a life.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_envs: rows, ``num_trials`` for each individual.
+        num_steps: steps of each row in a batch.
+        num_batches: batches of a life.
+        num_trials: trials of an individual, in rows that follow each other.
+        life_episodes: episodes of a trial whose rewards count.
+        num_latents: latents of the autoencoder.
+        hidden_size: units of its other layers.
+        learning_rate: of its gradient steps.
+        num_updates: gradient steps after a generation.
+        batch_size: observations of each.
+        segment_size: individuals of which the best one has all children.
+        crossover_prob: probability of a child to be crossed with a random individual.
+        insert_prob: probability of a child to get a new neuron.
+        duplicate_prob: probability of a child to get a copy of a neuron.
+        delete_prob: probability of a child to lose a neuron.
+        precision: of mutations, see `mutation`.
+    """
+
+    memory = True
+    solves = "tasks whose goal changes within a life, if images show what was paid: it learns without a reward"
+    in_keys = ["observation", "is_init", "trial", "life", WEIGHTS, OUTPUTS]  # noqa: RUF012, as TensorDict has it
+    out_keys = ["action", *(("next", key) for key in in_keys[2:])]  # noqa: RUF012
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        *,
+        num_envs: int,
+        num_steps: int,
+        num_batches: int,
+        num_trials: int,
+        life_episodes: int,
+        num_latents: int,
+        hidden_size: int,
+        learning_rate: float,
+        num_updates: int,
+        batch_size: int,
+        segment_size: int,
+        crossover_prob: float,
+        insert_prob: float,
+        duplicate_prob: float,
+        delete_prob: float,
+        precision: float,
+    ) -> None:
+        super().__init__()
+        num_actions = num_actions_of(action_spec)
+        require(
+            *at_least_one(
+                num_envs=num_envs,
+                num_steps=num_steps,
+                num_batches=num_batches,
+                num_trials=num_trials,
+                life_episodes=life_episodes,
+                num_latents=num_latents,
+                hidden_size=hidden_size,
+                num_updates=num_updates,
+                batch_size=batch_size,
+                segment_size=segment_size,
+            ),
+            *fraction(
+                crossover_prob=crossover_prob,
+                insert_prob=insert_prob,
+                duplicate_prob=duplicate_prob,
+                delete_prob=delete_prob,
+            ),
+            *positive(learning_rate=learning_rate, precision=precision),
+            (num_actions == 3, f"PENN-A has one neuron for the actions 0, 1 and 2, and the task has {num_actions}"),
+        )
+        rows = f"num_envs must be a multiple of num_trials={num_trials}, the rows of an individual, got {num_envs}"
+        require((num_envs % num_trials == 0, rows))
+        require_weights(observation_spec, hidden_size, 2, num_latents)
+        weights = num_envs * (num_latents + len(NEURONS)) * len(NEURONS)
+        require_memory(f"weights of num_envs={num_envs} with num_latents={num_latents}", 16 * weights, "of either")
+        self.reproduction = Reproduction(
+            segment_size=segment_size,
+            crossover_prob=crossover_prob,
+            insert_prob=insert_prob,
+            duplicate_prob=duplicate_prob,
+            delete_prob=delete_prob,
+            precision=precision,
+        )
+        self.num_envs, self.num_steps, self.num_batches = num_envs, num_steps, num_batches
+        self.num_trials, self.life_episodes = num_trials, life_episodes
+        self.num_updates, self.batch_size = num_updates, batch_size
+        shown = observation_spec["observation"]
+        self.autoencoder = Autoencoder(shown.shape.numel(), highest(shown), hidden_size, num_latents)
+        self.optimiser = torch.optim.SGD(self.parameters(), lr=learning_rate, momentum=0.9)
+        self.population = first_population(num_envs // num_trials, num_latents + 1)
+        self.generation = 0
+        self.lived = 0
+        self.register_buffer("rewards", torch.zeros(num_envs, dtype=torch.float32, device="cpu"))
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The agent itself."""
+        return self
+
+    def policy_for(self, task: int) -> TensorDictModuleBase:
+        """Return the policy, which is the same for all tasks."""
+        return self
+
+    def start_task(self, task: int | None = None) -> None:
+        """Do nothing."""
+
+    def end_task(self) -> None:
+        """Do nothing."""
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return the state before a life; it lasts over episodes, as it has a key ``trial``."""
+        genes = self.population.genes
+        none = genes.new_zeros(num_envs, 1, dtype=torch.int64)
+        weights = genes.new_zeros(num_envs, *genes.shape[1:])
+        return TensorDict({"trial": none, "life": none, WEIGHTS: weights, OUTPUTS: weights[:, 0]}, [num_envs])
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` and the next state; ``trial`` is the number of the episode in its life, from 1."""
+        rows = torch.arange(len(tensordict), device=tensordict["trial"].device)
+        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        who = torch.zeros_like(rows) if is_greedy else rows // self.num_trials % len(self.population.size)
+        lives = self.population.take(who)
+        waits = (tensordict["life"] != self.generation) | (tensordict["trial"] == 0)  # for its first episode
+        trial = torch.where(waits, 0, tensordict["trial"]) + tensordict["is_init"]
+        weights, outputs = tensordict[WEIGHTS], tensordict[OUTPUTS]
+        if waits.any():
+            born = lives.weights()
+            weights = born if waits.all() else torch.where(waits.unsqueeze(-1), born, weights)
+            outputs = torch.zeros_like(born[:, 0]) if waits.all() else torch.where(waits, 0.0, outputs)
+        weights, outputs = live(lives, self.autoencoder.inputs(tensordict["observation"]), weights, outputs)
+        output = outputs[:, 0] + NOISE * draw_like(outputs[:, 0])
+        action = 2 * (output > THRESHOLD) + 1 * (output < -THRESHOLD)
+        tensordict.set("action", guided(tensordict, action))
+        after = {"trial": trial, "life": torch.full_like(trial, self.generation), WEIGHTS: weights, OUTPUTS: outputs}
+        return tensordict.update({("next", key): value for key, value in after.items()})
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the autoencoder's loss; the population has none."""
+        return {"loss_autoencoder": self.autoencoder.loss(batch["observation"])}
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """Add up rewards; after the last batch of a life, let the population reproduce and the autoencoder learn."""
+        after = batch["next"]
+        is_born = (after["life"] == self.generation) & (after["trial"] > 0)
+        self.rewards += (after["reward"] * (is_born & (after["trial"] <= self.life_episodes))).sum(dim=(1, 2))
+        self.lived += 1
+        if self.lived < self.num_batches:
+            return {}
+        fitness = self.rewards.view(-1, self.num_trials).mean(dim=1)
+        measured = {
+            "fitness_mean": fitness.mean().item(),
+            "fitness_best": fitness.max().item(),
+            "neurons_mean": self.population.size.double().mean().item(),
+            "loss_autoencoder": self._learn_latents(batch["observation"].flatten(0, 1)),
+        }
+        self.population = self.reproduction.children(self.population, fitness)
+        self.generation += 1
+        self.lived = 0
+        self.rewards.zero_()
+        return measured
+
+    def _learn_latents(self, seen: Tensor) -> float:
+        """Let the autoencoder learn from some of what was seen; return its mean loss.
+
+        Raises:
+            FloatingPointError: if that is not finite.
+        """
+        total = torch.zeros_like(self.rewards[0])
+        for _ in range(self.num_updates):
+            loss = self.autoencoder.loss(seen[torch.randint(len(seen), (self.batch_size,), device=seen.device)])
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            total += loss.detach()
+        require_finite("loss_autoencoder", total)
+        return total.item() / self.num_updates
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PennA:
+        """Move the population with everything else."""
+        self.population = Population(*map(fn, self.population))
+        return super()._apply(fn, recurse)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what `state_dict` has beside tensors of one shape: the population, its age, the optimiser's state."""
+        return {
+            "population": self.population._asdict(),
+            "generation": self.generation,
+            "lived": self.lived,
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        self.population = Population(**state["population"])
+        self.generation = state["generation"]
+        self.lived = state["lived"]
+        self.optimiser.load_state_dict(state["optimiser"])
