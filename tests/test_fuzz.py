@@ -136,6 +136,7 @@ def tiny(name: str) -> dict[str, Any]:
     settings = dict(next(entry for entry in entries("agent") if entry.name == name).settings)
     small = {"num_envs": 2, "num_steps": 8, "hidden_size": 4, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
     small |= {"num_epochs": 1, "num_updates": 1, "compile": False, "adapt_episodes": 2}
+    small |= {"num_steps": 24} if "adapt_episodes" in settings else {}
     return settings | {key: value for key, value in small.items() if key in settings}
 
 
@@ -148,7 +149,7 @@ def agents() -> Iterator[tuple[str, Any]]:
     for entry in entries("agent"):
 
         def make(name: str = entry.name, **settings: Any) -> object:
-            curriculum = ONE_BLOCK if name in ("cavia", "maml") else SMALL_CURRICULUM
+            curriculum = ONE_BLOCK if name in ("cavia", "maml", "pearl") else SMALL_CURRICULUM
             return new_agent(curriculum, built("agent", name, **settings), 0)
 
         yield entry.name, (make, tiny(entry.name))

@@ -23,7 +23,7 @@ REFUSED = [
     (["curriculum=su_b2"], ["error: unknown curriculum 'su_b2': there are ", ", ctgraph-rl curricula lists them\n"]),
     (
         ["agent=sarsa"],
-        ["error: unknown agent 'sarsa': choices: a2c, cavia, dqn, drqn, lstm_ppo, maml, mohqa, penn_a, "],
+        ["error: unknown agent 'sarsa': choices: a2c, cavia, dqn, drqn, lstm_ppo, maml, mohqa, pearl, "],
     ),
     (["cell=gr"], ["error: unknown cell 'gr': did you mean 'gru'?\n"]),
     (["cell=gru", "agent=dqn"], ["agent has no cell: it has no memory; use agent=lstm_ppo, rl2, drqn or qrdqn_lstm"]),

@@ -8,11 +8,15 @@ the code that was released with the paper. ``hard_straight_through`` has the val
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
+from baselines.parts.networks import highest, require_weights
+from ctgraph_rl.checks import require_memory
 
 GATES = ("none", "soft", "hard", "hard_straight_through")
 
@@ -99,3 +103,36 @@ class GatedNetwork(nn.Module):
     def as_inputs(self, values: Tensor) -> Tensor:
         """Return values in the type of the weights."""
         return values.to(self.output.weight.dtype)
+
+
+def shown_specs(observation_spec: Composite) -> dict[str, TensorSpec]:
+    """Return the specs of what a network sees: the observation and, where the environment has it, the task id."""
+    shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
+    return {key: observation_spec[key] for key in shown}
+
+
+def gated_network(specs: dict[str, TensorSpec], num_extra: int, num_outputs: int, **sizes: Any) -> GatedNetwork:
+    """Build a network that reads what `shown_specs` returned, and further inputs.
+
+    Args:
+        specs: of what it sees.
+        num_extra: width of further inputs.
+        num_outputs: width of its output.
+        sizes: further arguments of `GatedNetwork`.
+    """
+    observation, *others = specs.values()
+    num_extra += sum(other.shape.numel() for other in others)
+    return GatedNetwork(observation.shape, highest(observation), num_extra, num_outputs=num_outputs, **sizes)
+
+
+def require_gated_weights(
+    observation_spec: Composite, hidden_size: int, num_layers: int, *, num_context: int, gate_size: int
+) -> None:
+    """Refuse networks whose weights, gradients and moments of Adam the machine cannot hold.
+
+    Raises:
+        ValueError: names the layers and the bytes.
+    """
+    require_weights(observation_spec, hidden_size, num_layers)
+    parts = f"weights of num_context={num_context} and gate_size={gate_size}"
+    require_memory(parts, 16 * hidden_size * (num_context + 2 * num_layers * gate_size), "or smaller ones")

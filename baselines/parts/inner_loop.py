@@ -31,12 +31,12 @@ from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from baselines.parts.gates import GATES, GatedNetwork
+from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, draw, guided, highest, num_actions_of, require_weights
+from baselines.parts.networks import Data, draw, guided, num_actions_of
 from baselines.update.optimiser import make_optimiser
 from baselines.update.trust_region import trust_region_step
-from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require, require_memory
+from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
 
 OUTER = ("trpo", "ppo")
@@ -258,6 +258,7 @@ class InnerLoop(Learner):
     """
 
     memory = True
+    needs_whole_trials = True
     output_keys = ("log_probs",)
     minibatch_size = 0  # batches differ in their number of trials
 
@@ -299,19 +300,14 @@ class InnerLoop(Learner):
         self.num_context = num_context
         self.outer, self.max_kl, self.clip_epsilon, self.num_epochs = outer, max_kl, clip_epsilon, num_epochs
         num_actions = num_actions_of(action_spec)
-        require_weights(observation_spec, hidden_size, num_layers, num_actions)
-        parts = f"weights of num_context={num_context} and gate_size={gate_size}"
-        require_memory(parts, 16 * hidden_size * (num_context + 2 * num_layers * gate_size), "or smaller ones")
-        shown = [key for key in ("observation", "task_id") if key in observation_spec.keys()]  # noqa: SIM118, no dict
-        self.specs = {key: observation_spec[key] for key in shown}
-        shape, *others = (spec.shape for spec in self.specs.values())
-        net = GatedNetwork(
-            shape,
-            highest(observation_spec["observation"]),
-            num_context + sum(other.numel() for other in others),
+        require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
+        self.specs = shown_specs(observation_spec)
+        net = gated_network(
+            self.specs,
+            num_context,
+            num_actions,
             hidden_size=hidden_size,
             num_layers=num_layers,
-            num_outputs=num_actions,
             gate=gate,
             gate_size=gate_size,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -64,11 +65,12 @@ def check_ids(curriculum: Curriculum, agent: Agent) -> None:
 
 
 def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
-    """Refuse an agent that adapts where a curriculum has nothing to adapt to, or too few episodes for it.
+    """Refuse an agent that adapts where a curriculum has nothing to adapt to, or too few episodes or steps for it.
 
     Args:
         curriculum: what is learned.
-        agent: one with a member ``adapt_episodes`` adapts to a row's task after so many of its episodes.
+        agent: one with a member ``adapt_episodes`` adapts to a row's task after so many of its episodes. One that
+            ``needs_whole_trials`` learns nothing from trials of ``trial_episodes`` that a batch cuts.
     """
     needed = getattr(agent, "adapt_episodes", 0)
     if not needed:
@@ -78,10 +80,25 @@ def check_adaptation(curriculum: Curriculum, agent: Agent) -> None:
     row = f"rows of an evaluation have {how.row_episodes} episodes, and {name} adapts after {needed}"
     without = [str(number) for number, block in enumerate(curriculum.blocks, 1) if not _has_distribution(block)]
     one = f"{name} learns to adapt to tasks that are drawn, and block {', '.join(without)} has one task"
+    steps = _steps_of_trial(curriculum, agent)
+    trial = f"a trial of {getattr(agent, 'trial_episodes', 0)} episodes that reach an end takes {steps} steps"
+    cut = f"num_steps={agent.num_steps} of {name}: {trial}, and {name} learns from whole trials in a batch"
     require(
+        (agent.num_steps >= steps, f"{cut}: set agent.num_steps={2 * steps}, which is two trials"),
         (not without, f"{one}: give a block all goals, as nm_uniform_goals does, or its task a goal_change"),
         (how.row_episodes > needed, f"{row}: set evaluation.adapt_episodes={needed}"),
     )
+
+
+def _steps_of_trial(curriculum: Curriculum, agent: Agent) -> int:
+    """Return the mean steps of a trial whose episodes reach an end, of the CT-graph with the longest ones.
+
+    It is 0 for an agent that needs no whole trial.
+    """
+    if not getattr(agent, "needs_whole_trials", False):
+        return 0
+    lengths = [task.graph.expected_episode_length for task in curriculum.tasks if isinstance(task, Task)]
+    return math.ceil(agent.trial_episodes * max(lengths, default=0))  # type: ignore[attr-defined]
 
 
 def _has_distribution(block: Block) -> bool:

@@ -64,7 +64,11 @@ def _builders(group: str) -> dict[str, Any]:
             cfg = hydra.compose("config", overrides=[f"{group}={path.stem}"])
             small = METHODS.get(path.stem, [])
             if group == "agent":
-                small = [*TINY, *REPLAY * ("buffer_size" in cfg.agent), *MINIBATCHES * ("num_minibatches" in cfg.agent)]
+                small = [
+                    *TINY,
+                    *REPLAY * ("target_update_interval" in cfg.agent),
+                    *MINIBATCHES * ("num_minibatches" in cfg.agent),
+                ]
             made[path.stem] = config.target(hydra.compose("config", overrides=[f"{group}={path.stem}", *small]), group)
     return made
 

@@ -45,11 +45,12 @@ ADAPTING = ("curriculum=nm_uniform_goals", "agent.adapt_episodes=1")
 FITTING = {
     "maml": ADAPTING,
     "cavia": ADAPTING,
+    "pearl": ADAPTING[:1],
     "l2d2c": ("agent=ppo", "method=mask_ri", "curriculum=l2d2c_2x2"),
     "isolated": ("agent=ppo",),
 }
 
-SMALL = {"num_envs": 4, "num_steps": 8, "hidden_size": 8, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
+SMALL = {"num_envs": 4, "num_steps": 16, "hidden_size": 8, "batch_size": 4, "buffer_size": 64, "num_minibatches": 1}
 
 FREE = ("checkpoint_seconds", "experts", "max_grad_norm")
 """Settings that may be of another kind than their value in the file: any number, and what a sweep also lists."""

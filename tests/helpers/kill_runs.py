@@ -35,6 +35,8 @@ REPLAY = ["agent.num_updates=2", "agent.batch_size=16", "agent.buffer_size=512"]
 TRIALS = ["curriculum=nm_uniform_goals", "curriculum.num_frames=2048", "evaluation.num_episodes=8"]
 TRIALS += ["evaluation.episodes_per_row=4", "evaluation.every=1024"]
 
+ADAPTS = ["evaluation.adapt_episodes=1"]
+
 CONF = Path(__file__).resolve().parents[2] / "conf" / "agent"
 
 RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") if "_target_" in path.read_text()} | {
@@ -48,7 +50,8 @@ RUNS: dict[str, list[str]] = {path.stem: BLOCKS for path in CONF.glob("*.yaml") 
     "qrdqn_lstm": [*BLOCKS, *REPLAY, "agent.replay_on_task_change=keep", "protocol.boundaries=hidden"],
     "reinforce": [*BLOCKS, "experts=true"],
     "rl2": [*TRIALS, *MINIBATCHES],
-    **{name: [*TRIALS, "agent.adapt_episodes=1", "evaluation.adapt_episodes=1"] for name in ("cavia", "maml")},
+    **{name: [*TRIALS, *ADAPTS, "agent.adapt_episodes=1", "agent.num_steps=16"] for name in ("cavia", "maml")},
+    "pearl": [*TRIALS, *ADAPTS, "agent.num_updates=2", "agent.buffer_size=512"],
 }
 """What every agent learns: small, with as many different things in it as a run can have."""
 

@@ -36,7 +36,9 @@ YAML = {path.stem: OmegaConf.load(path) for path in sorted(Path(conf_dir(), "age
 
 KINDS = {agent.name: agent.kind for agent in catalogue("agent")}
 
-ADAPTING = [name for name, kind in KINDS.items() if issubclass(kind, InnerLoop)]
+INNER_LOOPS = [name for name, kind in KINDS.items() if issubclass(kind, InnerLoop)]
+
+ADAPTING = [*INNER_LOOPS, "pearl"]
 """Agents that need tasks which are drawn, and no method."""
 
 EVOLVING = ["penn_a"]
@@ -81,7 +83,7 @@ def others_slow(values: Iterable[Any], *kept: Any) -> list[Any]:
 
 def less(name: str) -> list[str]:
     """The last two of these, where an agent has such settings."""
-    return [*REPLAY * ("buffer_size" in YAML[name]), *MINIBATCHES * ("num_minibatches" in YAML[name])]
+    return [*REPLAY * ("target_update_interval" in YAML[name]), *MINIBATCHES * ("num_minibatches" in YAML[name])]
 
 
 def batches(agent, task: Task, count: int, seed: int = 0) -> list:

@@ -6,7 +6,7 @@ import json
 import os
 import pickle
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
@@ -17,10 +17,11 @@ import torch
 from omegaconf import OmegaConf
 
 from baselines.a2c import A2C
-from ctgraph_rl import Block, Curriculum, Evaluation
+from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.packages import conf_dir
-from ctgraph_rl.runs.checkpoints import Checkpoints
+from ctgraph_rl.runs.checkpoints import Checkpoints, decoded, encoded
 from ctgraph_rl.runs.train import new_agent, train
+from helpers.kill_runs import equal
 from helpers.scripted import ONE, TWO
 
 SETTINGS = {
@@ -120,3 +121,32 @@ def bombs(canary: Path) -> dict[str, bytes]:
     torch.save({"frames": 64, "agent": Bomb(canary)}, folder / "old", _use_new_zipfile_serialization=False)
     (folder / "plain").write_bytes(pickle.dumps({"frames": 64, "agent": Bomb(canary)}))
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def logs_of_equal_ends(curriculum: Curriculum, make: Callable[[], Any], folder: Path) -> list[RunLog]:
+    """The logs of a run and of two that resume from its second and third checkpoint, of agents that end as equals."""
+    states: list[Path] = []
+    logs: list[RunLog] = []
+    ends: list[dict[str, Any]] = []
+
+    def keep(state, at_block_end):
+        states.append(folder / f"{len(states)}.pt")
+        states[-1].write_bytes(encoded(state()))
+
+    def learn(log, saved=None, checkpoint=None):
+        agent = make()
+        torch.manual_seed(0 if saved is None else 1234)
+        learn_curriculum(curriculum, agent, 7, log, saved=saved, checkpoint=checkpoint)
+        log.close()
+        logs.append(log)
+        ends.append(agent.state_dict())
+
+    learn(RunLog(folder / "run.jsonl"), checkpoint=keep)
+    for path in states[1:3]:
+        saved = decoded(path)
+        (folder / path.stem).write_bytes((folder / "run.jsonl").read_bytes())
+        learn(RunLog.resume(folder / path.stem, saved["log"]), saved)
+    for other, log in zip(ends[1:], logs[1:], strict=True):
+        assert equal(other, ends[0])
+        assert torch.equal(log.performance(), logs[0].performance())
+    return logs

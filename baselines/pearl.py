@@ -1,0 +1,328 @@
+"""PEARL: a policy reads a guess of its task, which it draws from a posterior over the steps of its trial.
+
+Rakelly et al. 2019, "Efficient off-policy meta-reinforcement learning via probabilistic context variables" (arXiv
+1903.08254). The posterior of a context c of steps (o_i, a_i, r_i) is a product of Gaussians, one for each step,
+
+    q(z | c) = N(mu, s),    1/s = sum_i 1/s_i,    mu = s sum_i mu_i/s_i,    N(0, 1) without a step.
+
+A row draws z before each episode of a trial. The losses are those of soft actor-critic for discrete actions
+(Christodoulou 2019, arXiv 1910.07207), given z of a posterior of the same trial, with the smaller of two critics Q:
+
+    loss_value = sum_j (Q_j(o, a, z) - k r - gamma V')^2
+    V' = sum_b pi(b | o', z) (min_j Q'_j(o', b, z) - alpha log pi(b | o', z))
+    loss_policy = sum_b pi(b | o, z) (alpha log pi(b | o, z) - min_j Q_j(o, b, z))
+    loss_context = kl_coeff KL(q(z | c) || N(0, 1))
+
+They are means over steps. The encoder, which computes mu_i and s_i, gets no gradient of loss_policy. Q' follows Q.
+
+A task is a trial: nothing tells that two trials have one goal. Replay holds the last steps of all rows. A context, and
+the steps that the other losses read, are drawn from one trial there. As a context is a set of single steps, it says
+where the goal is if the observation that comes with the reward is not that of other end states, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import deepcopy
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn.functional import one_hot, softplus
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
+from baselines.parts.inner_loop import NetInputs
+from baselines.parts.learner import MOST_PASSES, Learner
+from baselines.parts.networks import Data, draw, entropy, guided, num_actions_of
+from baselines.parts.q_learning import require_replay
+from baselines.update.optimiser import make_optimiser
+from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, one_of, positive, require
+from ctgraph_rl.learn.collect import UNSTORED
+
+SMALLEST_VARIANCE = 1e-7
+
+ACTION, PRECISION, WEIGHTED = f"{UNSTORED}action", f"{UNSTORED}precision", f"{UNSTORED}weighted"
+"""A row's last action, and the sums of 1/s_i and mu_i/s_i over the steps of its trial."""
+
+CONTEXT = f"{UNSTORED}context"
+"""The z of a row's episode."""
+
+
+def gaussian(precision: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute mu and s, [..., num_context] each, from the sums of 1/s_i and mu_i/s_i."""
+    variance = torch.where(precision > 0, 1 / precision, 1.0)
+    return variance * weighted, variance
+
+
+def kl_to_prior(mean: Tensor, variance: Tensor) -> Tensor:
+    """Compute the divergence of a Gaussian from N(0, 1), [...], from [..., num_context]."""
+    return 0.5 * (variance + mean.square() - 1 - variance.log()).sum(dim=-1)
+
+
+class PosteriorPolicy(TensorDictModuleBase):
+    """Draws a row's z before each episode, from the posterior of the steps of its trial.
+
+    The sums over a trial have what each step added with the weights that the encoder had at the time.
+
+    Args:
+        actor: maps what is seen and z to logits.
+        encoder: maps what is seen, the one-hot action and the reward to mu_i, and to s_i before its softplus.
+        seen_keys: what the networks see.
+        num_actions: actions of the task.
+        trial_episodes: episodes of a trial.
+    """
+
+    def __init__(
+        self, actor: GatedNetwork, encoder: GatedNetwork, seen_keys: list[str], num_actions: int, trial_episodes: int
+    ) -> None:
+        super().__init__()
+        self.actor, self.encoder = actor, encoder
+        self.seen_keys, self.num_actions, self.trial_episodes = seen_keys, num_actions, trial_episodes
+        self.kept_keys = [f"{UNSTORED}{key}" for key in seen_keys]
+        state = ["trial", ACTION, PRECISION, WEIGHTED, CONTEXT, *self.kept_keys]
+        self.in_keys = [*seen_keys, "is_init", "reward", *state]
+        self.out_keys = ["action", *(("next", key) for key in state)]
+
+    def evidence(self, seen: NetInputs, action: Tensor, reward: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute 1/s_i and mu_i/s_i of steps, [..., num_context] each."""
+        found = self.encoder(*seen, one_hot(action, self.num_actions), reward)
+        mean, raw = found.chunk(2, dim=-1)
+        precision = 1 / softplus(raw).clamp(min=SMALLEST_VARIANCE)
+        return precision, precision * mean
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` and the next state."""
+        begins = tensordict["is_init"]
+        episode = tensordict["trial"] + begins
+        fresh = begins & ((episode == 1) | (episode > self.trial_episodes))
+        last = tuple(tensordict[key] for key in self.kept_keys)
+        precision, weighted = self.evidence(last, tensordict[ACTION], tensordict["reward"])
+        precision = torch.where(fresh, 0, tensordict[PRECISION] + precision)
+        weighted = torch.where(fresh, 0, tensordict[WEIGHTED] + weighted)
+        mean, variance = gaussian(precision, weighted)
+        drawn = mean + variance.sqrt() * torch.randn_like(mean)
+        context = torch.where(begins, drawn, tensordict[CONTEXT])
+        seen = tuple(tensordict[key] for key in self.seen_keys)
+        logits = self.actor(*seen, context)
+        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        action = logits.argmax(dim=-1) if is_greedy else draw(logits.softmax(dim=-1))
+        tensordict.set("action", guided(tensordict, action))
+        tensordict.set(("next", "trial"), torch.where(fresh, 1, episode))
+        tensordict.set(("next", ACTION), tensordict["action"])
+        tensordict.set(("next", PRECISION), precision)
+        tensordict.set(("next", WEIGHTED), weighted)
+        tensordict.set(("next", CONTEXT), context)
+        for key, kept in zip(self.seen_keys, self.kept_keys, strict=True):
+            tensordict.set(("next", kept), tensordict[key])
+        return tensordict
+
+
+class PEARL(Learner):
+    """Discrete soft actor-critic with a posterior over tasks.
+
+    The losses are those of TorchRL's `DiscreteSACLoss`, but plain: it takes one context for both of its losses, where
+    the policy's must not reach the encoder, and it keeps its critics where a `Learner` does not find their weights.
+
+    Args:
+        observation_spec: the environment's ``observation_spec_unbatched``.
+        action_spec: the environment's ``action_spec_unbatched``.
+        num_envs: rows, each with one trial at a time.
+        num_steps: steps of each row between two rounds of updates.
+        hidden_size: width of all layers.
+        num_layers: layers before the output of each network.
+        num_context: width of z.
+        trial_episodes: episodes of a trial.
+        learning_rate: of Adam.
+        gamma: discount factor.
+        entropy_coeff: alpha.
+        reward_scale: what rewards are multiplied by in loss_value: against alpha and kl_coeff.
+        kl_coeff: weight of the divergence from N(0, 1).
+        buffer_size: steps that replay keeps, of all rows.
+        num_trials: trials that a gradient step learns from.
+        context_size: steps of a trial that are its context there.
+        batch_size: steps of a trial that the critics and the policy learn from there.
+        num_updates: gradient steps after each batch of data.
+        target_rate: how far the target critics follow in each gradient step, in (0, 1].
+        max_grad_norm: gradients are scaled down to this norm.
+        gate: modulates the layers of the policy, see `baselines.parts.gates`.
+        gate_size: units of a gate.
+    """
+
+    memory = True
+    adapt_episodes = 1
+    output_keys = ("log_probs",)
+    solves = "tasks whose goal is drawn from several: it draws a guess of its task before each episode"
+
+    policy: PosteriorPolicy
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        num_envs: int,
+        num_steps: int,
+        hidden_size: int,
+        num_layers: int,
+        num_context: int,
+        trial_episodes: int,
+        learning_rate: float,
+        gamma: float,
+        entropy_coeff: float,
+        reward_scale: float,
+        kl_coeff: float,
+        buffer_size: int,
+        num_trials: int,
+        context_size: int,
+        batch_size: int,
+        num_updates: int,
+        target_rate: float,
+        max_grad_norm: float,
+        gate: str,
+        gate_size: int,
+    ) -> None:
+        super().__init__(num_envs, num_steps, max_grad_norm)
+        require(
+            *at_least_one(hidden_size=hidden_size, num_layers=num_layers, num_context=num_context, gate_size=gate_size),
+            *at_least_one(num_trials=num_trials, context_size=context_size, batch_size=batch_size),
+            *at_least_one(trial_episodes=trial_episodes, num_updates=num_updates),
+            *at_most(MOST_PASSES, num_updates=num_updates),
+            *positive(learning_rate=learning_rate, target_rate=target_rate, reward_scale=reward_scale),
+            *fraction(gamma=gamma, target_rate=target_rate),
+            *not_negative(entropy_coeff=entropy_coeff, kl_coeff=kl_coeff),
+            *one_of(GATES, gate=gate),
+        )
+        num_actions = num_actions_of(action_spec)
+        require_gated_weights(observation_spec, hidden_size, num_layers, num_context=num_context, gate_size=gate_size)
+        require_replay(observation_spec, buffer_size, num_trials * (batch_size + context_size), num_context)
+        short = f"buffer_size must be at least a step of each of num_envs={num_envs} rows, got {buffer_size}"
+        require((buffer_size >= num_envs, short))
+        self.gamma = gamma
+        self.entropy_coeff = entropy_coeff
+        self.reward_scale = reward_scale
+        self.kl_coeff = kl_coeff
+        self.target_rate = target_rate
+        self.kept_steps = buffer_size // num_envs
+        self.num_updates = num_updates
+        self.minibatch_size = num_trials
+        self.context_size = context_size
+        self.batch_size = batch_size
+        self.num_context = num_context
+        self.specs = shown_specs(observation_spec)
+        network = partial(
+            gated_network, self.specs, hidden_size=hidden_size, num_layers=num_layers, gate_size=gate_size
+        )
+        encoder = network(num_actions + 1, 2 * num_context, gate="none")
+        actor = network(num_context, num_actions, gate=gate)
+        self.policy = PosteriorPolicy(actor, encoder, list(self.specs), num_actions, trial_episodes)
+        self.critics = nn.ModuleList([network(num_context, num_actions, gate="none") for _ in range(2)])
+        self.targets = deepcopy(self.critics).requires_grad_(False)
+        self.optimiser = make_optimiser("adam", [*self.policy.parameters(), *self.critics.parameters()], learning_rate)
+        self.replay: dict[Any, Tensor] = {}
+        """The last steps of all rows, [rows, steps] each, and whether a trial ``begins`` there."""
+
+    def initial_state(self, num_envs: int) -> TensorDict:
+        """Return the state before the first trial; it lasts over episodes, as it has a key ``trial``."""
+        like = next(self.parameters()).detach()
+        counts = like.new_zeros(num_envs, dtype=torch.int64)
+        state = {"trial": counts.unsqueeze(-1), ACTION: counts, "reward": like.new_zeros(num_envs, 1)}
+        state |= {key: like.new_zeros(num_envs, self.num_context) for key in (PRECISION, WEIGHTED, CONTEXT)}
+        for key, spec in self.specs.items():
+            state[f"{UNSTORED}{key}"] = torch.zeros(num_envs, *spec.shape, dtype=spec.dtype, device=like.device)
+        return TensorDict(state, batch_size=[num_envs])
+
+    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+        """Store a batch, and yield steps of trials, [num_trials, batch_size], each with a context of its trial."""
+        self._store(batch)
+        begins = self.replay["begins"]
+        num_rows, num_steps = begins.shape
+        place = torch.arange(num_steps, device=begins.device).expand_as(begins)
+        ends = begins.roll(-1, dims=1)
+        ends[:, -1] = True
+        first = torch.where(begins, place, 0).cummax(dim=1).values
+        last = torch.where(ends, place, num_steps).flip(1).cummin(dim=1).values.flip(1)
+        for _ in range(self.num_updates):
+            row = torch.randint(num_rows, (self.minibatch_size, 1), device=begins.device)
+            step = torch.randint(num_steps, (self.minibatch_size, 1), device=begins.device)
+            trial = row, first[row, step], last[row, step]
+            context = {("context", key): value for key, value in self._steps(*trial, self.context_size).items()}
+            noise = torch.randn(self.minibatch_size, self.num_context, device=begins.device)
+            yield {**self._steps(*trial, self.batch_size), **context, "noise": noise}
+
+    def _store(self, batch: TensorDictBase) -> None:
+        """Append a batch to the steps of each row, and drop the oldest ones."""
+        begins = batch["is_init"] & (batch["next", "trial"] == 1)
+        keys = [*self.specs, "action", ("next", "reward"), ("next", "terminated")]
+        keys += [("next", key) for key in self.specs]
+        kept = {}
+        for key, value in {"begins": begins.squeeze(-1), **{key: batch[key] for key in keys}}.items():
+            steps = [self.replay[key], value] if self.replay else [value]
+            kept[key] = torch.cat(steps, dim=1)[:, -self.kept_steps :].contiguous()
+        self.replay = kept
+
+    def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> dict[Any, Tensor]:
+        """Draw steps of trials with replacement, [num_trials, number]; row, first and last are [num_trials, 1]."""
+        share = torch.rand(len(row), number, device=row.device)
+        step = (first + (share * (last + 1 - first)).long()).minimum(last)
+        return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}
+
+    def loss(self, batch: Data) -> dict[str, Tensor]:
+        """Compute the losses of what `minibatches` yields."""
+        mean, variance = self.posterior(batch)
+        context = (mean + variance.sqrt() * batch["noise"]).unsqueeze(1).expand(-1, batch["action"].shape[1], -1)
+        fixed = context.detach()
+        seen = tuple(batch[key] for key in self.specs)
+        after = tuple(batch["next", key] for key in self.specs)
+        with torch.no_grad():
+            later = self.policy.actor(*after, fixed).log_softmax(dim=-1)
+            soft = smaller(self.targets, after, fixed) - self.entropy_coeff * later
+            value = (later.exp() * soft).sum(dim=-1, keepdim=True)
+            reward = self.reward_scale * batch["next", "reward"]
+            target = reward + self.gamma * ~batch["next", "terminated"] * value
+            best = smaller(self.critics, seen, fixed)
+        action = batch["action"].unsqueeze(-1)
+        errors = [critic(*seen, context).gather(-1, action) - target for critic in self.critics]
+        log_probs = self.policy.actor(*seen, fixed).log_softmax(dim=-1)
+        return {
+            "loss_value": sum(error.square().mean() for error in errors),
+            "loss_policy": (log_probs.exp() * (self.entropy_coeff * log_probs - best)).sum(dim=-1).mean(),
+            "loss_context": self.kl_coeff * kl_to_prior(mean, variance).mean(),
+            "entropy": entropy(log_probs).detach().mean(),
+        }
+
+    def posterior(self, batch: Data) -> tuple[Tensor, Tensor]:
+        """Compute mu and s of the contexts of a minibatch, [num_trials, num_context] each."""
+        seen = tuple(batch["context", key] for key in self.specs)
+        given = batch["context", "action"], batch["context", ("next", "reward")]
+        precision, weighted = self.policy.evidence(seen, *given)
+        return gaussian(precision.sum(dim=1), weighted.sum(dim=1))
+
+    @torch.no_grad()
+    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Let the target critics follow."""
+        for target, online in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
+            target.lerp_(online, self.target_rate)
+        return measured
+
+    def weights_changed(self) -> None:
+        """Copy the weights to the target critics."""
+        self.targets.load_state_dict(self.critics.state_dict())
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the optimiser's state and replay."""
+        return {**super().get_extra_state(), "replay": self.replay}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned."""
+        super().set_extra_state(state)
+        self.replay = state["replay"]
+
+
+def smaller(critics: nn.ModuleList, seen: NetInputs, context: Tensor) -> Tensor:
+    """Compute the smaller of the critics' action values, [..., num_actions]."""
+    first, second = (critic(*seen, context) for critic in critics)
+    return torch.minimum(first, second)
