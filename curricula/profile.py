@@ -88,7 +88,7 @@ def profile_similarity(num_frames: int = 61_440) -> Curriculum:
 
 
 def profile_hierarchy(num_frames: int = 102_400) -> Curriculum:
-    """Property 6: a goal of depth 4 from scratch, then nested goals of depth 2, 3 and 4 on images of their own.
+    """Property 6: a goal of depth 4 from scratch, then nested goals of depth 2, 3 and 4 on other images.
 
     Args:
         num_frames: frames of each goal.
@@ -135,8 +135,8 @@ def profile_model(num_frames: int = 102_400) -> Curriculum:
 def profile_innate(num_frames: int = 102_400) -> Curriculum:
     """Property 10: a graph from scratch, then four others at once, then a held-out graph with the images of these.
 
-    The first and the last graph differ in their images alone. The four in between have depth 2 and 3, with and without
-    random waits, and other goals.
+    The first and the last graph differ in nothing but their images. The four in between have depth 2 and 3, with and
+    without random waits, and other goals.
 
     Args:
         num_frames: frames of each block.

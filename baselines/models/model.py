@@ -72,7 +72,7 @@ class Symbols:
         weights = torch.arange(1, flat.shape[1] + 1, dtype=torch.float64, device="cpu").sqrt()
         sums, order = (self.images.double() @ weights).sort()
         found = order[torch.searchsorted(sums - 0.5e-6, flat.double() @ weights).sub(1).clamp(min=0)]
-        require(((self.images[found] == flat).all().item(), "the data show an image that is none of the tasks'"))
+        require(((self.images[found] == flat).all().item(), "the data show an image that no task has"))
         return found.view(observation.shape[:num_dims])
 
 
@@ -117,7 +117,7 @@ def experience(
 
 
 def learned_share(model: Predictor, test: Transitions, task: Task, policy: str = "navigation") -> float:
-    """Return how much of what can be predicted is predicted: 1 is the exact model, 0 knows frequencies alone.
+    """Return how much of what can be predicted is predicted: 1 is the exact model, 0 knows frequencies and no more.
 
     1 - (bits - H) / (U - H), with the exact H and U of `transition_entropy` with and without information. It is below 0
     for a predictor that is wrong and sure.
@@ -137,7 +137,7 @@ def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Tas
     """Return `learned_share` of each task after each of them was learned in order, float64 [tasks + 1, tasks].
 
     Metrics of the performance matrix take it, such as ``forgetting(matrix, [[0], [1]])``. Data are of a policy that
-    navigates; test data have a seed of their own.
+    navigates; test data have another seed.
 
     Args:
         make: builds the predictor of symbols, such as `baselines.models.table_model.TableModel`.

@@ -79,7 +79,7 @@ def faster(run: Evidence, on: Sequence[int], than: Sequence[int], learned: bool 
         run: the run.
         on: tasks on which an agent with the property is faster.
         than: those that it learns without what the property gives; their area is the floor, the mean of few tasks.
-        learned: they must be mastered at the end of their blocks, without which a gain is luck.
+        learned: refuse a run that does not master these by the end of their blocks.
 
     Raises:
         Undefined: where the others were learned at once, or not at all though they must be.

@@ -93,7 +93,7 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     Args:
         task: whose rewards are no chance: the needle, without noise.
         policy: see `state_entropy`.
-        informed: False gives the entropy of the pairs alone.
+        informed: False gives the entropy of the pairs.
 
     Raises:
         ValueError: as for `state_entropy`, and for rewards, goals and images that are drawn, and an extra last step.

@@ -154,5 +154,5 @@ def test_help_has_no_backticks():
     helps = {name: make().format_help() for name in cli.COMMANDS if (make := getattr(parsers, name, None))}
     options = [line for text in files for line in re.findall(r'help=f?"[^"]*`', text)]
 
-    assert len(helps) == 10
+    assert len(helps) == 11
     assert [name for name, text in helps.items() if "`" in text] == options == []
