@@ -132,6 +132,9 @@ class DQN(QLearner):
 
     def other_weights(self) -> dict[str, Tensor]:
         """Return the target network's weights: those of its trunk as ``0.*``, those of its head as ``1.*``."""
-        parts = (self.dqn.target_value_network_params["module", "0", "module", i, "module"] for i in ("0", "1"))
-        flat = [part.flatten_keys(".").items() for part in parts]
-        return {f"{i}.{name}": value for i, items in enumerate(flat) for name, value in items}
+        found = {}
+        for place in ("0", "1"):
+            part = self.dqn.target_value_network_params["module", "0", "module", place, "module"]
+            for name, value in part.flatten_keys(".").items():
+                found[f"{place}.{name}"] = value
+        return found

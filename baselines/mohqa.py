@@ -209,10 +209,11 @@ class Target(LossModule):
     def outputs(self, data: Data) -> tuple[Tensor, Tensor]:
         """Compute phi and q with the target network's weights."""
         trunk, head = self.value_network
-        parts = (self.target_value_network_params["module", place, "module"] for place in ("0", "1"))
-        of_trunk, of_head = (dict(part.flatten_keys(".").items()) for part in parts)
-        features = functional_call(trunk.module, of_trunk, tuple(data[key] for key in trunk.in_keys))
-        return features, functional_call(head.module, of_head, (features,))
+        weights = self.target_value_network_params
+        of_trunk = weights["module", "0", "module"].flatten_keys(".")
+        of_head = weights["module", "1", "module"].flatten_keys(".")
+        features = functional_call(trunk.module, dict(of_trunk.items()), tuple(data[key] for key in trunk.in_keys))
+        return features, functional_call(head.module, dict(of_head.items()), (features,))
 
 
 class MOHQA(QLearner):

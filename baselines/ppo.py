@@ -65,7 +65,8 @@ class PPO(PolicyGradient):
         """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""
         log_probs, taken, values = self.evaluate_actions(batch)
         change = taken - batch["action_log_prob"].unsqueeze(-1)
-        gain, clipped = (value.exp() * batch["advantage"] for value in (change, change.clamp(*self.clip_range)))
+        gain = change.exp() * batch["advantage"]
+        clipped = change.clamp(*self.clip_range).exp() * batch["advantage"]
         return {
             "loss_objective": -torch.minimum(gain, clipped).mean(),
             "loss_critic": critic_loss(values, batch, self.critic_coeff),

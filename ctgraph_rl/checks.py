@@ -183,8 +183,11 @@ def takes_its_kinds(function: Function) -> Function:
     So what a function does not use is not silently accepted. Annotations with other names than `KINDS` say nothing.
     """
     shape = signature(function)
-    kinds = {name: [re.sub(r"\[.*", "", kind) for kind in _kinds(each)] for name, each in shape.parameters.items()}
-    checked = {name: each for name, each in kinds.items() if set(each) <= set(KINDS)}
+    checked = {}
+    for name, parameter in shape.parameters.items():
+        kinds = _kinds(parameter)
+        if set(kinds) <= set(KINDS):
+            checked[name] = kinds
 
     @wraps(function)
     def called(*args: Any, **kwargs: Any) -> Any:
@@ -197,7 +200,8 @@ def takes_its_kinds(function: Function) -> Function:
 
 
 def _kinds(parameter: Parameter) -> list[str]:
-    return re.split(r" \| (?![^\[]*\])", str(parameter.annotation))
+    kinds = re.split(r" \| (?![^\[]*\])", str(parameter.annotation))
+    return [kind.partition("[")[0] for kind in kinds]
 
 
 def _kind_rule(name: str, value: object, kinds: list[str]) -> tuple[bool, str]:
@@ -275,43 +279,39 @@ def _limit(value: object) -> str:
     return "< 2**63" if is_int(value, 1) else ">= 1"
 
 
+def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]) -> list[tuple[bool, str]]:
+    """Rules that each named value must be something."""
+    return [(holds(value), f"{name} must be {what}, got {value!r}") for name, value in values.items()]
+
+
 def at_most(limit: float, **values: object) -> list[tuple[bool, str]]:
     """Rules that each named number is no larger than a limit; what is no number breaks other rules."""
-    return [
-        (not is_real(value) or value <= limit, f"{name} must be at most {limit:,}, got {value!r}")  # type: ignore[operator]
-        for name, value in values.items()
-    ]
+    return _rules(lambda value: not is_real(value) or value <= limit, f"at most {limit:,}", values)
 
 
 def positive(**values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is a number > 0."""
-    return [
-        (is_real(value, 0) and value != 0, f"{name} must be a number > 0, got {value!r}")
-        for name, value in values.items()
-    ]
+    return _rules(lambda value: is_real(value, 0) and value != 0, "a number > 0", values)
 
 
 def fraction(**values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is a number in [0, 1]."""
-    return [(is_real(value, 0, 1), f"{name} must be in [0, 1], got {value!r}") for name, value in values.items()]
+    return _rules(lambda value: is_real(value, 0, 1), "in [0, 1]", values)
 
 
 def not_negative(**values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is a number >= 0."""
-    return [(is_real(value, 0), f"{name} must be a number >= 0, got {value!r}") for name, value in values.items()]
+    return _rules(lambda value: is_real(value, 0), "a number >= 0", values)
 
 
 def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is one of the choices."""
-    return [
-        (isinstance(value, str) and value in choices, f"{name} must be one of {', '.join(choices)}, got {value!r}")
-        for name, value in values.items()
-    ]
+    return _rules(lambda value: isinstance(value, str) and value in choices, f"one of {', '.join(choices)}", values)
 
 
 def true_or_false(**values: object) -> list[tuple[bool, str]]:
     """Rules that each named value is a bool."""
-    return [(isinstance(value, bool), f"{name} must be true or false, got {value!r}") for name, value in values.items()]
+    return _rules(lambda value: isinstance(value, bool), "true or false", values)
 
 
 def as_tuple(value: object) -> object:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,17 +55,18 @@ def compare(one: Path, other: Path, bound: float = BOUND) -> Compared:
     Raises:
         ValueError: for a directory without a run, and a log or weights that cannot be read.
     """
-    logs = [_log(path) for path in (one, other)]
-    first = [log.measurements[0] for log in logs]
-    found = [list(map(_measured, log.measurements[1:])) for log in logs]
-    code, verdict = _verdict(found, bound)
+    logs = [_log(one), _log(other)]
+    code, verdict = _verdict([list(map(_measured, log.measurements[1:])) for log in logs], bound)
     weights = _weights(one, other)
     if code == EQUAL and weights.startswith("different"):
         code = DIFFERENT
         verdict = "different: all measurements are equal, the agents' weights are not"
-    torn = [path for path, log in zip((one, other), logs, strict=True) if log.torn_lines]
-    notes = [f"note: the last line of {path / LOG} is torn and not compared" for path in torn]
-    return Compared(code, [verdict, f"weights: {weights}", *_origins(*first), *_groups_of_experts(*logs), *notes])
+    origins = _origins(logs[0].measurements[0], logs[1].measurements[0])
+    lines = [verdict, f"weights: {weights}", *origins, *_groups_of_experts(*logs)]
+    for path, log in zip((one, other), logs, strict=True):
+        if log.torn_lines:
+            lines.append(f"note: the last line of {path / LOG} is torn and not compared")
+    return Compared(code, lines)
 
 
 def _measured(line: LogLine) -> LogLine:
@@ -78,18 +80,25 @@ def _measured(line: LogLine) -> LogLine:
 
 def _groups_of_experts(*logs: RunLog) -> list[str]:
     """Return a line on the seeds that single-task experts were trained with, if there are groups."""
-    one, other = (
-        {
-            f"task {each.get('task')}": each.get("together")
-            for line in log.of_kind("experts")
-            for each in line.get("experts", ())
-            if isinstance(each, dict)
-        }
-        for log in logs
-    )
+    one, other = map(_seeds_of_experts, logs)
     if not any((*one.values(), *other.values())):
         return []
-    return [f"{EXPERTS_TOGETHER}: {'equal' if one == other else 'different, ' + _changes(one, other)}"]
+    return [_compared(EXPERTS_TOGETHER, one, other, 3)]
+
+
+def _seeds_of_experts(log: RunLog) -> dict[str, Any]:
+    """Return the seeds that the expert of each task was trained with."""
+    found = {}
+    for line in log.of_kind("experts"):
+        for each in line.get("experts", ()):
+            if isinstance(each, dict):
+                found[f"task {each.get('task')}"] = each.get("together")
+    return found
+
+
+def _compared(name: str, one: Mapping[str, Any], other: Mapping[str, Any], most: int) -> str:
+    """Return whether two sets of values are equal, in a line."""
+    return f"{name}: {'equal' if one == other else 'different, ' + _changes(one, other, most)}"
 
 
 def _log(path: Path) -> RunLog:
@@ -114,7 +123,7 @@ def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str
     beyond = next(
         (i for i, pair in enumerate(pairs) if not all(_close(*p, bound, scale) for p in _fields(*pair))), None
     )
-    since = f"{_where(pairs[unequal][0])}: {_changes(*pairs[unequal])}"
+    since = f"{_where(pairs[unequal][0])}: {_changes(pairs[unequal][0], pairs[unequal][1], 3)}"
     if beyond is None and lengths[0] == lengths[1]:
         within = f"all measurements agree within {bound:g} of their field's largest value"
         return ROUNDING, f"equal up to rounding: {within}; they diverge at {since}"
@@ -131,7 +140,7 @@ def _fields(one: LogLine, other: LogLine) -> Iterator[tuple[str, Any, Any]]:
 def _scale(found: Sequence[Sequence[LogLine]]) -> dict[str, float]:
     """Return the largest size that the numbers of each field have in both runs."""
     scale: dict[str, float] = {}
-    for line in (line for lines in found for line in lines):
+    for line in chain(*found):
         for key, value in line.items():
             if is_real(value):
                 scale[key] = max(scale.get(key, 0.0), abs(value))
@@ -152,11 +161,15 @@ def _where(line: LogLine) -> str:
     return terminal_text(f"{line['kind']}{label}{block}{frames}")
 
 
-def _changes(one: Mapping[str, Any], other: Mapping[str, Any], most: int = 3) -> str:
+def _changes(one: Mapping[str, Any], other: Mapping[str, Any], most: int) -> str:
     """Return in words which values differ."""
-    pairs = [f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b]
-    more = f" and {len(pairs) - most} more" if len(pairs) > most else ""
-    return terminal_text(", ".join(pairs[:most]) + more)
+    return _first_of([f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b], most)
+
+
+def _first_of(texts: Sequence[str], most: int) -> str:
+    """Return the first texts, and how many more there are."""
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return terminal_text(", ".join(texts[:most]) + more)
 
 
 def _weights(one: Path, other: Path) -> str:
@@ -165,15 +178,13 @@ def _weights(one: Path, other: Path) -> str:
     missing = [str(file.parent) for file in files if not file.exists()]
     if missing:
         return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
-    states = [dict(flat(_state(file))) for file in files]
-    if list(states[0]) != list(states[1]):
+    state, others = (dict(flat(_state(file))) for file in files)
+    if list(state) != list(others):
         return "different: the agents have other parts"
-    pairs = {key: (states[0][key], states[1][key]) for key in states[0]}
-    unequal = [key for key, pair in pairs.items() if not _same(*pair)]
+    unequal = [key for key in state if not _same(state[key], others[key])]
     if not unequal:
         return "equal, bit for bit"
-    shown = terminal_text(", ".join(unequal[:3]) + (f" and {len(unequal) - 3} more" if len(unequal) > 3 else ""))
-    return f"different in {len(unequal)} of {len(pairs)} parts: {shown}"
+    return f"different in {len(unequal)} of {len(state)} parts: {_first_of(unequal, 3)}"
 
 
 def _state(path: Path) -> Mapping[str, Any]:
@@ -201,14 +212,23 @@ def _same(one: Any, other: Any) -> bool:
 
 def _origins(one: LogLine, other: LogLine) -> list[str]:
     """Return a line for what the runs were: settings, curriculum, code and machine."""
-    settings = [{**ADDED.get("run", {}), **dict(flat(as_before(line.get("config") or {})))} for line in (one, other)]
-    known = {key for keys in PARTS.values() for key in keys} | {"kind", "seconds", "config"}
-    parts = {name: [{key: line.get(key) for key in keys} for line in (one, other)] for name, keys in PARTS.items()}
-    parts["code"] = [dict(flat({k: v for k, v in line.items() if k not in known})) for line in (one, other)]
+    of_one = _parts(one)
+    of_other = _parts(other)
     if not (one.get("together") or other.get("together")):
-        del parts[TOGETHER]
-    parts = {"settings": settings, **parts}
-    return [f"{name}: {'equal' if a == b else 'different, ' + _changes(a, b, 10)}" for name, (a, b) in parts.items()]
+        del of_one[TOGETHER]
+    return [_compared(name, part, of_other[name], 10) for name, part in of_one.items()]
+
+
+def _parts(line: LogLine) -> dict[str, dict[str, Any]]:
+    """Return what a log's first line says of settings, curriculum, code and machine, by name."""
+    left = dict(line)
+    for key in ("kind", "seconds", "config"):
+        left.pop(key, None)
+    parts = {"settings": {**ADDED.get("run", {}), **dict(flat(as_before(line.get("config") or {})))}}
+    for name, keys in PARTS.items():
+        parts[name] = {key: left.pop(key, None) for key in keys}
+    parts["code"] = dict(flat(left))
+    return parts
 
 
 def main() -> None:

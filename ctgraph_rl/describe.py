@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 
 from ctgraph_rl.checks import positive, require
@@ -223,7 +224,10 @@ def _closed_forms(task: Task) -> tuple[str, ...]:
 def _ceilings(curriculum: Curriculum) -> Sheet:
     """The best mean returns of policies that see less than all, or why they are not known."""
     rows, reasons, easy, lost = [], [], [], []
+    limited: dict[str, bool] = {CHANGING_GOALS: False, NOISE_AS_DICE: False}
     for task, label in _labelled(curriculum):
+        limited[CHANGING_GOALS] |= task.goal_change is not None
+        limited[NOISE_AS_DICE] |= bool(task.observations.read_noise or task.observations.read_rotation)
         found = [_ceiling(task, ceiling) for ceiling in CEILINGS.values()]
         rows.append((label, *(UNKNOWN if value is None else _number(value) for value, _ in found)))
         reasons += [f"{UNKNOWN}: {reason}" for _, reason in found if reason]
@@ -234,21 +238,11 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
         if memoryless is not None and optimal is not None and memoryless < optimal - 1e-9:
             lost.append(f"{label} {_number(memoryless)} of {_number(optimal)}")
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
-    limits = ((CHANGING_GOALS, _changes_goals), (NOISE_AS_DICE, _varies_on_read))
-    limited = [note for note, applies in limits if any(map(applies, _graphs(curriculum)))]
     easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
     shown = ", ".join(lost[:MOST_LOST]) + f" and {len(lost) - MOST_LOST} more" * (len(lost) > MOST_LOST)
     needed = [f"{NEEDS_MEMORY} {shown}."] if lost else []
-    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *needed, *limited, *easily)
+    notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *needed, *compress(limited, limited.values()), *easily)
     return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
-
-
-def _changes_goals(task: Task) -> bool:
-    return task.goal_change is not None
-
-
-def _varies_on_read(task: Task) -> bool:
-    return bool(task.observations.read_noise or task.observations.read_rotation)
 
 
 def _ceiling(task: Task, ceiling: Callable[[Task], float]) -> tuple[float | None, str]:

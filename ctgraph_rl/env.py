@@ -16,7 +16,7 @@ from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.batch.specs import specs_of
-from ctgraph_rl.checks import require, require_all, takes_numbers
+from ctgraph_rl.checks import require, require_all, takes_numbers, true_or_false
 from ctgraph_rl.core import dynamics
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import NO_LEAF, RowState, Shown
@@ -94,8 +94,7 @@ class CTGraphEnv(EnvBase):
         kernel: str = "auto",
         info: bool = True,
     ) -> None:
-        flags = {"check_actions": check_actions, "info": info}
-        require(*((isinstance(v, bool), f"{name} must be true or false, got {v!r}") for name, v in flags.items()))
+        require(*true_or_false(check_actions=check_actions, info=info))
         tasks = require_all(Task, "tasks", tasks)
         self.num_task_ids = checked_num_ids(task_ids, num_task_ids)
         device = None if device is None else checked_device(device)

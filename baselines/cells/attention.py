@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, episodes_of, linear_layer, of_frames, zeros_like_weights
 from baselines.cells.frames import MOST_FRAMES
 from ctgraph_rl.checks import at_least_one, at_most, is_int, require
 
@@ -80,9 +80,9 @@ class Attention(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; all steps at once, each over the frames of its episode."""
-        present = inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape)
+        present = of_frames(inputs, groups)
         frames = torch.cat([state[0][..., :-1], present], dim=1)
-        episode = torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
+        episode = episodes_of(starts)
         earlier = torch.where(state[0][..., -1] > 0, 0, -1)
         of_frame = torch.cat([earlier, episode], dim=1)
         return self._block(frames, groups.shape[1], of_frame.unsqueeze(1) == episode.unsqueeze(2))

@@ -115,6 +115,16 @@ def can_branch(value: Tensor) -> bool:
     return value.is_cpu and not is_traced()
 
 
+def of_frames(values: Tensor, groups: Tensor) -> Tensor:
+    """Return the values of groups, [num_groups, n], at each frame, [rows, steps, n]."""
+    return values.index_select(0, groups.flatten()).unflatten(0, groups.shape)
+
+
+def episodes_of(starts: Tensor) -> Tensor:
+    """Number the episodes of rows from 0, int64 [rows, steps], by where others than the first start."""
+    return torch.cat([starts[:, :1] & False, starts[:, 1:]], dim=1).cumsum(dim=1)
+
+
 def reset(state: Sequence[Tensor], starts: Tensor) -> CellState:
     """Return a state that is zero in the rows where an episode starts, bool [rows]."""
     return tuple(torch.where(starts.view(-1, *[1] * (value.ndim - 1)), 0.0, value) for value in state)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Branches, Cell, CellState, can_branch, zeros_like_weights
+from baselines.cells.cell import Branches, Cell, CellState, can_branch, of_frames, zeros_like_weights
 from baselines.cells.segments import segments
 
 
@@ -29,17 +29,15 @@ class LSTM(Cell):
     def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""
         if not can_branch(inputs):
-            h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), *(value.squeeze(1) for value in state))
+            h, c = lstm_step(self.lstm, lstm_inputs(self.lstm, inputs), state[0].squeeze(1), state[1].squeeze(1))
             return h, (h.unsqueeze(1), c.unsqueeze(1))
-        before = tuple(value.transpose(0, 1).contiguous() for value in state)
-        output, after = self.lstm(inputs.unsqueeze(1), before)
-        return output.squeeze(1), tuple(value.transpose(0, 1) for value in after)
+        output, (h, c) = self.lstm(inputs.unsqueeze(1), _layer_first(state))
+        return output.squeeze(1), (h.transpose(0, 1), c.transpose(0, 1))
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; each segment between two resets is a sequence, and the LSTM runs over all of them at once."""
         if not starts[:, 1:].any():
-            before = tuple(value.transpose(0, 1).contiguous() for value in state)
-            return self.lstm(inputs.index_select(0, groups.flatten()).unflatten(0, groups.shape), before)[0]
+            return self.lstm(of_frames(inputs, groups), _layer_first(state))[0]
         found = segments(starts)
         h, c = (found.initial(value.squeeze(1)).unsqueeze(0) for value in state)
         memory = packed_lstm(self.lstm, inputs, groups.flatten()[found.frames], found.sizes, (h, c))
@@ -47,12 +45,20 @@ class LSTM(Cell):
 
     def tree(self, inputs: Tensor, branches: Branches, state: CellState) -> Tensor:
         """See `Cell`; with one product of features and weights for each group."""
-        given, (h, c), memory = lstm_inputs(self.lstm, inputs), (value.squeeze(1) for value in state), []
+        given = lstm_inputs(self.lstm, inputs)
+        h = state[0].squeeze(1)
+        c = state[1].squeeze(1)
+        memory = []
         for shorter, groups in branches:
-            before = (value.index_select(0, shorter) for value in (h, c))
-            h, c = lstm_step(self.lstm, given.index_select(0, groups), *before)
+            step = given.index_select(0, groups)
+            h, c = lstm_step(self.lstm, step, h.index_select(0, shorter), c.index_select(0, shorter))
             memory.append(h)
         return torch.cat(memory)
+
+
+def _layer_first(state: CellState) -> CellState:
+    """Return a state as PyTorch's LSTM takes it, [1, rows, num_outputs] each."""
+    return tuple(value.transpose(0, 1).contiguous() for value in state)
 
 
 def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, state: CellState) -> Tensor:
@@ -71,7 +77,9 @@ def packed_lstm(lstm: nn.LSTM, features: Tensor, groups: Tensor, sizes: Tensor, 
         The hidden states at all frames in packed order, [num_frames, hidden_size].
     """
     given = lstm_inputs(lstm, features)
-    (h, c), memory = (value[0] for value in state), []
+    h = state[0][0]
+    c = state[1][0]
+    memory = []
     for step in given.index_select(0, groups).split(sizes.tolist()):
         h, c = lstm_step(lstm, step, h[: len(step)], c[: len(step)])
         memory.append(h)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, of_frames, zeros_like_weights
 from baselines.cells.scan import linear_scan
 
 
@@ -35,9 +35,7 @@ class MinGRU(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`; a scan, in which a reset is a carry of 0."""
-        carry, given = (
-            part.index_select(0, groups.flatten()).unflatten(0, groups.shape) for part in self._parts(inputs)
-        )
+        carry, given = (of_frames(part, groups) for part in self._parts(inputs))
         first = given[:, :1] + carry[:, :1] * state[0].unsqueeze(1)
         return linear_scan(carry * ~starts.unsqueeze(-1), torch.cat([first, given[:, 1:]], dim=1))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer
+from baselines.cells.cell import Cell, CellState, linear_layer, of_frames
 
 
 class NoMemory(Cell):
@@ -23,4 +23,4 @@ class NoMemory(Cell):
 
     def sequence(self, inputs: Tensor, groups: Tensor, starts: Tensor, state: CellState) -> Tensor:
         """See `Cell`."""
-        return self.linear(inputs).relu().index_select(0, groups.flatten()).unflatten(0, groups.shape)
+        return of_frames(self.linear(inputs).relu(), groups)

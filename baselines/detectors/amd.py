@@ -56,6 +56,7 @@ class AMD(Detector):
 
     reads = "one-hot observations"
     needs = ("observation_id",)
+    changing = ("label", "is_doubted", "pending", "recent", "last_action")
 
     def __init__(
         self,
@@ -205,16 +206,11 @@ class AMD(Detector):
     def state_dict(self) -> dict[str, Any]:
         """Return the models, and what verdicts depend on beside them."""
         models = {label: (model.keys, model.counts) for label, model in self.models.items()}
-        last = {"recent": self.recent, "last_action": self.last_action, "pending": self.pending}
-        return {"label": self.label, "is_doubted": self.is_doubted, "models": models, **last}
+        return {**super().state_dict(), "models": models}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.label = state["label"]
-        self.is_doubted = state["is_doubted"]
-        self.pending = state["pending"]
-        self.recent = state["recent"]
-        self.last_action = state["last_action"]
+        super().load_state_dict(state)
         self.models = {label: Counts(*model) for label, model in state["models"].items()}
 
 

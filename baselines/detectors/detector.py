@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from baselines.detectors.seen import Seen, Verdict
@@ -40,6 +41,9 @@ class Detector(TakesNumbers):
 
     is_oracle: ClassVar[bool] = False
     """Whether it is given the curriculum."""
+
+    changing: ClassVar[tuple[str, ...]] = ()
+    """The attributes that its verdicts depend on, tensors and plain values."""
 
     def __init__(self, max_labels: int | None, patience: int, snapshot_every: int | None) -> None:
         labels = is_int(max_labels, 1) or (max_labels is None and self.is_oracle)
@@ -97,7 +101,9 @@ class Detector(TakesNumbers):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that verdicts depend on, as tensors and plain values."""
-        return {}
+        return {name: copy(getattr(self, name)) for name in self.changing}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
+        for name in self.changing:
+            setattr(self, name, copy(state[name]))

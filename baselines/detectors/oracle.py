@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import Seen, Verdict
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -23,6 +20,7 @@ class Oracle(Detector):
 
     reads = "the true tasks"
     is_oracle = True
+    changing = ("frames",)
 
     def __init__(self, max_labels: int | None = None) -> None:
         super().__init__(max_labels, patience=1, snapshot_every=None)
@@ -41,11 +39,3 @@ class Oracle(Detector):
         """Return the label of the task in which the next batch begins; nothing where boundaries are announced."""
         self.frames += seen.action.numel()
         return self.present_label() if self.curriculum.protocol.boundaries == "hidden" else None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the number of frames."""
-        return {"frames": self.frames}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self.frames = state["frames"]

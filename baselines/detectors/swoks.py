@@ -7,9 +7,8 @@ use of samples of a trial, what is kept of a label to which the learner returns,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from copy import copy
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -55,6 +54,7 @@ class SWOKS(Detector):
 
     reads = "features, rewards"
     needs = ("features",)
+    changing = ("label", "is_trial", "num_points", "pending", "history", "references", "earlier", "distances")
 
     def __init__(
         self,
@@ -184,19 +184,6 @@ class SWOKS(Detector):
 
     def _p_value(self, earlier: Sequence[float], newest: Sequence[float]) -> float:
         return ks_greater([self.adjustment * distance for distance in earlier], newest)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all that verdicts depend on."""
-        return {name: copy(getattr(self, name)) for name in STATE}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        for name in STATE:
-            setattr(self, name, copy(state[name]))
-
-
-STATE = ("label", "is_trial", "num_points", "pending", "history", "references", "earlier", "distances")
-"""The attributes that change."""
 
 
 def points_of(seen: Seen) -> Tensor:

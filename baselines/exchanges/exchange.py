@@ -81,19 +81,19 @@ class MaskExchange(Exchange):
         Raises:
             ValueError: if a member has no masks that this exchange knows, or another network than the first member.
         """
-        methods = [getattr(agent, "method", None) for agent in agents]
-        known = [isinstance(method, Masks) and self.takes(method) for method in methods]
+        self.methods: list[Any] = [getattr(agent, "method", None) for agent in agents]
         name = type(self).__name__
-        fix = f"take method={self.method}"
-        lack = [number for number, good in enumerate(known) if not good]
-        one = f"member {lack[0]} has {type(methods[lack[0]]).__name__}" if lack else ""
-        require((not lack, f"{name} needs masks, which {len(lack)} of {len(methods)} members lack; {one}: {fix}"))
-        self.methods: list[Any] = methods
+        lack = []
+        for number, method in enumerate(self.methods):
+            if not (isinstance(method, Masks) and self.takes(method)):
+                lack.append(f"member {number} has {type(method).__name__}: take method={self.method}")
+        needs = f"{name} needs masks, which {len(lack)} of {len(agents)} members lack"
+        require((not lack, "; ".join([needs, *lack[:1]])))
         first = self.methods[0].constant
-        others = [number for number, method in enumerate(self.methods) if not torch.equal(first, method.constant)]
-        have = f"{len(others)} of {len(methods)} members have another than member 0"
+        others = sum(not torch.equal(first, method.constant) for method in self.methods)
+        have = f"{others} of {len(agents)} members have another than member 0"
         require((not others, f"{name} needs one network behind all masks, and {have}: set method.backbone_seed"))
-        self.returns: list[dict[int, float]] = [{} for _ in methods]
+        self.returns: list[dict[int, float]] = [{} for _ in agents]
 
     def takes(self, method: Masks) -> bool:
         """Return whether it can exchange the masks of a method."""

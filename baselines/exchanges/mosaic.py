@@ -154,11 +154,12 @@ class Mosaic(MaskExchange):
             return []
         share = 0.5 + 0.5 * min(max(own, 0.0), LARGEST_RETURN) if self.own_share is None else self.own_share
         self.methods[member].receive(torch.stack([each.content["scores"] for each in best]), share)
-        task = {"task_id": self.task_of(member), "return_before": own, "own_share": share}
-        return [
-            Help(each.sender, member, {**task, "return_of_sender": each.content["reward"], **_of(each, "similarity")})
-            for each in best
-        ]
+        helps = []
+        for each in best:
+            values = {"task_id": self.task_of(member), "return_before": own, "own_share": share}
+            values["return_of_sender"] = each.content["reward"]
+            helps.append(Help(each.sender, member, {**values, **_of(each, "similarity")}))
+        return helps
 
     def _queries(self, member: int) -> list[Message]:
         """Return a query to every other member; none without an embedding."""

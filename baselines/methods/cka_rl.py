@@ -6,7 +6,6 @@ Hu et al. 2025 (Continual Knowledge Adaptation for Reinforcement Learning, NeurI
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +41,7 @@ class CKARL(TaskMethod):
         alpha_rate: learning rate of alpha by that of the agent, exact for Adam and RMSprop.
     """
 
+    counts = ("ended", "num_pooled")
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 
     base: Tensor  # float32 [S]
@@ -73,11 +73,12 @@ class CKARL(TaskMethod):
         require((any(self.inside), message))
         self.in_scope = weights.mask_of(names)
         self.ended = self.num_pooled = 0
-        vector = flat(self._network()).detach()
+        own = self._within(weights.parameters)
+        vector = flat(own).detach()
         self.register_buffer("base", torch.zeros_like(vector))
         self.register_buffer("pool", vector.new_zeros(self.pool_size, len(vector)))
         self.register_buffer("kept", vector.new_zeros(self.num_tasks, len(vector)))
-        self.own = nn.ParameterList([each.detach().clone() for each in self._network()])
+        self.own = nn.ParameterList([each.detach().clone() for each in own])
         self.alpha = nn.Parameter(vector.new_zeros(self.pool_size))
         agent.replace_optimiser(self.trainable)
 
@@ -116,7 +117,7 @@ class CKARL(TaskMethod):
             drawn = make(self.num_combined, dtype=torch.float32, device="cpu")
             self.alpha[: self.num_combined] = drawn.to(self.alpha) / (self.num_combined * self.alpha_rate)
         self.agent.replace_optimiser(self.trainable)
-        self.after_step()
+        self.after_step(self.weights.parameters)
         self.agent.weights_changed()
 
     @torch.no_grad()
@@ -132,19 +133,19 @@ class CKARL(TaskMethod):
         self._set_own(present)
         self.ended = max(self.ended, self.slot + 1)
 
-    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the gradients of the weights, and that of alpha."""
-        in_scope = flat([each for each, inside in zip(gradients, self.inside, strict=True) if inside])
+        in_scope = flat(self._within(gradients))
         shares = self.shares.detach()
         along = self.pool[: self.num_combined] @ in_scope
         of_alpha = self.factor * shares * (along - shares @ along)
         return [*gradients, torch.cat([of_alpha, torch.zeros_like(self.alpha[self.num_combined :])])]
 
     @torch.no_grad()
-    def after_step(self) -> None:
+    def after_step(self, weights: Sequence[Tensor]) -> None:
         """Write w to the network."""
         parts = self.current().split([each.numel() for each in self.own])
-        for parameter, part in zip(self._network(), parts, strict=True):
+        for parameter, part in zip(self._within(weights), parts, strict=True):
             parameter.copy_(part.view_as(parameter))
 
     @torch.no_grad()
@@ -152,9 +153,9 @@ class CKARL(TaskMethod):
         """Return the weights of a task in scope, and the present ones elsewhere."""
         return self.present_with(task, self.in_scope, self.kept)
 
-    def _network(self) -> list[nn.Parameter]:
-        """Return the network's parameters in scope."""
-        return [each for each, inside in zip(self.weights.parameters, self.inside, strict=True) if inside]
+    def _within(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Return those in scope of the network's weights, or of their gradients."""
+        return [each for each, inside in zip(tensors, self.inside, strict=True) if inside]
 
     def _set_own(self, vector: Tensor) -> None:
         for own, part in zip(self.own, vector.split([each.numel() for each in self.own]), strict=True):
@@ -167,16 +168,6 @@ class CKARL(TaskMethod):
             vectors = merged(vectors)
         self.num_pooled = len(vectors)
         self.pool[: self.num_pooled] = vectors
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the slots of the tasks, how many have ended, and the number of vectors in the pool."""
-        return {**super().get_extra_state(), "ended": self.ended, "num_pooled": self.num_pooled}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` returned."""
-        super().set_extra_state(state)
-        self.ended = state["ended"]
-        self.num_pooled = state["num_pooled"]
 
 
 def merged(vectors: Tensor) -> Tensor:

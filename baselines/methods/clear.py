@@ -6,7 +6,7 @@ Rolnick et al. 2019 (NeurIPS, arXiv 1811.11682), the cloning losses of section 3
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -121,7 +121,7 @@ class CLEAR(Method):
         replayed = self.reservoir.sample(len(batch["action"]))
         return {**batch, **{("replay", key): value for key, value in replayed.items()}}
 
-    def penalties(self, batch: Data) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
         """Compute the cloning losses."""
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
         if not replayed:

@@ -5,7 +5,7 @@ Kirkpatrick et al. 2017 (PNAS, arXiv 1612.00796), eq. (3); online as Schwarz et 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -77,11 +77,13 @@ class EWC(SampledImportance):
         for minibatch in self.samples.minibatches:
             usual = compiles and len(minibatch["action"]) == self.agent.minibatch_size
             add = compiled(add_squared_gradients) if usual else add_squared_gradients
-            add(self.agent, minibatch, squares, max(num_learnt(minibatch), 1))
+            add(self.agent, minibatch, self.weights.parameters, squares, max(num_learnt(minibatch), 1))
         return squares
 
 
-def add_squared_gradients(agent: Learner, minibatch: Data, squares: Tensor, num_items: int) -> None:
+def add_squared_gradients(
+    agent: Learner, minibatch: Data, weights: Sequence[Tensor], squares: Tensor, num_items: int
+) -> None:
     """Add to ``squares``, [P], those of the gradients of an agent's losses on a minibatch, over its number of items."""
-    gradients = torch.autograd.grad(total_loss(agent.loss(minibatch)), agent.weights, materialize_grads=True)
+    gradients = torch.autograd.grad(total_loss(agent.loss(minibatch)), weights, materialize_grads=True)
     squares += flat(gradients).square() / num_items

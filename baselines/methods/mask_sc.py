@@ -72,7 +72,7 @@ class MaskSC(SelectedMasks):
             return torch.randperm(len(earlier), generator=self.generator, device="cpu")[: self.top_k].tolist()
         if self.selection in ("all", "none"):
             return [*earlier] if self.selection == "all" else []
-        tasks = ct_graphs([*map(self.task_in, range(self.num_combined)), self.task_in(self.slot)], self.selection)
+        tasks = ct_graphs([*map(self.task_in, (*earlier, self.slot))], self.selection)
         family = [slot for slot in earlier if is_prefix(tasks[slot], tasks[-1])]
         return family if self.selection == "depth_prefix" else family[-1:]
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from baselines.methods.parts.masks import Masks, combined
+from baselines.methods.parts.masks import Masks
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import at_least_one, require
@@ -36,10 +36,7 @@ class MaskShared(Masks):
 
     stackable = False
 
-    received: Tensor  # s_i, float32 [r, P] with r >= c; those after the first c have a share of 0
-    places: Tensor  # of which b is the share of each, and of the own scores, int64 [r + 1]
-    offsets: Tensor  # added to these b: 0, or -infinity, float32 [r + 1]
-    betas: nn.Parameter  # b, float32 [weight tensors, max_received + 1]; the last one in use is the own scores'
+    received: Tensor  # s_i, float32 [r, P] with r >= c; those after the first c have a share of 0; b is [l, most c + 1]
 
     def __init__(self, max_received: int, backbone_seed: int | None = None) -> None:
         super().__init__(backbone_seed)
@@ -64,8 +61,7 @@ class MaskShared(Masks):
         """Compute the combination."""
         if not len(self.received):
             return super().current_scores()
-        betas = self.betas.index_select(-1, self.places) + self.offsets
-        return list(map(combined, betas.unbind(0), self.weights.split(self.received), self.own))
+        return self.combine(self.received)
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
@@ -99,13 +95,11 @@ class MaskShared(Masks):
     def _keep(self, scores: Tensor) -> None:
         """Keep received scores, [c, P]; for compiled steps, made for each number, zeros fill up to 1, 2, 4, 8 ..."""
         count = len(scores)
-        device = scores.device
         room = 2 ** (count - 1).bit_length() if count and self.agent.compiled_step is not None else count
         excluded = room - count
         self.num_received = count
         self.received = torch.cat([scores, scores.new_zeros(excluded, scores.shape[1])]) if excluded else scores
-        self.places = torch.tensor([*range(count), *[0] * excluded, count], device=device, dtype=torch.int64)
-        self.offsets = torch.tensor([0.0] * count + [-torch.inf] * excluded + [0.0], device=device, dtype=torch.float32)
+        self.set_places([*range(count), *[0] * excluded, count], excluded, scores.device)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return what `Masks` does, and the received scores."""

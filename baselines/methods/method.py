@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
+from inspect import signature
 from typing import Any, ClassVar, cast
 
 from tensordict import TensorDict, TensorDictBase
@@ -96,6 +97,10 @@ class Method(TakesNumbers, Hooks):
         require(
             (not adapts, f"{name} learns tasks one after the other, and {learner} draws them: take method=finetune")
         )
+        for hook in ("penalties", "transform_gradients", "after_step"):
+            taken = list(signature(getattr(self, hook)).parameters)
+            rule = f"{name}.{hook} must take `weights`, those of the agent, as its last argument, got {taken}"
+            require((taken[-1:] == ["weights"], rule))
         require((not missing, f"{message}: derive it from baselines.parts.learner.Learner, or take method=finetune"))
         return AgentWithMethod(cast(Learner, agent), self, curriculum)
 
@@ -143,6 +148,9 @@ class TaskMethod(Method):
     needs_task_id = True
     agent_members = (*Method.agent_members, "weights_changed")
 
+    counts: ClassVar[tuple[str, ...]] = ()
+    """The attributes that are numbers and change; they are saved."""
+
     def __init__(self) -> None:
         super().__init__()
         self.started: list[int] = []
@@ -189,13 +197,16 @@ class TaskMethod(Method):
         return weights
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the slots of the tasks."""
-        return {"begun": list(self.started), "place": self.slot}
+        """Return the slots of the tasks, and `counts`."""
+        counts = {name: getattr(self, name) for name in self.counts}
+        return {"begun": list(self.started), "place": self.slot, **counts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned."""
         self.started = list(state["begun"])
         self.slot = state["place"]
+        for name in self.counts:
+            setattr(self, name, state[name])
 
 
 class AgentWithMethod(nn.Module):
@@ -254,7 +265,7 @@ class AgentWithMethod(nn.Module):
 
     def loss(self, batch: Mapping[Any, Tensor] | TensorDictBase) -> Mapping[str, Tensor]:
         """Compute the agent's losses and the method's penalties."""
-        return {**self.agent.loss(batch), **self.method.penalties(batch)}
+        return {**self.agent.loss(batch), **self.method.penalties(batch, self.agent.weights)}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Show the method a batch, and learn from it."""

@@ -6,7 +6,6 @@ Mallya and Lazebnik 2018 (CVPR, arXiv 1711.05769).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from baselines.methods.method import TaskMethod
 from baselines.methods.parts.heads import Heads
-from baselines.methods.parts.weights import Weights
+from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import is_real, require
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -39,6 +38,7 @@ class PackNet(TaskMethod):
 
     agent_members = Heads.agent_members
     reads_tasks = "the frames of each block"
+    counts = ("block", "frames")
 
     owner: Tensor  # int16 [P]: the slot of the task that keeps a weight, or FREE
     packed: Tensor  # float32 [P]: kept weights
@@ -59,11 +59,10 @@ class PackNet(TaskMethod):
         self.budgets = [block.num_frames for block in curriculum.blocks]
         self.block = -1
         self.frames = 0
-        size = len(weights)
-        self.register_buffer("owner", torch.full([size], FREE, dtype=torch.int16, device="cpu"))
-        self.register_buffer("packed", torch.zeros(size, dtype=torch.float32, device="cpu"))
-        self.register_buffer("live", torch.ones(size, dtype=torch.bool, device="cpu"))
-        self.register_buffer("mine", torch.zeros(size, dtype=torch.bool, device="cpu"))
+        self.register_buffer("owner", weights.zeros(torch.int16) + FREE)
+        self.register_buffer("packed", weights.zeros())
+        self.register_buffer("live", ~weights.zeros(torch.bool))
+        self.register_buffer("mine", weights.zeros(torch.bool))
         self.in_matrices = weights.in_matrices & ~weights.in_heads
         self.in_heads = weights.in_heads
 
@@ -96,15 +95,15 @@ class PackNet(TaskMethod):
             self._prune()
         self.frames += batch.numel()
 
-    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the gradients of weights that may change, and 0 for the others."""
         live = self.weights.split(self.live)
         return [gradient * part.view_as(gradient) for gradient, part in zip(gradients, live, strict=True)]
 
     @torch.no_grad()
-    def after_step(self) -> None:
+    def after_step(self, weights: Sequence[Tensor]) -> None:
         """Undo the optimiser's changes of weights that may not change."""
-        self.weights.write(torch.where(self.live, self.weights.vector(), torch.where(self.mine, self.packed, 0.0)))
+        self.weights.write(torch.where(self.live, flat(weights), torch.where(self.mine, self.packed, 0.0)))
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
@@ -136,7 +135,7 @@ class PackNet(TaskMethod):
 
     def _load(self) -> None:
         """Load the present task's weights where they may not change."""
-        self.after_step()
+        self.after_step(self.weights.parameters)
         self.agent.weights_changed()
 
     def _kept_up_to(self, slot: int) -> Tensor:
@@ -145,13 +144,3 @@ class PackNet(TaskMethod):
 
     def _on_device(self, chosen: Tensor) -> Tensor:
         return chosen.to(self.owner.device)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the slots of the tasks, the block's number and its frames so far."""
-        return {**super().get_extra_state(), "block": self.block, "frames": self.frames}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` returned."""
-        super().set_extra_state(state)
-        self.block = state["block"]
-        self.frames = state["frames"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from baselines.methods.method import TaskMethod
@@ -29,7 +28,7 @@ class Scratch(TaskMethod):
         layers = [(name, each) for name, each in agent.policy.named_modules() if list(each.parameters(recurse=False))]
         fixed = [name or type(layer).__name__ for name, layer in layers if not hasattr(layer, "reset_parameters")]
         require((not fixed, f"Scratch draws weights again by reset_parameters, which {', '.join(fixed)} lack: add it"))
-        self.register_buffer("kept", torch.zeros(self.num_tasks, len(weights), dtype=torch.float32, device="cpu"))
+        self.register_buffer("kept", weights.zeros().repeat(self.num_tasks, 1))
 
     def start_task(self, task: int | None) -> None:
         """Load the task's network; the first task takes that of the new agent."""

@@ -46,7 +46,7 @@ class SI(Importance):
         """See `Method`."""
         super().setup(agent, weights, curriculum)
         for name in ("path", "start", "before", "slope"):
-            self.register_buffer(name, torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
+            self.register_buffer(name, weights.zeros())
 
     @torch.no_grad()
     def start_task(self, task: int | None) -> None:
@@ -56,17 +56,17 @@ class SI(Importance):
         self.start.copy_(self.weights.vector())
 
     @torch.no_grad()
-    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the same, and store the part that comes from the agent's own losses."""
-        self.before.copy_(self.weights.vector())
+        self.before.copy_(flat(weights))
         added = 2 * self.coeff * self.importance * (self.before - self.anchor)
         self.slope.copy_(flat(gradients) - added)
         return gradients
 
     @torch.no_grad()
-    def after_step(self) -> None:
+    def after_step(self, weights: Sequence[Tensor]) -> None:
         """Add the step to the path."""
-        self.path -= self.slope * (self.weights.vector() - self.before)
+        self.path -= self.slope * (flat(weights) - self.before)
 
     def task_importance(self) -> Tensor:
         """Return the fall of the loss along the path, divided by the squared changes of the weights."""

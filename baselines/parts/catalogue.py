@@ -52,10 +52,12 @@ def constants(target: str) -> dict[str, Any]:
     tree = ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
-    bases = [ast.unparse(base) for base in reversed(classes[name].bases)]
-    ours = [f"{homes[base]}.{base}" for base in bases if homes.get(base, "").startswith("baselines.")]
-    inherited = {key: value for base in ours for key, value in constants(base).items()}
-    return inherited | dict(_assigned(classes[name]))
+    found: dict[str, Any] = {}
+    for base in map(ast.unparse, reversed(classes[name].bases)):
+        home = homes.get(base, "")
+        if home.startswith("baselines."):
+            found |= constants(f"{home}.{base}")
+    return found | dict(_assigned(classes[name]))
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:

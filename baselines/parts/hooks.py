@@ -13,6 +13,7 @@ from baselines.parts.networks import Data
 class Hooks(nn.Module):
     """Hooks that change nothing; an agent calls them in each gradient step, in this order.
 
+    Those after the first get the agent's weights, by which its losses are differentiated, one tensor of each layer's.
     `baselines.methods.method.Method` derives from it. Buffers and parameters are saved with the agent.
     """
 
@@ -23,13 +24,13 @@ class Hooks(nn.Module):
         """Return the minibatch to learn from in place of the given one."""
         return batch
 
-    def penalties(self, batch: Data) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
         """Return what is added to the agent's losses, as scalars named ``loss_*``."""
         return {}
 
-    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the gradients of the optimiser's parameters, given those of the agent's weights."""
         return gradients
 
-    def after_step(self) -> None:
-        """Called after each step of the optimiser."""
+    def after_step(self, weights: Sequence[Tensor]) -> None:
+        """Called after each step of the optimiser; it may write the weights."""

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.parts.hooks import Hooks
-from baselines.parts.networks import Data, Place, places
+from baselines.parts.networks import Data
 from baselines.update.compiled import compiled
 from baselines.update.optimiser import parts_of
 from baselines.update.update import Update, UpdateState, update
@@ -131,15 +131,10 @@ class Learner(TakesNumbers, nn.Module):
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
 
-    @property
-    def weights(self) -> list[nn.Parameter]:
-        """The parameters by which the losses are differentiated."""
-        return [getattr(*place) for place in self._places]
-
     @cached_property
-    def _places(self) -> list[Place]:
-        """Where the weights are: what the optimiser trains before a method trains others in their place."""
-        return places(self, self.trainable)
+    def weights(self) -> list[nn.Parameter]:
+        """The parameters by which the losses are differentiated: what the optimiser trains without a method."""
+        return list(self.trainable)
 
     @property
     def trainable(self) -> list[nn.Parameter]:
@@ -164,15 +159,16 @@ class Learner(TakesNumbers, nn.Module):
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
 
-    def losses(self, batch: Data, others: Data | None = None) -> dict[str, Tensor]:
+    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data | None = None) -> dict[str, Tensor]:
         """Compute the agent's losses and the method's penalties.
 
         Args:
             batch: a minibatch.
+            weights: by which the sum is differentiated; the networks have them.
             others: read in place of `other_weights`, by a ``loss`` that takes them as its second argument.
         """
         own = self.loss(batch, others) if others else self.loss(batch)  # type: ignore[call-arg]
-        return {**own, **self.method.penalties(batch)}
+        return {**own, **self.method.penalties(batch, weights)}
 
     def forward(self, function: Callable[..., Any], *given: Any) -> Any:
         """Return a function of this learner: with the tensors that `torch.func.functional_call` gives it."""
@@ -188,8 +184,7 @@ class Learner(TakesNumbers, nn.Module):
         self._region = self._region or Region(self._usual_update)
         if not self._region.takes(batch):
             return update(self, self.update_state, batch)
-        measured = self._region(batch)
-        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
+        return self._region.copies(batch)
 
     def _usual_update(self, batch: Data) -> dict[str, Tensor]:
         """Take the step, compiled where the agent is."""
@@ -211,7 +206,7 @@ class Learner(TakesNumbers, nn.Module):
         Raises:
             FloatingPointError: names the first number that is not finite, or the largest weight.
         """
-        return self.means(list(steps[0]), torch.stack([torch.stack(list(step.values())) for step in steps], dim=1))
+        return self.means(list(steps[0]), table_of(steps))
 
     def means(self, names: Sequence[str], table: Tensor) -> dict[str, float]:
         """Return the means of a table of measurements, [names, gradient steps]; see `mean_measurements`."""
@@ -234,6 +229,11 @@ def reset_layer(module: nn.Module) -> None:
     """Draw the weights of a layer, if it has any, as PyTorch does at its construction."""
     if list(module.parameters(recurse=False)):
         module.reset_parameters()  # type: ignore[operator]
+
+
+def table_of(steps: Sequence[dict[str, Tensor]]) -> Tensor:
+    """Return what was measured in gradient steps, [...] each, as a table, [names, gradient steps, ...]."""
+    return torch.stack([torch.stack(list(step.values())) for step in steps], dim=1)
 
 
 def finite_means(names: Sequence[str], table: Tensor, largest_weight: Tensor) -> dict[str, float]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
@@ -32,23 +32,6 @@ GROUP = "group"
 ENCODERS = ("mlp", "cnn")
 TILE = 4
 NUM_CHANNELS = 16
-
-
-class Place(NamedTuple):
-    """Where a module has a tensor, whichever it has at the time."""
-
-    module: nn.Module
-    name: str
-
-
-def places(root: nn.Module, tensors: Sequence[Tensor]) -> list[Place]:
-    """Return where the modules of ``root`` have these parameters."""
-    found: dict[int, Place] = {}
-    for module in root.modules():
-        for name, value in module._parameters.items():
-            if not isinstance(module, TensorDictParams):  # it repeats tensors of other modules by other names
-                found.setdefault(id(value), Place(module, name))
-    return [found[id(tensor)] for tensor in tensors]
 
 
 class Convolutions(nn.Module):

@@ -7,7 +7,7 @@ two batches, and each agent gets its own after each batch. Each seed draws by co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,11 +15,10 @@ from torch import Tensor
 
 from baselines.cells.cell import PREVIOUS_ACTION
 from baselines.methods.method import AgentWithMethod
-from baselines.parts.learner import finite_means
+from baselines.parts.learner import finite_means, table_of
 from baselines.parts.networks import Data, sequences_of
 from baselines.parts.policy_gradient import PolicyGradient
-from baselines.update.optimiser import has_parts
-from baselines.update.seeds import clear, sampled
+from baselines.update.seeds import SeedGroup, or_error, sampled, why_not_optimiser
 from baselines.update.stack import Stack
 from baselines.update.update import update
 from ctgraph_rl.agent import Agent
@@ -39,9 +38,7 @@ def why_not_captured(agent: Agent) -> str | None:
         return f"{name} cannot be vectorised over seeds on a GPU"
     if any(getattr(type(agent), own) is not getattr(PolicyGradient, own) for own in AS_EVER):
         return f"{name} does not learn by the steps that a batch of seeds shares"
-    if not has_parts(agent.optimiser):
-        return f"{type(agent.optimiser).__name__} with these settings cannot be vectorised over seeds"
-    return None
+    return why_not_optimiser(agent)
 
 
 class Draws:
@@ -92,7 +89,7 @@ class SeedDraws(NamedTuple):
         self.tick.copy_(state)
 
 
-class CapturedGroup:
+class CapturedGroup(SeedGroup):
     """Agents of one configuration with different seeds, which act and learn together on a GPU.
 
     Args:
@@ -101,53 +98,62 @@ class CapturedGroup:
             from them; they say the seeds.
     """
 
+    first: PolicyGradient
+
     def __init__(self, agents: Sequence[PolicyGradient], generators: Sequence[torch.Generator]) -> None:
-        self.agents = list(agents)
-        self.generators = list(generators)
-        self.first = self.agents[0]
+        super().__init__(agents, generators)
+        self.most_at_once = len(self.agents)
         device = next(self.first.parameters()).device
         self.draws = Draws([generator.initial_seed() for generator in generators], device)
         self.device_generators = [SeedDraws(tick) for tick in self.draws.tick]
-        self.policy = StackedPolicy(self)
-        self._stack: Stack | None = None
         self._region = Region(self._usual_update)
 
     @property
     def stack(self) -> Stack:
         """The agents' tensors, from the first step on: a saved state is restored before that."""
-        if self._stack is None:
-            self._stack = Stack(self.agents)
-        return self._stack
+        return self.stacks[0]
 
-    def start_task(self, task: int | None = None) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
-        for agent in self.agents:
-            agent.start_task(task)
-        if self._stack is not None:
-            self._stack.read()
+    def _task_has_changed(self) -> None:
+        """Read what the start of a task has changed, into the memory of the graphs."""
+        for stack in self._stacks:
+            stack.read()
 
-    def end_task(self) -> None:
-        """See `ctgraph_rl.agent.Agent`."""
-        for agent in self.agents:
-            agent.end_task()
+    def policy(self, data: TensorDictBase) -> TensorDictBase:
+        """See `SeedGroup`."""
+        return super().policy(data)
 
-    def by_seed(self, value: Tensor) -> Tensor:
-        """Return a tensor of all rows, [seeds * rows, ...], as [seeds, rows, ...]."""
-        return value.unflatten(0, (len(self.agents), -1))
+    policy.capturable = True  # type: ignore[attr-defined]
+
+    def acted(self, data: TensorDictBase) -> dict[Any, Tensor]:
+        """See `SeedGroup`."""
+        keys = self.first.trunk.in_keys
+        written = self.stack.one_step({key: self.by_seed(data[key]) for key in keys})
+        log_probs = written.pop("log_probs")
+        noise = self.draws.exponential(log_probs[0].numel()).view_as(log_probs)
+        written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
+        if PREVIOUS_ACTION in keys:
+            written["next", PREVIOUS_ACTION] = written["action"]
+        return written
 
     def learn(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
-        """Let each agent learn from its rows of a batch, [seeds * num_envs, num_steps].
+        """See `SeedGroup`."""
+        measured = super().learn(batch)
+        if any(isinstance(each, FloatingPointError) for each in measured):
+            self.stack.read()
+        return measured
 
-        Returns:
-            What each measured, or the error that names what is not finite.
-        """
+    def learnt(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+        """See `SeedGroup`; the host waits twice."""
         items = self._items(batch)
         steps = []
         for _ in range(self.first.num_epochs):
             for minibatch in self._minibatches(items):
                 steps.append(self.gradient_step(minibatch))
         self.stack.write()
-        return self._measure(list(steps[0]), torch.stack([torch.stack(list(step.values())) for step in steps], dim=1))
+        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
+        largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
+        columns = table_of(steps).cpu().unbind(2)
+        return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
 
     @torch.no_grad()
     def _items(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -189,54 +195,11 @@ class CapturedGroup:
         is_usual = minibatch["action"].shape[1] == self.first.minibatch_size
         if not is_usual or not self._region.takes(minibatch):
             return update(self.first, self.stack.state, minibatch)
-        measured = self._region(minibatch)
-        return dict(zip(measured, torch.stack(list(measured.values())).unbind(), strict=True))
+        return self._region.copies(minibatch)
 
     def _usual_update(self, minibatch: Data) -> dict[str, Tensor]:
         """Take the step, compiled where the agents are."""
         return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)
-
-    def _measure(self, names: Sequence[str], table: Tensor) -> list[dict[str, float] | FloatingPointError]:
-        """Return the means of a table of measurements, [names, gradient steps, seeds], or errors; with two waits."""
-        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
-        largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
-        measured: list[dict[str, float] | FloatingPointError] = []
-        for agent, column, its_largest in zip(self.agents, table.cpu().unbind(2), largest, strict=True):
-            try:
-                measured.append(finite_means(names, column, its_largest))
-            except FloatingPointError as error:
-                measured.append(error)
-                clear(agent)
-        if any(isinstance(each, FloatingPointError) for each in measured):
-            self.stack.read()
-        return measured
-
-
-class StackedPolicy:
-    """Writes the actions of all seeds, and what they need to learn from them.
-
-    Args:
-        group: whose agents act.
-    """
-
-    capturable = True
-
-    def __init__(self, group: CapturedGroup) -> None:
-        self.group = group
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        """Write into the data of all rows, [seeds * num_envs]."""
-        group = self.group
-        keys = group.first.trunk.in_keys
-        written = group.stack.one_step({key: group.by_seed(data[key]) for key in keys})
-        log_probs = written.pop("log_probs")
-        noise = group.draws.exponential(log_probs[0].numel()).view_as(log_probs)
-        written |= sampled({"log_probs": log_probs, "state_value": written["state_value"]}, noise)
-        if PREVIOUS_ACTION in keys:
-            written["next", PREVIOUS_ACTION] = written["action"]
-        for key, value in written.items():
-            data.set(key, value.flatten(0, 1))
-        return data
 
 
 def _taken(value: Tensor, items: Tensor) -> Tensor:

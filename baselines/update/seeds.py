@@ -19,7 +19,7 @@ from torch.fx import GraphModule
 
 from baselines.methods.method import AgentWithMethod
 from baselines.parts.hooks import Hooks
-from baselines.parts.learner import Learner
+from baselines.parts.learner import Learner, table_of
 from baselines.parts.networks import Data
 from baselines.update.compiled import compiler_options
 from baselines.update.optimiser import has_parts
@@ -43,9 +43,14 @@ def why_not_together(agent: Agent) -> str | None:
         return f"{name} does not learn by the steps that a batch of seeds shares"
     if not learner.method.stackable:
         return f"{type(learner.method).__name__} cannot be vectorised over seeds"
-    if not has_parts(learner.optimiser):
-        return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
-    return None
+    return why_not_optimiser(learner)
+
+
+def why_not_optimiser(learner: Learner) -> str | None:
+    """Return why the step of a learner's optimiser cannot be that of several seeds; None if it can."""
+    if has_parts(learner.optimiser):
+        return None
+    return f"{type(learner.optimiser).__name__} with these settings cannot be vectorised over seeds"
 
 
 class SeedGroup:
@@ -58,21 +63,24 @@ class SeedGroup:
         generators: of each agent, with the state of torch's global generator after the agent was built.
     """
 
-    device_generators = None
+    device_generators: Sequence[Any] | None = None
 
     def __init__(self, agents: Sequence[Agent], generators: Sequence[torch.Generator]) -> None:
-        self.agents, self.generators = list(agents), list(generators)
+        self.agents = list(agents)
+        self.generators = list(generators)
         self.learners = [_learner(agent) for agent in agents]
-        self.is_stacked = _gains_from_stacking(self.learners[0])
-        self.most_at_once = _most_at_once(self.learners[0]) if self.learners[0].compiled_step else len(self.agents)
+        self.first = self.learners[0]
+        self.is_stacked = _gains_from_stacking(self.first)
+        self.most_at_once = _most_at_once(self.first) if self.first.compiled_step else len(self.agents)
         self._compiled: dict[str, Outputs] = {}
-        self._forget()
-
-    def _forget(self) -> None:
-        """Forget what depends on the present task: what a method computes can depend on earlier ones."""
         self._stacks: list[Stack] = []
         self._acting: Stack | None = None
         self._outputs: Outputs | None = None
+
+    def _task_has_changed(self) -> None:
+        """Forget what depends on the task: what a method computes can depend on earlier ones."""
+        self._stacks = []
+        self._acting = self._outputs = None
 
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
@@ -96,10 +104,10 @@ class SeedGroup:
 
     def start_task(self, task: int | None = None) -> None:
         """See `ctgraph_rl.agent.Agent`."""
-        self._forget()
         for number, agent in enumerate(self.agents):
             with self.random(number):
                 agent.start_task(task)
+        self._task_has_changed()
 
     def end_task(self) -> None:
         """See `ctgraph_rl.agent.Agent`."""
@@ -108,16 +116,23 @@ class SeedGroup:
             with self.random(number):
                 agent.end_task()
 
+    def by_seed(self, value: Tensor) -> Tensor:
+        """Return a tensor of all rows, [seeds * rows, ...], as [seeds, rows, ...]."""
+        return value.unflatten(0, (len(self.agents), -1))
+
     def policy(self, data: TensorDictBase) -> TensorDictBase:
         """Write the actions of all agents, [seeds * num_envs], and what they need to learn from them."""
-        if self._acting is None:
-            self._acting = Stack(self.learners)
-        keys = [key for key in self.learners[0].policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
-        outputs = self._act(self._acting, {key: data[key].unflatten(0, (len(self.agents), -1)) for key in keys})
-        written = self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
-        for key, value in written.items():
+        for key, value in self.acted(data).items():
             data.set(key, value.flatten(0, 1))
         return data
+
+    def acted(self, data: TensorDictBase) -> dict[Any, Tensor]:
+        """Return what the policies write, [seeds, num_envs, ...] each."""
+        if self._acting is None:
+            self._acting = Stack(self.learners)
+        keys = [key for key in self.first.policy.in_keys if key in data.keys()]  # noqa: SIM118, rows otherwise
+        outputs = self._act(self._acting, {key: self.by_seed(data[key]) for key in keys})
+        return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
 
     def _act(self, stack: Stack, data: dict[Any, Tensor]) -> dict[str, Tensor]:
         """Compute `Stack.outputs` by a graph of its operations, compiled where the agents say so.
@@ -127,7 +142,7 @@ class SeedGroup:
         inputs = stack.acting_inputs(data)
         if self._outputs is None:
             graph = stack.traced_outputs(data)
-            self._outputs = self._compile(graph, inputs) if self.learners[0].compiled_step else graph
+            self._outputs = self._compile(graph, inputs) if self.first.compiled_step else graph
         return self._outputs(*inputs)
 
     def _compile(self, graph: GraphModule, inputs: Sequence[Tensor]) -> Outputs:
@@ -158,18 +173,22 @@ class SeedGroup:
             What each measured, or the error that names what is not finite.
         """
         self._acting = None
-        parts = batch.chunk(len(self.agents))
-        measured = self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
+        measured = self.learnt(batch)
         for learner, each in zip(self.learners, measured, strict=True):
             if isinstance(each, FloatingPointError):
                 clear(learner)
         return measured
 
+    def learnt(self, batch: TensorDictBase) -> list[dict[str, float] | FloatingPointError]:
+        """Learn, and return what `learn` does; an agent that failed keeps weights that are not finite."""
+        parts = batch.chunk(len(self.agents))
+        return self._learn_stacked(parts) if self.is_stacked else self._learn_in_turn(parts)
+
     def _learn_in_turn(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
         measured = []
         for number, (agent, part) in enumerate(zip(self.agents, parts, strict=True)):
             with self.random(number):
-                measured.append(_or_error(agent.learn, part))
+                measured.append(or_error(agent.learn, part))
         return measured
 
     def _learn_stacked(self, parts: Sequence[TensorDictBase]) -> list[dict[str, float] | FloatingPointError]:
@@ -198,14 +217,14 @@ class SeedGroup:
             if isinstance(agent, AgentWithMethod):
                 agent.method.after_learning()
         names = list(steps[0])
-        table = torch.stack([torch.stack(list(step.values())) for step in steps], dim=1).unbind(-1)
+        table = table_of(steps).unbind(-1)
 
         def measured(learner: Learner, column: Tensor) -> dict[str, float]:
             if learner in errors:
                 raise errors[learner]
             return learner.after_batch(learner.means(names, column))
 
-        return [_or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
+        return [or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
 
     def _next(self, minibatches: Mapping[int, Iterator[dict[Any, Tensor]]]) -> list[Data]:
         """Return the next minibatch of each of these agents; none after the last."""
@@ -269,7 +288,7 @@ def _most_at_once(learner: Learner) -> int:
     return max(1, CACHED_BYTES // of_one)
 
 
-def _or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str, float] | FloatingPointError:
+def or_error(measure: Callable[..., dict[str, float]], *given: Any) -> dict[str, float] | FloatingPointError:
     """Return what a function measures, or its error where that is not finite."""
     try:
         return measure(*given)

@@ -19,13 +19,13 @@ from baselines.update.update import UpdateState, over_seeds, stacked, unstacked
 
 def named_tensors(learner: Learner) -> dict[str, Tensor]:
     """Return a learner's parameters and buffers by name, in an order that depends only on its structure."""
-    return {
-        f"{path}.{name}" if path else name: value
-        for path, module in learner.named_modules()
-        for kind in (module._parameters, module._buffers)
-        for name, value in kind.items()
-        if value is not None and not isinstance(module, TensorDictParams)
-    }
+    found = {}
+    for path, module in learner.named_modules():
+        if not isinstance(module, TensorDictParams):
+            for name, value in (*module._parameters.items(), *module._buffers.items()):
+                if value is not None:
+                    found[f"{path}.{name}" if path else name] = value
+    return found
 
 
 class Stack:
@@ -38,16 +38,19 @@ class Stack:
     def __init__(self, learners: Sequence[Learner]) -> None:
         self.learners = learners
         first = learners[0]
-        of_first = named_tensors(first)
-        names = {id(tensor): name for name, tensor in reversed(of_first.items())}
+        names: dict[int, str] = {}
+        turned = []
+        self.first_name: dict[str, str] = {}
+        """For each name the first one of the same tensor."""
+
+        for name, tensor in named_tensors(first).items():
+            self.first_name[name] = names.setdefault(id(tensor), name)
+            if isinstance(tensor, nn.Parameter) and tensor.ndim == 2:
+                turned.append(name)
+        self.turned = tuple(turned)
         self.weights = [names[id(tensor)] for tensor in first.weights]
         self.trained = [names[id(tensor)] for tensor in first.trainable]
         self.learned = {*self.weights, *self.trained}
-        self.first_name = {name: names[id(tensor)] for name, tensor in of_first.items()}
-        """For each name the first one of the same tensor."""
-
-        matrices = [name for name, each in of_first.items() if isinstance(each, nn.Parameter) and each.ndim == 2]
-        self.turned = tuple(matrices)
         self.kept: dict[str, Tensor] = {}
         self.moments: list[dict[str, Tensor]] = [{} for _ in self.trained]
         self.others: dict[str, Tensor] = {}
@@ -98,7 +101,14 @@ class Stack:
         weights = [self.kept[name] for name in self.weights]
         own = cast(Parts, parts_of(self.learners[0].optimiser))
         optimiser = own._replace(parameters=[self.kept[name] for name in self.trained], state=self.moments)
-        return UpdateState(weights, optimiser, self._named(self.kept), self.turned, self.others)
+        return UpdateState(
+            weights,
+            optimiser,
+            self._named(self.kept),
+            names=self.weights,
+            turned=self.turned,
+            others=self.others,
+        )
 
     def _named(self, kept: dict[str, Tensor]) -> dict[str, Tensor]:
         return {name: kept[first] for name, first in self.first_name.items()}
@@ -136,9 +146,9 @@ def _keep(kept: dict[str, Tensor], name: str, value: Tensor) -> None:
         kept[name] = value
 
 
-def _outputs(learner: Learner, data: Data) -> dict[str, Tensor]:
+def _outputs(learner: Learner, weights: Sequence[Tensor], data: Data) -> dict[str, Tensor]:
     return learner.outputs(data)
 
 
-def _one_step(learner: Learner, data: Data) -> dict[Any, Tensor]:
+def _one_step(learner: Learner, weights: Sequence[Tensor], data: Data) -> dict[Any, Tensor]:
     return learner.one_step(data)

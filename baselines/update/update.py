@@ -27,6 +27,9 @@ class UpdateState(NamedTuple):
     tensors: Mapping[str, Tensor] | None = None
     """Of several seeds all parameters and buffers by name, [seeds, ...] each; None: those that one learner has."""
 
+    names: Sequence[str] = ()
+    """Those of the weights among these tensors."""
+
     turned: Sequence[str] = ()
     """The names of matrices, which are kept as [seeds, inputs, outputs]: so their gradients come out of the backward
     pass."""
@@ -59,28 +62,35 @@ def update(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tenso
 def losses_of(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
     """Compute the agent's losses and the method's penalties, of each seed where there are several."""
     if state.tensors is None:
-        return learner.losses(batch)
+        return learner.losses(batch, state.weights)
     return over_seeds(learner, _losses, state, batch, state.others)
 
 
 def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
-    """Compute a function of a learner and further tensors for each seed."""
+    """Compute a function of a learner, its weights and further tensors for each seed."""
 
     def of_one(tensors: dict[str, Tensor], *its: Any) -> Any:
-        return functional_call(learner, tensors, (function, *its), tie_weights=False)
+        return _with(learner, tensors, function, state, *its)
 
     return vmap(of_one)(_seen(state), *given)
 
 
 def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., Any], *given: Any) -> Any:
-    """Compute a function of a learner that has the tensors of a state, those of all seeds at once."""
+    """Compute a function of a learner that has the tensors of a state, those of all seeds at once, and its weights."""
     if state.tensors is None:
-        return function(learner, *given)
-    return functional_call(learner, _seen(state), (function, *given), tie_weights=False)
+        return function(learner, state.weights, *given)
+    return _with(learner, _seen(state), function, state, *given)
 
 
-def _losses(learner: Learner, batch: Data, others: Data) -> dict[str, Tensor]:
-    return learner.losses(batch, others)
+def _with(
+    learner: Learner, tensors: dict[str, Tensor], function: Callable[..., Any], state: UpdateState, *given: Any
+) -> Any:
+    weights = [tensors[name] for name in state.names]
+    return functional_call(learner, tensors, (function, weights, *given), tie_weights=False)
+
+
+def _losses(learner: Learner, weights: Sequence[Tensor], batch: Data, others: Data) -> dict[str, Tensor]:
+    return learner.losses(batch, weights, others)
 
 
 def _seen(state: UpdateState) -> dict[str, Tensor]:
@@ -89,19 +99,19 @@ def _seen(state: UpdateState) -> dict[str, Tensor]:
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}
 
 
-def _descend(learner: Learner, state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
+def _descend(learner: Learner, weights: Sequence[Tensor], state: UpdateState, gradients: Sequence[Tensor]) -> Tensor:
     """Take the optimiser's step; return the norm of the gradients, of each seed where there are several."""
     is_stacked = state.tensors is not None
     if is_stacked:
         gradients = [unstacked(gradient) for gradient in gradients]
-    gradients = learner.method.transform_gradients(gradients)
+    gradients = learner.method.transform_gradients(gradients, weights)
     if is_stacked:
         gradients = [unstacked(gradient).contiguous() for gradient in gradients]
     norm = norm_of(gradients, num_leading=int(is_stacked))
     scale = (learner.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
     with torch.no_grad():
         step(state.optimiser, [gradient * _beside(scale, gradient) for gradient in gradients])
-    learner.method.after_step()
+    learner.method.after_step(weights)
     return norm
 
 

@@ -24,11 +24,12 @@ from ctgraph_rl.log.provenance import code_changes, versions
 from ctgraph_rl.log.run_log import SCHEMA, RunLog
 from ctgraph_rl.report.objective import check_objective, objective_of
 from ctgraph_rl.report.style import require_packages
-from ctgraph_rl.runs import config, seeds
+from ctgraph_rl.runs import config
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.experts import Failures
 from ctgraph_rl.runs.interrupt import Interrupt
-from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished
+from ctgraph_rl.runs.job import Job, code_of, first_line, is_finished, run_job
+from ctgraph_rl.runs.seeds import run_seeds
 from ctgraph_rl.runs.status import marked_if_it_fails
 from ctgraph_rl.runs.train import Participant, execute
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -41,7 +42,7 @@ Runs = Sequence[tuple[Any, Path]]
 
 
 def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration: a collective if it has an ``exchange``, or else as `ctgraph_rl.runs.seeds.run_cells`.
+    """Run a configuration: a collective if it has an ``exchange``, each of its ``seeds`` if a sweep lists them.
 
     Returns:
         The directories of single runs; those of a collective's members are within its own.
@@ -49,12 +50,15 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
     check_objective(cfg.objective, cfg.experts)
     if cfg.report:
         require_packages()
-    if "exchange" not in cfg:
-        return seeds.run_cells(cfg, run_dir)
-    run_collective(cfg, run_dir)
-    if not config.in_sweep():
-        print(described(read_collective(run_dir)))
-    return []
+    if "exchange" in cfg:
+        run_collective(cfg, run_dir)
+        if not config.in_sweep():
+            print(described(read_collective(run_dir)))
+        return []
+    if "seeds" in cfg:
+        return run_seeds(cfg, run_dir)
+    run_job(cfg, run_dir)
+    return [run_dir]
 
 
 def value_of(cfg: Any, run_dir: Path, run_dirs: Sequence[Path]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,12 @@ def find_collectives(paths: Sequence[Path | str]) -> list[Collective]:
     Raises:
         ValueError: if there is none; and see `read_collective`.
     """
-    folders = [log.parent for path in paths for log in files_below(Path(path), (COLLECTIVE,))[0]]
+    folders: dict[Path, None] = {}
+    for path in paths:
+        for log in files_below(Path(path), (COLLECTIVE,))[0]:
+            folders[log.parent] = None
     require((bool(folders), f"no {COLLECTIVE} in or below {', '.join(map(str, paths))}: run one with exchange=l2d2c"))
-    return [read_collective(folder) for folder in dict.fromkeys(folders)]
+    return list(map(read_collective, folders))
 
 
 def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
@@ -69,25 +72,36 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     for name, columns, rows in tables(found):
         write_whole(folder / name, csv_text([columns, *rows]))
     measured = [_row(each) for each in found]
-    write_whole(
-        folder / "collectives.csv", csv_text([list(COLUMNS), *([row[name] for name in COLUMNS] for row in measured)])
-    )
-    drawn = gallery.write((), _figures(found))
-    head = ["| " + " | ".join(SHOWN) + " |", "|" + "---|" * len(SHOWN)]
-    lines = ["| " + " | ".join(markdown_text(_shown(row[name])) for name in SHOWN) + " |" for row in measured]
-    images = [f"![{each.alt}]({each.path})\n\n{each.caption}" for each in drawn]
+    cells = [[row[name] for name in COLUMNS] for row in measured]
+    write_whole(folder / "collectives.csv", csv_text([list(COLUMNS), *cells]))
+    parts = ["# Collectives", _table(measured), MEANING]
+    for each in gallery.write((), _figures(found)):
+        parts.append(f"![{each.alt}]({each.path})\n\n{each.caption}")
     page = folder / "collectives.md"
-    write_whole(page, "\n\n".join(["# Collectives", "\n".join([*head, *lines]), MEANING, *images]) + "\n")
+    write_whole(page, "\n\n".join(parts) + "\n")
     return page
+
+
+def _table(measured: Sequence[Mapping[str, Any]]) -> str:
+    """Return the page's table, in Markdown."""
+    lines = [f"| {' | '.join(SHOWN)} |", "|" + "---|" * len(SHOWN)]
+    for row in measured:
+        cells = [markdown_text(_shown(row[name])) for name in SHOWN]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def _row(collective: Collective) -> dict[str, Any]:
     """Return the values of `COLUMNS`."""
     exchange = collective.config["exchange"]
-    settings = {name: exchange.get(name) for name in ("every", "drop_prob", "delay_prob")}
-    counts = {name: collective.total(name) for name in (*WHAT, "bytes")}
-    measured = {name: getattr(collective, name) for name in MEASURES}
-    return {**collective.about, **settings, **measured, **counts, "helps": len(collective.helps)}
+    row = {**collective.about, "helps": len(collective.helps)}
+    for name in ("every", "drop_prob", "delay_prob"):
+        row[name] = exchange.get(name)
+    for name in MEASURES:
+        row[name] = getattr(collective, name)
+    for name in (*WHAT, "bytes"):
+        row[name] = collective.total(name)
+    return row
 
 
 def _shown(value: Any) -> str:

@@ -83,10 +83,11 @@ class Collective:
     @property
     def final_return(self) -> float:
         """Sum of the final returns of all members, each the mean over its blocks; blocks without one count 0."""
-        members = Counter(each.member for each in self.learned)
-        values = [
-            0.0 if math.isnan(each.final_return) else each.final_return / members[each.member] for each in self.learned
-        ]
+        blocks = Counter(each.member for each in self.learned)
+        values = []
+        for each in self.learned:
+            if not math.isnan(each.final_return):
+                values.append(each.final_return / blocks[each.member])
         return math.fsum(values)
 
     def total(self, what: str) -> int:
@@ -115,7 +116,9 @@ def read_collective(path: Path | str) -> Collective:
     members = about["members"]
     called = {part: str(config[part]["_target_"]).rpartition(".")[2] for part in ("agent", "method", "exchange")}
     run = {"curriculum": members[0]["curriculum"], **called, "num_members": len(members), "seed": config["seed"]}
-    learned = [row for number, each in enumerate(members) for row in _learned(path, number, each)]
+    learned: list[Learned] = []
+    for number, each in enumerate(members):
+        learned += _learned(path, number, each)
     return Collective(path, run, config, learned, messages=log.of_kind("exchange"), helps=log.of_kind("help"))
 
 
@@ -172,13 +175,14 @@ def write_summary(run_dir: Path) -> None:
 
 def tables(collectives: Sequence[Collective]) -> Iterator[tuple[str, list[str], list[list[Any]]]]:
     """Yield the name, the columns and the rows of each tidy table, of one or of several collectives."""
-    columns: list[str] = [*RUN, *Learned._fields]
-    yield "members.csv", columns, [[*_run(each), *_plain(row)] for each in collectives for row in each.learned]
-    columns = ["round", "frames", "message", *WHAT, "bytes"]
-    yield "messages.csv", [*RUN, *columns], _rows(collectives, "messages", columns)
+    rows = [[*_run(each), *_plain(row)] for each in collectives for row in each.learned]
+    yield "members.csv", [*RUN, *Learned._fields], rows
+    yield _table(collectives, "messages", ["round", "frames", "message", *WHAT, "bytes"])
     columns = ["round", "receiver", "sender", "block", "frames"]
-    extra = {name for each in collectives for row in each.helps for name in row} - {*columns, "kind", "seconds"}
-    yield "helps.csv", [*RUN, *columns, *sorted(extra)], _rows(collectives, "helps", [*columns, *sorted(extra)])
+    extra: set[str] = set()
+    for each in collectives:
+        extra.update(*each.helps)
+    yield _table(collectives, "helps", [*columns, *sorted(extra - {*columns, "kind", "seconds"})])
 
 
 def _run(collective: Collective) -> list[Any]:
@@ -189,8 +193,12 @@ def _plain(row: Learned) -> list[Any]:
     return [None if isinstance(value, float) and math.isnan(value) else value for value in row]
 
 
-def _rows(collectives: Sequence[Collective], part: str, columns: Sequence[str]) -> list[list[Any]]:
-    return [[*_run(each), *(row.get(name) for name in columns)] for each in collectives for row in getattr(each, part)]
+def _table(collectives: Sequence[Collective], part: str, columns: list[str]) -> tuple[str, list[str], list[list[Any]]]:
+    rows = []
+    for each in collectives:
+        for row in getattr(each, part):
+            rows.append([*_run(each), *map(row.get, columns)])
+    return f"{part}.csv", [*RUN, *columns], rows
 
 
 def metrics(collective: Collective) -> dict[str, Metric]:

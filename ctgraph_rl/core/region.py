@@ -59,6 +59,11 @@ class Region:
             self.graph.replay()
         return dict(self._results)
 
+    def copies(self, arguments: Tensors) -> dict[Any, Tensor]:
+        """Return the function's results, all of one shape, as copies."""
+        found = self(arguments)
+        return dict(zip(found, torch.stack(list(found.values())).unbind(), strict=True))
+
     def takes(self, arguments: Tensors) -> bool:
         """Return whether arguments have the shapes of the first call's; any, before the first call."""
         shapes = {key: value.shape for key, value in self._arguments.items()}

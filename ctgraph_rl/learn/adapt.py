@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from inspect import Parameter, signature
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import nn
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.learn.collect import Policy
-from ctgraph_rl.learn.evaluate import as_policy
+from ctgraph_rl.learn.evaluate import as_policy, positional
 
 
 def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = False) -> Policy:
@@ -37,8 +36,7 @@ def adapt(policy: Any, greedy: bool, num_actions: int | None, shows_ids: bool = 
     if isinstance(policy, nn.Module):
         return as_policy(policy, num_actions)
     require((callable(policy), f"policy must be a function, or an object with predict, got {type(policy).__name__}"))
-    positional = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    places = [p for p in signature(policy).parameters.values() if p.kind in positional]
+    places = positional(policy)
     if [p.name for p in places[1:2]] == ["task_id"]:
         return act(lambda shown, state, start: (policy(*_parts(shown)), None))
     taken = [p for p in places if p.default is p.empty]

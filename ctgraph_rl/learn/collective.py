@@ -252,10 +252,8 @@ class _Collective:
         states: Sequence[Any] = [None] * len(self.members) if saved is None else saved["members"]
         count = f"the saved state has {len(states)} members, there are {len(self.members)}; start again"
         require((len(states) == len(self.members), count))
-        self.learners = [
-            _Learner(number, member, device, state)
-            for number, (member, state) in enumerate(zip(self.members, states, strict=True))
-        ]
+        for number, (member, state) in enumerate(zip(self.members, states, strict=True)):
+            self.learners.append(_Learner(number, member, device, state))
         if saved is not None:
             self.rounds = saved["rounds"]
             self.mail.load_state_dict(saved["mail"])

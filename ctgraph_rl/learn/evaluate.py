@@ -186,11 +186,16 @@ class LogitsPolicy:
 def _takes_ids(function: Any) -> bool:
     """Return whether a function needs two positional arguments, or its second one is named ``task_id``."""
     try:
-        parameters = signature(function).parameters.values()
+        places = positional(function)
     except ValueError:  # of a traced module, which has none
         return False
-    places = [p for p in parameters if p.kind in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)]
     return sum(p.default is p.empty for p in places) == 2 or [p.name for p in places[1:2]] == ["task_id"]
+
+
+def positional(function: Any) -> list[Parameter]:
+    """Return the positional parameters of a function."""
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return [parameter for parameter in signature(function).parameters.values() if parameter.kind in kinds]
 
 
 @contextmanager

@@ -96,8 +96,11 @@ def why_refused(message: Message, kinds: Mapping[str, Fields]) -> str | None:
         return f"unknown kind {message.kind!r:.40}"
     if message.content.keys() != fields.keys():
         return f"a {message.kind} with other fields than {', '.join(fields)}"
-    wrong = {name: field.why_not(message.content[name]) for name, field in fields.items()}
-    return next((f"{name} of a {message.kind}: {why}" for name, why in wrong.items() if why is not None), None)
+    for name, field in fields.items():
+        why = field.why_not(message.content[name])
+        if why is not None:
+            return f"{name} of a {message.kind}: {why}"
+    return None
 
 
 class Mail:
@@ -157,18 +160,25 @@ class Mail:
             kind: messages of this kind, and of kinds that are unknown.
             kinds: the fields of each known kind.
         """
-        own = [
-            each for each in self.here if each.receiver == receiver and (each.kind == kind or each.kind not in kinds)
-        ]
-        self.here = [each for each in self.here if all(each is not other for other in own)]
-        reasons = [(each, why_refused(each, kinds)) for each in own]
-        for each, reason in reasons:
+        good = []
+        refused = []
+        others = []
+        for each in self.here:
+            if each.receiver != receiver or (each.kind != kind and each.kind in kinds):
+                others.append(each)
+                continue
+            reason = why_refused(each, kinds)
             self.counts[each.kind, DELIVERED if reason is None else REFUSED] += 1
-        return [each for each, reason in reasons if reason is None], [(each, why) for each, why in reasons if why]
+            if reason is None:
+                good.append(each)
+            else:
+                refused.append((each, reason))
+        self.here = others
+        return good, refused
 
     def state_dict(self) -> dict[str, Any]:
         """Return the random stream and the late messages, as tensors and plain values."""
-        return {"random": self.generator.get_state(), "late": [_as_plain(message) for message in self.late]}
+        return {"random": self.generator.get_state(), "late": list(map(_as_plain, self.late))}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""

@@ -25,14 +25,22 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
+def _are(holds: Callable[[Any], bool], value: object) -> bool:
+    """Whether it is a list of values for which a rule holds."""
+    return isinstance(value, list) and all(map(holds, value))
+
+
 def _are_texts(value: object) -> bool:
-    return isinstance(value, list) and all(map(_is_text, value))
+    return _are(_is_text, value)
+
+
+def _is_task(value: object) -> bool:
+    return is_int(value, 1, MOST)
 
 
 def _are_blocks(value: object) -> bool:
     """Whether it lists for each block the numbers of its tasks."""
-    blocks = value if isinstance(value, list) else [None]
-    return all(isinstance(block, list) and block and all(is_int(task, 1, MOST) for task in block) for block in blocks)
+    return _are(lambda block: block != [] and _are(_is_task, block), value)
 
 
 def _are_sources(value: object) -> bool:
@@ -43,16 +51,16 @@ def _are_sources(value: object) -> bool:
 
 def _are_seeds(value: object) -> bool:
     """Whether it lists the seeds of a group."""
-    return value is None or (isinstance(value, list) and all(is_int(seed) for seed in value))
+    return value is None or _are(is_int, value)
 
 
 def _are_experts(value: object) -> bool:
     """Whether it says of each single-task expert at least its task."""
-    each = value if isinstance(value, list) else [None]
-    return all(
-        isinstance(one, Mapping) and is_int(one.get("task"), 1, MOST) and _are_seeds(one.get("together"))
-        for one in each
-    )
+    return _are(_is_expert, value)
+
+
+def _is_expert(value: object) -> bool:
+    return isinstance(value, Mapping) and _is_task(value.get("task")) and _are_seeds(value.get("together"))
 
 
 RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -69,7 +77,7 @@ RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a list of objects with a task and, where seeds were trained together, the list of those",
     ),
     "block": (lambda value: is_int(value, 0, MOST), f"an integer in 0..{MOST:,}"),
-    **dict.fromkeys(("task", "step"), (lambda value: is_int(value, 1, MOST), f"an integer in 1..{MOST:,}")),
+    **dict.fromkeys(("task", "step"), (_is_task, f"an integer in 1..{MOST:,}")),
     "frames": (lambda value: is_int(value, 0, MOST_FRAMES), "an integer in [0, 2**63)"),
     "held_out": (lambda value: isinstance(value, bool), "true or false"),
     **dict.fromkeys(("moment", "label"), (_is_text, "a text")),
@@ -110,15 +118,20 @@ def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
     Raises:
         ValueError: for a missing field, one of another type, and a number that tables have no room for.
     """
+    fields = []
+    sizes = []
+    for name, value in measurement.items():
+        if name in RULES:
+            holds, what = RULES[name]
+            fields.append((holds(value), f"{name} must be {what}, got {value!r:.80}"))
+        fits = not is_int(value) or is_int(value, -LARGEST_INT, LARGEST_INT)
+        sizes.append((fits, f"{name} must be an integer of 64 bits"))
     kind = measurement["kind"]
-    rules = [(RULES[name], name, value) for name, value in measurement.items() if name in RULES]
-    missing = [name for name in NEEDED.get(kind if isinstance(kind, str) else "", ()) if name not in measurement]
+    needed = NEEDED.get(kind, ()) if isinstance(kind, str) else ()
+    missing = [name for name in needed if name not in measurement]
     require(
-        *((holds(value), f"{name} must be {what}, got {value!r:.80}") for (holds, what), name, value in rules),
-        *(
-            (not is_int(value) or is_int(value, -LARGEST_INT, LARGEST_INT), f"{name} must be an integer of 64 bits")
-            for name, value in measurement.items()
-        ),
+        *fields,
+        *sizes,
         (not missing, f"{', '.join(missing)} must be there"),
         (is_shallow(measurement, MAX_NESTING), f"nested more than {MAX_NESTING} deep"),
     )

@@ -118,8 +118,10 @@ def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     if numbers != numbers_of(before):
         changed.append(f"ctgraph_rl (numbers version {numbers} before, {numbers_of(before)} now)")
     if stored is not None and now["sources"] is not None:
-        pairs = {name: (stored.get(name, ""), now["sources"].get(name, "")) for name in {*stored, *now["sources"]}}
-        changed += [f"{name}" for name, pair in sorted(pairs.items()) if None not in pair and pair[0] != pair[1]]
+        for name in sorted({*stored, *now["sources"]}):
+            digests = {stored.get(name, ""), now["sources"].get(name, "")}
+            if None not in digests and len(digests) == 2:
+                changed.append(name)
     return changed
 
 

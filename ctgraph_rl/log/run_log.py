@@ -89,10 +89,15 @@ class RunLog:
 
     def __repr__(self) -> str:
         """Return the curriculum, the seed and how much was measured, in one line."""
+        run = self._run()
+        counts = f"{len(self.of_kind('training'))} training intervals, {len(self.of_kind('evaluation'))} evaluations"
+        return f"<RunLog {run['curriculum']!s:.80}, seed {run['seed']}: {counts}>"
+
+    def _run(self) -> dict[str, Any]:
+        """Return curriculum, fingerprint and seed, None where the log does not say them."""
         about = (self.of_kind("run") or [{}])[0]
         seed = (about.get("config") or {}).get("seed")
-        counts = f"{len(self.of_kind('training'))} training intervals, {len(self.of_kind('evaluation'))} evaluations"
-        return f"<RunLog {about.get('curriculum')!s:.80}, seed {seed}: {counts}>"
+        return {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint"), "seed": seed}
 
     @classmethod
     def resume(cls, path: Path | str, position: Mapping[str, float]) -> RunLog:
@@ -156,15 +161,18 @@ class RunLog:
         self.measurements.append(measurement)
         if self._file is not None and self._path is not None:
             self._check_place()
-            line = json.dumps(measurement).encode() + b"\n"
-            try:
-                written = self._file.write(line)
-                while written < len(line):  # a full disk takes a part, and says so at the next attempt
-                    written += self._file.write(line[written:])
-            except OSError as error:
-                raise cannot_write(self._path, len(line), error) from error
+            self._write(self._file, self._path, json.dumps(measurement).encode() + b"\n")
         for listener in self.listeners:
             listener(measurement)
+
+    @staticmethod
+    def _write(file: BinaryIO, path: Path, line: bytes) -> None:
+        try:
+            written = file.write(line)
+            while written < len(line):  # a full disk takes a part, and says so at the next attempt
+                written += file.write(line[written:])
+        except OSError as error:
+            raise cannot_write(path, len(line), error) from error
 
     def close(self) -> None:
         """Let all lines reach the disk, and close the file."""
@@ -238,11 +246,11 @@ class RunLog:
 
     def rows(self, kind: str) -> Iterator[dict[str, Any]]:
         """Yield the measurements of a kind, after the curriculum, the fingerprint and the seed of the run."""
-        about = (self.of_kind("run") or [{}])[0]
-        run = {"curriculum": about.get("curriculum"), "fingerprint": about.get("fingerprint")}
-        run["seed"] = (about.get("config") or {}).get("seed")
+        run = self._run()
         for measurement in self.of_kind(kind):
-            yield {**run, **{name: value for name, value in measurement.items() if name != "kind"}}
+            row = {**run, **measurement}
+            del row["kind"]
+            yield row
 
     def to_pandas(self, kind: str = "evaluation") -> Any:
         """Return the measurements of a kind as a ``pandas.DataFrame``, one row each; see `rows`.
@@ -370,9 +378,11 @@ class RunLog:
         require((all(block[0] + 1 in said for block in tasks), "lifelong metrics need an evaluation of every task"))
         label = said if labels is None else dict(enumerate(labels, 1))
         names: dict[str, int] = {}
-        regimes = list(self._stays([block[0] + 1 for block in tasks]))
-        rows = [(names.setdefault(label[task], len(names)), training, len(own)) for task, training, own in regimes]
-        values = [value for _, _, own in regimes for value in own]
+        rows = []
+        values: list[float | None] = []
+        for task, training, own in self._stays([block[0] + 1 for block in tasks]):
+            rows.append((names.setdefault(label[task], len(names)), training, len(own)))
+            values += own
         return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
@@ -396,8 +406,10 @@ class RunLog:
 
     def _said(self) -> list[list[int]]:
         """The tasks of each block, counted from 0, if the first line says them."""
-        said = (m["trained"] for m in self.measurements if m["kind"] == "run" and "trained" in m)
-        return [[number - 1 for number in block] for block in next(said, ())]
+        for run in self.of_kind("run"):
+            if "trained" in run:
+                return [[number - 1 for number in block] for block in run["trained"]]
+        return []
 
     def _evaluations(self, during: bool) -> list[dict[str, Any]]:
         """Evaluations of the curriculum's own tasks."""
@@ -437,9 +449,10 @@ def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> N
         log: the run's log.
         labels: a name per task, the last columns.
     """
-    so_far = zip(log.ends(), log.performance().tolist(), strict=False)
-    rows = ([block, frames, *row] for block, (frames, row) in enumerate(so_far))
-    write_whole(path, csv_text([["block", "frames", *labels], *rows], "\r\n"))
+    lines: list[list[Any]] = [["block", "frames", *labels]]
+    for block, (frames, row) in enumerate(zip(log.ends(), log.performance().tolist(), strict=False)):
+        lines.append([block, frames, *row])
+    write_whole(path, csv_text(lines, "\r\n"))
 
 
 def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:

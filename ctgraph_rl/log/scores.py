@@ -127,10 +127,10 @@ def _check_same(log: RunLog, curriculum: Curriculum) -> None:
         other = f"the log is of {run.get('curriculum')} (fingerprint {learned}), not of {curriculum.name} ({given})"
         require((learned == given, f"{other}: give the curriculum that the run learned, with all its changes"))
     tasks = max((m["task"] for m in log.of_kind("evaluation") if not m.get("held_out")), default=0)
-    blocks = max((m["block"] for kind in ("training", "evaluation") for m in log.of_kind(kind)), default=0)
+    block = len(log.ends()) - 1
     most = len(curriculum.tasks), len(curriculum.blocks)
-    more = f"the log has task {tasks} and block {blocks}, {curriculum.name} has {most[0]} tasks and {most[1]} blocks"
-    require((tasks <= most[0] and blocks <= most[1], f"{more}: give the curriculum that the run learned"))
+    more = f"the log has task {tasks} and block {block}, {curriculum.name} has {most[0]} tasks and {most[1]} blocks"
+    require((tasks <= most[0] and block <= most[1], f"{more}: give the curriculum that the run learned"))
 
 
 def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
@@ -140,7 +140,7 @@ def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """
     if not are_graphs(tasks):
         return _said_by(tasks, "optimal_value", lambda task: task.optimal_value(1.0))
-    return torch.tensor([_known(optimal_value, task) for task in tasks], dtype=torch.float64, device="cpu")
+    return _numbers([_known(optimal_value, task) for task in tasks])
 
 
 def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
@@ -160,7 +160,7 @@ def lowest_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """Each task's return of a failure, of others than CT-graphs the lowest mean return, float64 [tasks]."""
     if not are_graphs(tasks):
         return _said_by(tasks, "return_bounds", lambda task: task.return_bounds[0])
-    return torch.tensor([task.fail_reward for task in tasks], dtype=torch.float64, device="cpu")
+    return _numbers([task.fail_reward for task in tasks])
 
 
 def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], float]) -> Tensor | Undefined:
@@ -173,9 +173,13 @@ def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], floa
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
     """Return a value of each task; the reason of the first that has none."""
     try:
-        return torch.tensor([value(task) for task in tasks], dtype=torch.float64, device="cpu")
+        return _numbers([value(task) for task in tasks])
     except ValueError as error:
         return Undefined(str(error))
+
+
+def _numbers(values: Sequence[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64, device="cpu")
 
 
 def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
@@ -191,11 +195,9 @@ def mastered_returns(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     if positive.all():
         return share * best
     worst = _of_each(partial(_known, worst_value), tasks) if are_graphs(tasks) else lowest_returns(tasks)
-    return (
-        worst
-        if isinstance(worst, Undefined)
-        else torch.where(positive, share * best, best - (1 - share) * (best - worst))
-    )
+    if isinstance(worst, Undefined):
+        return worst
+    return torch.where(positive, share * best, best - (1 - share) * (best - worst))
 
 
 def _known(value: Callable[[Task, float], float], task: Task) -> float:
@@ -210,35 +212,31 @@ def _curves(log: RunLog, curriculum: Curriculum) -> Curves:
     """The evaluation curves; where nothing was evaluated, one evaluation without values."""
     if any(not m.get("held_out") for m in log.of_kind("evaluation")):
         return log.curves(curriculum.trained)
-    return Curves(
-        torch.full((1, len(curriculum.tasks)), math.nan, dtype=torch.float64, device="cpu"),
-        (0,),
-        (0,),
-        curriculum.trained,
-    )
+    nothing = _numbers([math.nan] * len(curriculum.tasks)).unsqueeze(0)
+    return Curves(nothing, (0,), (0,), curriculum.trained)
 
 
 def _interval_best(log: RunLog, curriculum: Curriculum, best: Tensor | Undefined) -> Tensor | Undefined:
     """Return the optimum of the block that each interval ends in; NaN where tasks of a block differ in it."""
     if isinstance(best, Undefined):
         return best
-    of_task = best.tolist()
-    values = [{of_task[task] for task in block} for block in curriculum.trained]
-    alone = torch.tensor(
-        [each.pop() if len(each) == 1 else math.nan for each in values], dtype=torch.float64, device="cpu"
-    )
-    return alone[log.training("block").long() - 1]
+    alone = []
+    for block in curriculum.trained:
+        values = set(best[list(block)].tolist())
+        alone.append(values.pop() if len(values) == 1 else math.nan)
+    return _numbers(alone)[log.training("block").long() - 1]
 
 
 def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
     """Return the labels that the learner gave to tasks itself; undefined where it gave none."""
-    acted, ends, blocks = (log.training(name) for name in ("acted_label", "frames", "block"))
+    acted = log.training("acted_label")
+    ends = log.training("frames")
     if not len(acted) or acted.isnan().any():
         return Undefined("the learner gives tasks no labels of its own: it has no detector")
     trained = [block[0] if len(block) == 1 else SEVERAL for block in curriculum.trained]
     return Labelling(
         acted.long() - 1,
-        acted.new_tensor(trained).long()[blocks.long() - 1],
+        acted.new_tensor(trained).long()[log.training("block").long() - 1],
         ends.diff(prepend=ends.new_zeros(1)).long(),
         learned=log.training("learned") > 0,
         alarm=log.training("alarm") > 0,
@@ -249,23 +247,28 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
 
 def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
     """Return the intervals of each task in the block that trains it first, which must train no other."""
-    blocks, tasks = curriculum.trained, range(len(curriculum.tasks))
-    firsts = {task: i for i, block in reversed([*enumerate(blocks)]) for task in block}
-    first = [firsts[task] for task in tasks]
+    blocks = curriculum.trained
+    firsts: dict[int, int] = {}
+    for number, block in enumerate(blocks):
+        for task in block:
+            firsts.setdefault(task, number)
+    first = [firsts[task] for task in range(len(curriculum.tasks))]
     reason = None
-    if any(len(blocks[block]) > 1 for block in first):
+    if any(len(blocks[number]) > 1 for number in first):
         reason = "needs first blocks that train one task each"
     elif curriculum.protocol.boundaries == "hidden":
         reason = "needs announced boundaries: an episode of one task may end in the block of the next"
     if reason is not None:
         return dict.fromkeys(("first_frames", "first_episodes", "first_success_rates"), Undefined(reason))
-    starts, nothing = (0, *curriculum.ends), torch.empty(0, dtype=torch.float64, device="cpu")
-    names = ("frames", "episodes", "success_rate")
-    frames, episodes, success_rates = (log.training_by_block(name) for name in names)
+    starts = (0, *curriculum.ends)
+    nothing = _numbers([])
+    frames = log.training_by_block("frames")
+    episodes = log.training_by_block("episodes")
+    success_rates = log.training_by_block("success_rate")
     return {
-        "first_frames": [frames.get(block + 1, nothing) - starts[block] for block in first],
-        "first_episodes": [episodes.get(block + 1, nothing) for block in first],
-        "first_success_rates": [success_rates.get(block + 1, nothing) for block in first],
+        "first_frames": [frames.get(number + 1, nothing) - starts[number] for number in first],
+        "first_episodes": [episodes.get(number + 1, nothing) for number in first],
+        "first_success_rates": [success_rates.get(number + 1, nothing) for number in first],
     }
 
 

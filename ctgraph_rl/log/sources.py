@@ -187,19 +187,24 @@ def _needed(statements: Iterable[ast.stmt], name: str) -> list[ast.stmt]:
     return [each for each in mentions if each in kept]
 
 
+DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+
+
 def _defined(statement: ast.stmt) -> Iterator[str]:
     """Yield the names that a statement of a module defines, or may define, and of what it sets an attribute or item."""
-    if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+    if isinstance(statement, DEFINITIONS):
         yield statement.name
         return
     for node in ast.walk(statement):
         if isinstance(node, (ast.Attribute, ast.Subscript)) and isinstance(node.ctx, ast.Store):
-            yield from (each.id for each in [_root(node)] if isinstance(each, ast.Name))
+            root = _root(node)
+            if isinstance(root, ast.Name):
+                yield root.id
         if isinstance(node, ast.alias):
             yield (node.asname or node.name).partition(".")[0]
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id
-        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+        elif isinstance(node, DEFINITIONS):
             yield node.name
 
 

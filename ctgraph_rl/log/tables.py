@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ def require_parquet() -> None:
 
 def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[str, str]:
     """Type of each column; what else the log has follows as numbers, in the order of first appearance."""
-    names = dict.fromkeys(name for measurement in log.of_kind(kind) for name in measurement)
+    names = dict.fromkeys(chain(*log.of_kind(kind)))
     require((len(names) <= MOST_COLUMNS, f"a table of {len(names):,} columns, the limit is {MOST_COLUMNS}"))
     extra = {name: "double" for name in names if name != "kind" and name not in columns}
     return {name: type_ for name, (type_, _) in columns.items()} | extra
@@ -160,7 +161,7 @@ def _types(log: RunLog, kind: str, columns: dict[str, tuple[str, str]]) -> dict[
 
 def _rows(log: RunLog, kind: str, names: Sequence[str]) -> Iterator[list[Any]]:
     for row in log.rows(kind):
-        yield [row.get(name) for name in names]
+        yield list(map(row.get, names))
 
 
 def _parquet(arrow: Any, types: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> bytes:
@@ -169,7 +170,7 @@ def _parquet(arrow: Any, types: Mapping[str, str], rows: Sequence[Sequence[Any]]
 
     schema = arrow.schema([(name, arrow.type_for_alias(type_)) for name, type_ in types.items()])
     columns = zip(*rows, strict=True) if rows else ([] for _ in types)
-    values = [[utf8_text(value) for value in column] for column in columns]
+    values = [list(map(utf8_text, column)) for column in columns]
     buffer = io.BytesIO()
     parquet.write_table(arrow.table(values, schema=schema), buffer)
     return buffer.getvalue()

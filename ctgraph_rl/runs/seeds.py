@@ -30,8 +30,8 @@ JobAndPath = tuple[Any, Path]
 """A composed configuration and its directory."""
 
 
-def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
-    """Run a configuration, or where a sweep lists ``seeds`` the configuration with each of them in its directory.
+def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
+    """Run a configuration with each of the ``seeds`` that a sweep lists, in its directory.
 
     Args:
         cfg: the composed configuration, with the first seed.
@@ -45,10 +45,7 @@ def run_cells(cfg: Any, run_dir: Path) -> list[Path]:
         RuntimeError: if seeds have failed.
     """
     alone = "seeds is a setting of the jobs of a sweep: add -m, and give seed=0,1 in place of it"
-    require((config.in_sweep() or "seeds" not in cfg, alone))
-    if "seeds" not in cfg:
-        run_job(cfg, run_dir)
-        return [run_dir]
+    require((config.in_sweep(), alone))
     seeds = cfg.seeds
     are_seeds = isinstance(seeds, Sequence) and all(map(is_int, seeds)) and len({*seeds}) == len(seeds) > 0
     rule = f"seeds must be a list of different seeds that begins with seed={cfg.seed}, got {seeds}"

@@ -144,7 +144,7 @@ def test_for_a_compiled_step_zeros_without_a_share_fill_up_what_was_received(mak
     assert (len(plain.received), len(filled.received)) == (3, 4)
     torch.testing.assert_close(scores(filled), 0.4 * mine + 0.2 * received.sum(dim=0))
     torch.testing.assert_close(scores(filled), scores(plain))
-    torch.testing.assert_close(*(method.transform_gradients(gradients) for method in (filled, plain)))
+    torch.testing.assert_close(*(method.transform_gradients(gradients, []) for method in (filled, plain)))
     assert torch.equal(filled.get_extra_state()["received"], received)
 
 

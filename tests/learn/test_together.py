@@ -166,12 +166,12 @@ def of_all(group: SeedGroup, minibatches) -> tuple[dict[str, torch.Tensor], list
 
 
 def of_one(learner, minibatch) -> tuple[dict[str, torch.Tensor], list[torch.Tensor]]:
-    losses = learner.losses({key: wide(value) for key, value in minibatch.items()})
-    return losses, transformed(learner, torch.autograd.grad(total_loss(losses), learner.weights))
+    losses = learner.losses({key: wide(value) for key, value in minibatch.items()}, learner.weights)
+    return losses, transformed(learner, learner.weights, torch.autograd.grad(total_loss(losses), learner.weights))
 
 
-def transformed(learner, gradients) -> list[torch.Tensor]:
-    return list(learner.method.transform_gradients(gradients))
+def transformed(learner, weights, gradients) -> list[torch.Tensor]:
+    return list(learner.method.transform_gradients(gradients, weights))
 
 
 def wide(value: torch.Tensor) -> torch.Tensor:

@@ -53,15 +53,15 @@ class Importance(Method):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`."""
         super().setup(agent, weights, curriculum)
-        self.register_buffer("importance", torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
-        self.register_buffer("anchor", torch.zeros(len(weights), dtype=torch.float32, device="cpu"))
+        self.register_buffer("importance", weights.zeros())
+        self.register_buffer("anchor", weights.zeros())
         ids = curriculum.protocol.task_id != "hidden" and not multi_task_blocks(curriculum)
         if self.heads_setting == "multi" or (self.heads_setting == "auto" and ids):
             self.heads = Heads()
             self.heads.max_labels = self.max_labels
             self.heads.setup(agent, weights, curriculum)
-        everywhere = torch.ones(len(weights), dtype=torch.float32, device="cpu")
-        self.register_buffer("held", everywhere if self.heads is None else 1.0 - weights.in_heads.float())
+        in_heads = weights.zeros() if self.heads is None else weights.in_heads.float()
+        self.register_buffer("held", 1.0 - in_heads)
 
     def start_task(self, task: int | None) -> None:
         """Load the task's output layers."""
@@ -86,9 +86,9 @@ class Importance(Method):
         self.importance += new
         self.anchor.copy_(weights)
 
-    def penalties(self, batch: Data) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
         """Compute the penalty for distance."""
-        gap = self.weights.vector() - self.anchor
+        gap = flat(weights) - self.anchor
         return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
 
     def task_weights(self, task: int) -> Tensor | None:

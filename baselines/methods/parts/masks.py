@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -35,11 +34,15 @@ class Masks(TaskMethod):
     """
 
     stackable = True
+    counts = ("ended",)
     agent_members = (*TaskMethod.agent_members, "replace_optimiser")
 
     constant: Tensor  # c, float32 [P]
     scores: Tensor  # of tasks that have ended, by slot; float32 [tasks, P]
     own: nn.ParameterList  # the scores that are trained, float32 [n] of each weight tensor
+    betas: nn.Parameter  # b, of methods that combine scores, float32 [weight tensors, n]
+    places: Tensor  # the b that `combine` reads, int64 [n + 1]
+    offsets: Tensor  # added to them: 0, or -infinity, float32 [n + 1]
 
     def __init__(self, backbone_seed: int | None = None) -> None:
         super().__init__()
@@ -50,14 +53,13 @@ class Masks(TaskMethod):
     def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
         """See `Method`; the optimiser now trains the scores."""
         super().setup(agent, weights, curriculum)
-        named = zip(weights.names, weights.parameters, strict=True)
-        vectors = [name for name, each in named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
+        vectors = [name for name, each in weights.named if each.ndim < 2 and "bias" not in name.rpartition(".")[2]]
         rule = f"{type(self).__name__} masks weight matrices, and {', '.join(vectors)} are none"
         require((not vectors, f"{rule}: take another method, or a network without such layers"))
         self.ended = 0
         """Number of tasks whose scores are stored."""
 
-        scores = torch.zeros(self.num_tasks, len(weights), dtype=torch.float32, device="cpu")
+        scores = weights.zeros().repeat(self.num_tasks, 1)
         own = self.initial_scores()
         if self.backbone_seed is not None:
             with _seeded(self.backbone_seed):
@@ -102,6 +104,18 @@ class Masks(TaskMethod):
         drawn = self.initial_scores()
         self.set_scores(drawn if self.backbone_seed is None else self.weights.split(self.scores[self.slot]))
 
+    def set_places(self, places: Sequence[int], excluded: int, device: torch.device) -> None:
+        """Set which b `combine` reads, the last one for the own scores, and exclude the last of the others."""
+        none = [-torch.inf] * excluded
+        offsets = [0.0] * (len(places) - excluded - 1) + none + [0.0]
+        self.places = torch.tensor(places, device=device, dtype=torch.int64)
+        self.offsets = torch.tensor(offsets, device=device, dtype=torch.float32)
+
+    def combine(self, others: Tensor) -> Sequence[Tensor]:
+        """Combine other scores, [n, P], with the own ones, by the b of `set_places`."""
+        betas = self.betas.index_select(-1, self.places) + self.offsets
+        return list(map(combined, betas.unbind(-2), self.weights.split(others), self.own))
+
     def set_scores(self, scores: Sequence[Tensor]) -> None:
         """Set the trained scores to these values."""
         for own, value in zip(self.own, scores, strict=True):
@@ -115,7 +129,7 @@ class Masks(TaskMethod):
         self.set_scores(present)
         self.ended = max(self.ended, self.slot + 1)
 
-    def transform_gradients(self, gradients: Sequence[Tensor]) -> Sequence[Tensor]:
+    def transform_gradients(self, gradients: Sequence[Tensor], weights: Sequence[Tensor]) -> Sequence[Tensor]:
         """Compute the gradients of the trained parameters, through the scores."""
         with torch.enable_grad():
             scores = self.current_scores()
@@ -123,9 +137,12 @@ class Masks(TaskMethod):
         of_scores = [c * gradient.reshape(c.shape) for c, gradient in zip(constants, gradients, strict=True)]
         return torch.autograd.grad(scores, self.trainable, of_scores, materialize_grads=True)
 
-    def after_step(self) -> None:
+    @torch.no_grad()
+    def after_step(self, weights: Sequence[Tensor]) -> None:
         """Write the masked weights to the network."""
-        self._write()
+        masked = map(_masked, self.current_scores(), self.weights.split(self.constant))
+        for weight, part in zip(weights, masked, strict=True):
+            weight.copy_(part.view_as(weight))
 
     @torch.no_grad()
     def task_weights(self, task: int) -> Tensor | None:
@@ -146,18 +163,8 @@ class Masks(TaskMethod):
         self._write()
         self.agent.weights_changed()
 
-    @torch.no_grad()
     def _write(self) -> None:
-        self.weights.write_parts(list(map(_masked, self.current_scores(), self.weights.split(self.constant))))
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the slots of the tasks, and the number of those that have ended."""
-        return {**super().get_extra_state(), "ended": self.ended}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` returned."""
-        super().set_extra_state(state)
-        self.ended = state["ended"]
+        self.after_step(self.weights.parameters)
 
 
 class CombinedMasks(Masks):

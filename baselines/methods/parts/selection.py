@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from baselines.methods.mask_lc import MaskLC
-from baselines.methods.parts.masks import combined
 from baselines.methods.parts.weights import Weights
 from baselines.parts.embedding import (
     linear_wasserstein,
@@ -137,8 +136,6 @@ class SelectedMasks(MaskLC):
     """Whether `choose` reads the embeddings."""
 
     community: Tensor  # scores of the selected tasks, and of others with a share of 0, float32 [n, P]
-    places: Tensor  # their slots, and that of the new scores, int64 [n + 1]
-    offsets: Tensor  # added to their b: 0, or -infinity, float32 [n + 1]
 
     def __init__(
         self,
@@ -222,8 +219,7 @@ class SelectedMasks(MaskLC):
         """Compute the combination."""
         if not self.num_combined:
             return list(self.own)
-        betas = self.betas.index_select(-1, self.places) + self.offsets
-        return list(map(combined, betas.unbind(-2), self.weights.split(self.community), self.own))
+        return self.combine(self.community)
 
     def _gather(self, slots: list[int]) -> None:
         """Copy the scores of the selected tasks; some others fill up to 4, 16, 64 ..., as each number is compiled."""
@@ -232,14 +228,9 @@ class SelectedMasks(MaskLC):
             room *= 4
         others = [slot for slot in range(self.num_combined) if slot not in slots]
         filled = [*slots, *others][:room]
-        excluded = len(filled) - len(slots)
-        device = self.scores.device
         self.selected = list(slots)
         self.community = self.scores[filled]
-        self.places = torch.tensor([*filled, self.slot], device=device, dtype=torch.int64)
-        self.offsets = torch.tensor(
-            [0.0] * len(slots) + [-torch.inf] * excluded + [0.0], device=device, dtype=torch.float32
-        )
+        self.set_places([*filled, self.slot], len(filled) - len(slots), self.scores.device)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return what is selected, and all that selections depend on."""

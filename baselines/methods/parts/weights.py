@@ -8,7 +8,6 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-from baselines.parts.networks import places
 from ctgraph_rl.checks import require
 
 
@@ -29,21 +28,25 @@ class Weights:
         within = all(id(parameter) in names for parameter in parameters)
         require((within, "the weights of an agent must all be parameters of its policy"))
         self.names = [names[id(parameter)] for parameter in parameters]
-        self._places = places(policy, parameters)
+        self.parameters = list(parameters)
         self.head_names = head_names(policy)
 
     def __len__(self) -> int:
         return sum(self.sizes)
 
     @property
-    def parameters(self) -> list[nn.Parameter]:
-        """The present parameters, or what `torch.func.functional_call` has put in their places."""
-        return [getattr(*place) for place in self._places]
+    def named(self) -> list[tuple[str, nn.Parameter]]:
+        """Name and parameter of each."""
+        return list(zip(self.names, self.parameters, strict=True))
 
     @property
     def device(self) -> torch.device:
         """The parameters' device."""
         return self.parameters[0].device
+
+    def zeros(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return a zero for each number, [P] on the CPU."""
+        return torch.zeros(len(self), dtype=dtype, device="cpu")
 
     def vector(self) -> Tensor:
         """Return a copy of all values, float32 [P]; gradients flow back to the parameters."""
@@ -52,12 +55,7 @@ class Weights:
     @torch.no_grad()
     def write(self, vector: Tensor) -> None:
         """Set the parameters to the values of a vector, [P]."""
-        self.write_parts(self.split(vector))
-
-    @torch.no_grad()
-    def write_parts(self, parts: Sequence[Tensor]) -> None:
-        """Set each parameter to the values of its vector, [n] each."""
-        for parameter, part in zip(self.parameters, parts, strict=True):
+        for parameter, part in zip(self.parameters, self.split(vector), strict=True):
             parameter.copy_(part.view_as(parameter))
 
     def split(self, vector: Tensor) -> Sequence[Tensor]:
@@ -66,8 +64,7 @@ class Weights:
 
     def mask_of(self, names: Collection[str]) -> Tensor:
         """Return bool [P], true in the parameters with these names."""
-        named = zip(self.names, self.parameters, strict=True)
-        return flat([torch.full_like(value, name in names, dtype=torch.bool) for name, value in named])
+        return flat([torch.full_like(value, name in names, dtype=torch.bool) for name, value in self.named])
 
     @property
     def in_heads(self) -> Tensor:
@@ -77,13 +74,12 @@ class Weights:
     @property
     def in_head_parameters(self) -> list[nn.Parameter]:
         """The parameters of the output layers."""
-        named = zip(self.names, self.parameters, strict=True)
-        return [parameter for name, parameter in named if name in self.head_names]
+        return [parameter for name, parameter in self.named if name in self.head_names]
 
     @property
     def in_matrices(self) -> Tensor:
         """bool [P], true in weight matrices and false in biases."""
-        return self.mask_of([name for name, value in zip(self.names, self.parameters, strict=True) if value.ndim > 1])
+        return self.mask_of([name for name, value in self.named if value.ndim > 1])
 
     @torch.no_grad()
     def write_to(self, policy: TensorDictModuleBase, vector: Tensor) -> None:

@@ -71,10 +71,10 @@ def test_with_one_vector_nothing_depends_on_alpha():
 
     with torch.no_grad():
         its.alpha.fill_(-7.0)
-    its.after_step()
+    its.after_step(its.weights.parameters)
 
     assert torch.equal(network(attached), before)
-    assert not its.transform_gradients([torch.ones(3, 2), torch.ones(3)])[-1].any()
+    assert not its.transform_gradients([torch.ones(3, 2), torch.ones(3)], its.weights.parameters)[-1].any()
 
 
 def test_with_vectors_of_zeros_the_weights_are_those_of_the_first_task_and_the_own_vector():
@@ -86,7 +86,7 @@ def test_with_vectors_of_zeros_the_weights_are_those_of_the_first_task_and_the_o
         its.pool.zero_()
         for part, value in zip(its.own, its.weights.split(its.base + own), strict=True):
             part.copy_(value.view_as(part))
-    its.after_step()
+    its.after_step(its.weights.parameters)
 
     assert_close(network(attached), its.base + own)
 
@@ -102,7 +102,7 @@ def test_gradients_are_those_of_autograd():
     with torch.no_grad():
         its.alpha.copy_(alpha)
     parts = [part.view_as(each) for part, each in zip(its.weights.split(gradient), its.own, strict=True)]
-    found = its.transform_gradients(parts)
+    found = its.transform_gradients(parts, its.weights.parameters)
     assert_close(found[-1].double(), of_alpha, atol=1e-6, rtol=1e-5)
     assert_close(flat(found[:-1]).double(), of_own)
 

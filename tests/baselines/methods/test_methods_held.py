@@ -52,7 +52,7 @@ def softmax_fisher(agent: Tiny, observation: Tensor) -> Tensor:
 
 
 def gradient_of_penalty(attached: AgentWithMethod) -> Tensor:
-    losses = attached.method.penalties({})
+    losses = attached.method.penalties({}, attached.agent.weights)
     assert list(losses) == ["loss_method"]
     parts = torch.autograd.grad(losses["loss_method"], attached.agent.weights)
     return torch.cat([part.flatten() for part in parts])
@@ -327,7 +327,7 @@ def test_separate_ewc_is_the_sum_of_one_term_for_each_earlier_task():
         weights = move(attached, seed).requires_grad_()
         (expected,) = torch.autograd.grad(explicit(weights), weights)
         torch.testing.assert_close(gradient_of_penalty(attached), expected)
-        differences.append(explicit(weights) - attached.method.penalties({})["loss_method"])
+        differences.append(explicit(weights) - attached.method.penalties({}, attached.agent.weights)["loss_method"])
     torch.testing.assert_close(*differences)  # a constant, which no gradient has
 
 

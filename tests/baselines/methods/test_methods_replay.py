@@ -141,7 +141,7 @@ def test_the_memory_that_replay_asks_for_is_that_of_its_images_and_states(compos
 def test_cloning_loses_nothing_right_after_storing(compose, agent):
     attached, mixed, replayed = cloning(compose, agent)
 
-    losses = attached.method.penalties(mixed)
+    losses = attached.method.penalties(mixed, attached.agent.weights)
 
     names = ["loss_policy_cloning", "loss_value_cloning"] if agent != "dqn" else ["loss_value_cloning"]
     assert list(losses) == names
@@ -160,7 +160,7 @@ def test_cloning_losses_are_the_divergence_of_the_policies_and_the_squared_error
     attached, mixed, replayed = cloning(compose, agent, policy_coeff=0.5, value_coeff=3.0)
     change(attached)
 
-    losses = attached.method.penalties(mixed)
+    losses = attached.method.penalties(mixed, attached.agent.weights)
 
     now = attached.agent.outputs(replayed)
     old, new = (torch.distributions.Categorical(logits=each["log_probs"]) for each in (replayed, now))
@@ -177,7 +177,7 @@ def test_a_q_learner_clones_its_action_values(compose):
     attached, mixed, replayed = cloning(compose, "dqn", value_coeff=3.0)
     change(attached)
 
-    losses = attached.method.penalties(mixed)
+    losses = attached.method.penalties(mixed, attached.agent.weights)
 
     error = (replayed["action_value"] - attached.agent.values(replayed)) ** 2
     assert list(losses) == ["loss_value_cloning"] and error.shape == (6, 3)
@@ -203,7 +203,12 @@ def test_what_is_replayed_are_steps_that_were_seen_with_what_was_said_then(compo
 def test_every_gradient_step_replays_as_many_items_as_it_has_fresh_ones(compose):
     attached = with_method(compose, "ppo", CLEAR(buffer_size=64, policy_coeff=1.0, value_coeff=1.0))
     sizes, loss = Counter(), attached.method.penalties
-    attached.method.penalties = lambda batch: (sizes.update([len(batch["replay", "log_probs"])]), loss(batch))[1]
+
+    def counted(batch, weights):
+        sizes.update([len(batch["replay", "log_probs"])])
+        return loss(batch, weights)
+
+    attached.method.penalties = counted
 
     attached.learn(batches(attached, ONE, 1)[0])
 

@@ -105,3 +105,12 @@ def test_a_weight_that_the_policy_lacks_is_refused(compose):
 
     with pytest.raises(ValueError, match="the weights of an agent must all be parameters of its policy"):
         new_agent(CURRICULUM, with_another, 0)
+
+
+def test_a_hook_that_does_not_take_the_weights_is_refused(compose):
+    class Former(Method):
+        def after_step(self) -> None:
+            """As methods were written before."""
+
+    with pytest.raises(ValueError, match=r"Former\.after_step must take `weights`, those of the agent, as its last "):
+        learned(compose, Former, Former.agent_members)
