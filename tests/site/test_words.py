@@ -38,6 +38,14 @@ SENTENCES = {
     r"of (?:its|their) own": "separate; another",
     r"as (?:it is|they are)": "unchanged",
     r"alone": "only; without others",
+    r"says? so": "repeat what it says",
+    r"in vain": "without success",
+    r"and the like": "name them all, or one as an example",
+    r"on purpose": "leave it out",
+    r"(?:some|any)body": "you; others",
+    r"an? \w+ of (?:yours|mine|ours)": "your ...",
+    r"as any other(?: \w+)?": "leave it out, or say what is equal",
+    r"(?-i:(?:^|(?<=^- )|(?<=[.!] ))(?:How|Whether|Why) (?:[^?|\]\n]|\n(?!\n))*?\.(?=\s|$))": "subject, verb, object",
     r"(?-i:(?:^|(?<=^- )|(?<=[.:!] ))(?:What|That (?:the|a|no|each|this|it)) (?:[^?|\]\n]|\n(?!\n))*?\.(?=\s|$))": (
         "subject, verb, object"
     ),
@@ -143,6 +151,9 @@ def test_pages_name_who_does_what():
         ("What cannot be composed is refused.", ["What cannot be composed is refused."]),
         ("Rows differ. That no row ends is rare.", ["That no row ends is rare."]),
         ("What memory buys\n\n`alone` What is a frame? It says what changed.", []),
+        ("Files differ. Whether they matter is unknown.", ["Whether they matter is unknown."]),
+        ("A reward of yours fails in vain, and the log says so.", ["A reward of yours", "in vain", "says so"]),
+        ("How to stop\n\nMeasures: How deep a goal can be.", []),
     ],
 )
 def test_a_turn_of_phrase_is_found_in_prose_and_not_in_code_headings_or_questions(text, found):
