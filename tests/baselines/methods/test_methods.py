@@ -226,7 +226,8 @@ def test_agents_go_on_with_every_method_as_if_never_stopped(compose, agent, meth
     check_policies(its, whole)
 
 
-@pytest.mark.parametrize("method", others_slow(["ewc", "ewc_published", "mas"], "mas"))
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ewc", "mas"])
 def test_a_run_goes_on_from_the_end_of_a_block_that_has_shortened_the_sequences_that_are_kept(compose, method):
     its = life(compose, "lstm_ppo", method, "method.num_samples=64")
 
