@@ -10,6 +10,8 @@ from typing import Any
 from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.util.inspect import signature as signature_of
+from sphinx.util.inspect import stringify_signature
 from sphinx.util.nodes import make_refnode
 
 OUTSIDE = {
@@ -83,7 +85,13 @@ def as_text(app: Sphinx, what: str, name: str, obj: object, options: Any, lines:
 def with_plain_defaults(
     app: Sphinx, what: str, name: str, obj: object, options: Any, signature: str | None, returned: str | None
 ) -> tuple[str | None, str | None]:
-    """Write a default that a factory makes as ``...``: the whole signature could not be parsed else."""
+    """Write a default that a factory makes as ``...``: the whole signature could not be parsed else.
+
+    A class whose metaclass hides its arguments, as TorchRL's, gets those of its ``__init__``.
+    """
+    if what == "class" and signature == "(*args, **kwargs)":
+        own = signature_of(obj.__init__, bound_method=True)
+        signature = stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
     return signature and signature.replace("<factory>", "..."), returned
 
 

@@ -42,8 +42,20 @@ def test_every_page_of_docs_that_a_file_names_exists():
 def test_every_figure_of_a_page_has_a_text_in_its_place():
     silent = re.compile(r"!\[\s*\]\(|<img(?![^>]*\balt=\"[^\"])|```\{(?:image|figure)\}(?![^`]*:alt: \S)")
     pages = {page: page.read_text(encoding="utf-8") for page in PAGES if page.suffix == ".md"}
+    notebooks = [page for page in PAGES if page.suffix == ".ipynb"]
+    cells = [(page.name, cell) for page in notebooks for cell in json.loads(page.read_text(encoding="utf-8"))["cells"]]
+    drawn = [(name, cell) for name, cell in cells if '"image/png"' in json.dumps(cell.get("outputs", []))]
 
     assert [page for page, text in pages.items() if silent.search(text)] == []
+    assert len(drawn) >= 5
+    assert [name for name, cell in drawn if not cell["metadata"].get("mystnb", {}).get("image", {}).get("alt")] == []
+
+
+def test_links_have_titles_and_no_names_of_files_as_their_text():
+    named = re.compile(r"\[`?[\w./-]+\.(?:md|ipynb|html)`?\]\(")
+    pages = {page: page.read_text(encoding="utf-8") for page in PAGES if page.name != "CHANGELOG.md"}
+
+    assert {page.name: named.findall(text) for page, text in pages.items() if named.search(text)} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(CHECKOUT).as_posix() for path in PAGES])
