@@ -11,7 +11,7 @@ action 1, else 0. At each step, five times, with x the inputs and the last outpu
     y_i = tanh(1/2 sum over inputs and standard j of w_ji x_j),  m_i = tanh(1/2 sum over modulatory j of w_ji x_j),
     w_ji <- clip(w_ji + m_i r (A z_j y_i + B z_j + C y_i + D), -10, 10),  z the inputs and y without noise.
 
-Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 0.1 is 0 and stays 0. So do A to D,
+Weights from modulatory neurons stay. A gene g gives w = 10 g^3; a weight below 0.1 is 0 and stays 0. Likewise A to D,
 g^3 or 0 below 0.01, and r = 100 g^3. A life begins with these weights.
 
 After a generation the population is cut into segments at a random place. The best of a segment has all its children:

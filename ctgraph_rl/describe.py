@@ -28,6 +28,9 @@ from ctgraph_rl.visualize.similarity_figure import draw_similarity
 AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
 """An agent of this package and its rough speed on one core, for estimates of time."""
 
+SECONDS_OF_AN_ID = 4e-8
+"""Further seconds a frame for each number of a one-hot task id, which the agent reads, too."""
+
 UNKNOWN = "-"
 
 SIZES = ("states", "ends")
@@ -125,7 +128,7 @@ def _of_graphs(curriculum: Curriculum, frames_per_second: float | None) -> dict[
     bank, per_row = memory(curriculum)
     return {
         "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
-        "time": f"{_time(curriculum.num_frames, frames_per_second)}, an estimate without evaluations",
+        "time": f"{_time(curriculum, frames_per_second)}, an estimate without evaluations",
     }
 
 
@@ -133,11 +136,15 @@ def _graphs(curriculum: Curriculum) -> Sequence[Task]:
     return ct_graphs(curriculum.tasks, "this sheet")
 
 
-def _time(num_frames: int, frames_per_second: float | None) -> str:
+def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
     """Return how long the frames take at a rate; None: at the rate of `AGENT`, which is then named."""
-    rate = FRAMES_PER_SECOND if frames_per_second is None else frames_per_second
-    whose = f", the rate of agent={AGENT} on one core" if frames_per_second is None else ""
-    return f"{_duration(num_frames / rate)} at {rate:,.0f} frames/s{whose}"
+    if frames_per_second is not None:
+        return f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s"
+    protocol = curriculum.protocol
+    length = protocol.length(len(curriculum.tasks)) if protocol.task_id == "one_hot" else 0
+    rate = 1 / (1 / FRAMES_PER_SECOND + SECONDS_OF_AN_ID * length)
+    seconds = curriculum.num_frames / rate
+    return f"{_duration(seconds)} at {rate:,.0f} frames/s, the rate of agent={AGENT} on one core"
 
 
 def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
