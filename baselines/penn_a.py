@@ -21,7 +21,7 @@ and is individual 0. The autoencoder learns from what the population saw. The pa
 here standard or modulatory with equal probability, its genes uniform.
 
 A greedy evaluation plays the best individual, which is the result of evolution; the mean of the population has mutants
-that nobody would use, and training measures it. An evaluation that samples plays the population in turns.
+that are of no use, and training measures it. An evaluation that samples plays the population in turns.
 """
 
 from __future__ import annotations
