@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from ctgraph_rl import Recorder, RunLog
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.metrics import Undefined
-from ctgraph_rl.packages import taught_share
+from ctgraph_rl.packages import conf_dir, taught_share
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy, SearchPolicy
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
 from ctgraph_rl.profile.scoring import profile_scores, score_of
@@ -210,8 +211,11 @@ def test_a_recorded_run_is_scored_and_what_was_not_run_is_a_gap(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_trains_scores_and_draws(tmp_path):
-    words = ["profile", "agent=ppo", "seed=0,1", "curriculum.num_frames=10240", "hydra/launcher=basic"]
+def test_the_command_trains_an_agent_of_the_user_scores_and_draws(tmp_path):
+    own = tmp_path / "conf" / "agent" / "mine.yaml"
+    own.parent.mkdir(parents=True)
+    shutil.copy(Path(conf_dir(), "agent", "ppo.yaml"), own)
+    words = ["profile", "--config-dir", "conf", "agent=mine", "seed=0", "curriculum.num_frames=10240"]
     start = "from ctgraph_rl.cli import main; main()"
 
     done = subprocess.run([sys.executable, "-c", start, *words], cwd=tmp_path, capture_output=True, text=True)
