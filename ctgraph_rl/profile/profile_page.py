@@ -48,7 +48,8 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
     write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
     caption = f"{MEANING}{left_out(len(scores), MOST_AGENTS, 'agents')}"
-    drawn = Gallery(folder).write((), [CaptionedFigure("profile", "Profile", caption, _draw(scores, titles))])
+    figures = (CaptionedFigure("profile", "Profile", caption, _draw(each, titles)) for each in [scores])
+    drawn = Gallery(folder).write((), figures)  # which draws them in the report's style
     images = [f"![{each.alt}]({each.path})\n\n{each.caption}" for each in drawn]
     page = ["# Profile", *images, _markdown(scores, titles), *_gaps(scores)]
     write_whole(folder / "profile.md", "\n\n".join(page) + "\n")
@@ -91,7 +92,7 @@ def _gaps(scores: Profiles) -> Iterator[str]:
 def _draw(scores: Profiles, titles: Sequence[str]) -> Any:
     """Draw a radar, and bars with intervals in the order of the paper; a gap has neither corner nor bar."""
     figure = new_figure(WIDTH, 0.5 * WIDTH)
-    left, right = figure.add_gridspec(1, 2, wspace=0.75, left=0.04, right=0.98)
+    left, right = figure.add_gridspec(1, 2)
     radar = figure.add_subplot(left, projection="polar")
     bars = figure.add_subplot(right)
     numbers = list(range(1, len(titles) + 1))
@@ -109,7 +110,7 @@ def _draw(scores: Profiles, titles: Sequence[str]) -> Any:
     radar.set_ylim(0, 1)
     bars.set_yticks(numbers, [f"{number} {title}" for number, title in zip(numbers, titles, strict=True)])
     bars.set(xlim=(0, 1), xlabel="score", ylim=(len(titles) + 0.5, 0.5))
-    radar.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2)
+    figure.legend(loc="outside upper center", ncols=3)
     return figure
 
 
