@@ -8,8 +8,7 @@ it reaches the goal in 90 of 100 greedy episodes; the time of these evaluations 
 core. --cells measures only LSTM-PPO, with each cell in place of the LSTM. Ctrl-C ends a measurement, and what was
 measured until then is printed.
 
---device cuda measures benchmarks.agent_ladder instead, --startup how long a run takes to its first step,
-beside the bare imports of torch and torchrl; --roofline how fast its matrix products are, which bound it.
+--device cuda measures benchmarks.agent_ladder instead.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -29,7 +28,7 @@ from rich.console import Console
 from rich.progress import track
 
 from baselines.parts.catalogue import CatalogueEntry, catalogue
-from benchmarks import agent_ladder, roofline, startup
+from benchmarks import agent_ladder
 from benchmarks.environment_ladder import climbed, found, until
 from benchmarks.environment_ladder import table as ladder_table
 from benchmarks.environments import machine
@@ -37,6 +36,7 @@ from ctgraph_rl import CTGraphEnv, Task, evaluate
 from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.collect import collect
+from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_su_b1
 
 ROWS = 256
@@ -183,13 +183,13 @@ def table(measured: list[Contender]) -> str:
         (one.agent, one.task): statistics.median(one.speeds) for one in measured if one.who == "ours" and one.speeds
     }
     measured = [one for one in measured if one.speeds and (one.agent, one.task) in ours]
-    lines = ["| agent | task | who | frames/s | ours is | frames to 90 % | seconds to 90 % |", "|---" * 7 + "|"]
+    rows = []
     for one in measured:
         speed = statistics.median(one.speeds)
         ratio = "" if one.who == "ours" else f"{ours[one.agent, one.task] / speed:.1f} x"
-        cells = [one.agent, one.task, one.who, f"{speed:,.0f}", ratio, *_solved(one.solved)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([one.agent, one.task, one.who, f"{speed:,.0f}", ratio, *_solved(one.solved)])
+    head = ("agent", "task", "who", "frames/s", "ours is", "frames to 90 %", "seconds to 90 %")
+    return markdown_table(head, rows)
 
 
 def _solved(found: list[tuple[int, float] | None]) -> tuple[str, str]:
@@ -212,17 +212,6 @@ def on_device(device: torch.device, options: argparse.Namespace) -> str:
     return f"{machine(device)}; medians of {options.rounds} rounds\n\n{ladder_table(rows, agent_ladder.ENVIRONMENT)}"
 
 
-def beside_products(agents: list[str], rounds: int) -> str:
-    """Format how fast agents learn, LSTM-PPO also with pixel noise, beside only their matrix products."""
-    task = ct_su_b1(GOAL)
-    noisy = replace(task, observations=replace(task.observations, read_noise=10))
-    pairs = [*((name, label, TASKS[label]) for name, label in PAIRS), ("lstm_ppo", "CT-SU-B1, noise", noisy)]
-    learners = [(name, label, Ours(name, task, 0).learn) for name, label, task in pairs if name in agents]
-    for *_, learn in learners:
-        learn()
-    return roofline.table(learners, rounds)
-
-
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     """Return the options of the command line.
 
@@ -240,12 +229,10 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--max-frames", type=int, default=500_000, help="frames after which a task counts as not solved"
     )
-    parser.add_argument("--startup", action="store_true", help="instead: the time of a run until its first step")
     parser.add_argument("--limit", type=float, default=3600.0, help="seconds after which no measurement begins")
     parser.add_argument("--device", default=None, help="instead: PPO and LSTM-PPO on one device, such as cuda")
     parser.add_argument("--rows", type=int, nargs="+", default=[4096, 65536], help="with --device: environments")
     parser.add_argument("--together", type=int, nargs="*", default=[64, 1024], help="with --device: seeds of one job")
-    parser.add_argument("--roofline", action="store_true", help="instead: learning beside only its matrix products")
     options = parser.parse_args(arguments)
     require(
         *at_least_one(rounds=options.rounds, max_frames=options.max_frames),
@@ -262,14 +249,8 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
     options = _options(arguments)
-    if options.startup:
-        print(f"{machine()}; medians of {options.rounds} rounds\n\n{startup.table(options.rounds)}")
-        return
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    if options.roofline:
-        print(f"{machine()}; medians of {options.rounds} rounds\n\n{beside_products(options.agents, options.rounds)}")
-        return
     if options.device:
         print(on_device(checked_device(options.device), options))
         return

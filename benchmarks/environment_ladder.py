@@ -26,6 +26,7 @@ from ctgraph_rl.core.region import WARM_UP, Region
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.core.tree import is_done
 from ctgraph_rl.env import CTGraphEnv
+from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.task import Task
 
 T = TypeVar("T")
@@ -282,7 +283,7 @@ def found(measured: Sequence[Rung], yardstick: str = COPY) -> list[dict[str, Any
 
 def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
     """Format what `found` returns in Markdown, each row with its ratio to the yardstick and its share of the goal."""
-    lines = [f"| rows | task | way | M/s | / {yardstick} | / goal |", "|---|---|---|---|---|---|"]
+    lines = []
     for row in rows:
         numbers = [row.get("failure", ""), "", ""]
         if "per_second" in row:
@@ -291,5 +292,5 @@ def table(rows: Sequence[Mapping[str, Any]], yardstick: str = COPY) -> str:
             goal = row["goal"]
             share = "" if goal is None else f"{speed / goal:.2g} of {goal / 1e6:,.3g}M"
             numbers = [f"{speed / 1e6:.4g}", "" if ratio is None else f"{ratio:.2g}", share]
-        lines.append(f"| {row['rows']:,} | {row['task']} | {row['way']} | {' | '.join(numbers)} |")
-    return "\n".join(lines)
+        lines.append([f"{row['rows']:,}", row["task"], row["way"], *numbers])
+    return markdown_table(("rows", "task", "way", "M/s", f"/ {yardstick}", "/ goal"), lines)

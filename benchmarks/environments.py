@@ -16,9 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 
-import gymnasium
 import torch
 from rich.console import Console
 from rich.progress import track
@@ -37,6 +35,7 @@ from ctgraph_rl.checks import at_least_one, positive, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.gym import CTGraphGymEnv, CTGraphVectorEnv
+from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.tasks.configurations import ct_co_b1, ct_su_b1
 from ctgraph_rl.tasks.task import Task
 
@@ -61,12 +60,9 @@ def configurations() -> dict[str, Task]:
         observations=replace(confounding.observations, read_rotation=10),
     )
     tasks = {"SU": ct_su_b1(), "CO": confounding}
-    noisy = {f"{name}, noise 10": _with_noise(task) for name, task in tasks.items()}
-    return tasks | noisy
-
-
-def _with_noise(task: Task) -> Task:
-    return replace(task, observations=replace(task.observations, read_noise=10))
+    for name, task in tuple(tasks.items()):
+        tasks[f"{name}, noise 10"] = replace(task, observations=replace(task.observations, read_noise=10))
+    return tasks
 
 
 @dataclass
@@ -216,30 +212,17 @@ def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Ca
 
     yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run_batch
     if num_rows == 1:
-        yield f"Gymnasium Env{SUFFIX[kernel]}", _single(CTGraphGymEnv(task, kernel=kernel))
+        env = CTGraphGymEnv(task, kernel=kernel)
+        choices = torch.randint(0, 3, (256,), device="cpu").tolist()
+        env.reset(seed=0)
 
+        def run() -> int:
+            for choice in choices:
+                if env.step(choice)[2]:
+                    env.reset()
+            return len(choices)
 
-def _single(env: gymnasium.Env) -> Callable[[], int]:
-    """Steps of any Gymnasium environment with random actions."""
-    actions = torch.randint(0, 3, (256,), device="cpu").tolist()
-    env.reset(seed=0)
-
-    def run() -> int:
-        for action in actions:
-            if env.step(action)[2]:
-                env.reset()
-        return len(actions)
-
-    return run
-
-
-def _authors() -> Iterator[tuple[str, Callable[[], int]]]:
-    """The authors' environment, where the user has installed it; its own default configuration."""
-    if find_spec("gym_CTgraph") is None:
-        return
-    import gym_CTgraph  # type: ignore[import-not-found]  # noqa: F401
-
-    yield "the authors' environment", _single(gymnasium.make("CTgraph-v1"))
+        yield f"Gymnasium Env{SUFFIX[kernel]}", run
 
 
 def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Way]:
@@ -262,13 +245,12 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
                     make = partial(CTGraphEnv, [task] * n, check_actions=False, kernel=kernel, info=info)
                     add(name, n, _torchrl(make, suffix=suffix + SUFFIX[kernel]))
                 add(name, n, _gymnasium(task, n, kernel))
-    add("", 1, _authors())
     return found
 
 
 def table(measured: list[Way]) -> str:
     """Medians in Markdown, with their spread over the rounds and their ratios to the yardsticks of the same rows."""
-    lines = ["| rows | task | way | M obs/s | spread | / memcpy | / trivial |", "|---|---|---|---|---|---|---|"]
+    rows = []
     median = {(one.num_rows, one.configuration, one.name): statistics.median(one.speeds) for one in measured}
     for one in measured:
         speed = statistics.median(one.speeds)
@@ -284,8 +266,8 @@ def table(measured: list[Way]) -> str:
             f"{speed / yardstick:.2g}" if yardstick else "",
             f"{speed / trivial:.2f}" if trivial else "",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return markdown_table(("rows", "task", "way", "M obs/s", "spread", "/ memcpy", "/ trivial"), rows)
 
 
 def machine(device: torch.device | None = None) -> str:

@@ -20,6 +20,7 @@ import torch
 
 from ctgraph_rl.describe import describe
 from ctgraph_rl.learn.rules import check_rows
+from ctgraph_rl.log.escape import markdown_table
 from ctgraph_rl.log.files import LOG, METRICS
 from ctgraph_rl.log.run_log import RunLog, write_metrics
 from ctgraph_rl.log.scores import scores
@@ -165,7 +166,7 @@ def measured(sizes: Sequence[int]) -> list[Cost]:
 
 def table(costs: Sequence[Cost]) -> str:
     """Format costs in Markdown."""
-    lines = ["| reader | size | seconds | exponent | MB at once | exponent |", "|---" * 6 + "|"]
+    rows = []
     for cost in costs:
         cells = [
             cost.name,
@@ -175,5 +176,5 @@ def table(costs: Sequence[Cost]) -> str:
             " / ".join(f"{peak / 1e6:.2g}" for peak in cost.peaks),
             f"{cost.exponent(cost.peaks):.1f}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append(cells)
+    return markdown_table(("reader", "size", "seconds", "exponent", "MB at once", "exponent"), rows)

@@ -16,7 +16,7 @@ import re
 import stat
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -25,6 +25,7 @@ from typing import Any
 import yaml
 
 from ctgraph_rl.checks import is_shallow, require
+from ctgraph_rl.disk import read_regular
 
 MAX_NESTING = 32
 """Most objects and lists within each other."""
@@ -84,6 +85,36 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
         raise ValueError(f"nested more than {nesting} deep") from None
     require((is_shallow(value, nesting), f"nested more than {nesting} deep"))
     return value
+
+
+def json_object(
+    path_or_dict: str | os.PathLike[str] | Mapping[str, Any], name: str, most: int, nesting: int = MAX_NESTING
+) -> tuple[str, Mapping[str, Any]]:
+    """Return the name of a source for errors, and the object of JSON that it holds.
+
+    Args:
+        path_or_dict: a file, or its content.
+        name: of a content without a file.
+        most: bytes of a file.
+        nesting: most objects and lists within each other.
+
+    Raises:
+        ValueError: for a file that cannot be read, or holds something else.
+    """
+    if isinstance(path_or_dict, Mapping):
+        return name, path_or_dict
+    is_path = isinstance(path_or_dict, (str, os.PathLike))
+    require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
+    try:
+        data = read_regular(path_or_dict, most)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
+    try:
+        content = json_value(data, finite=False, nesting=nesting)
+    except ValueError as error:
+        raise ValueError(f"{path_or_dict}: must be JSON: {error}") from error
+    require((isinstance(content, dict), f"{path_or_dict}: must hold a JSON object, got {type(content).__name__}"))
+    return str(path_or_dict), content
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

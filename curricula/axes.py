@@ -73,7 +73,9 @@ def goals_sharing(tasks: OneOrMore, num_decisions: int) -> Tasks:
         b = task.graph.branching_factor
         d = task.graph.depth
         require((is_int(num_decisions, 0, d), f"num_decisions must be in 0..{d}, the depth, got {num_decisions!r}"))
-        _check_number(b ** (d - num_decisions))
+        count = b ** (d - num_decisions)
+        fix = f"at most {MOST_TASKS}; use random_goals for a sample"
+        require((count <= MOST_TASKS, f"{count} tasks are too many: {fix}"))
         ends = itertools.product(range(1, b + 1), repeat=d - num_decisions)
         return (replace(task, goal=task.goal[:num_decisions] + end) for end in ends)
 
@@ -201,7 +203,13 @@ def growing_depth(tasks: OneOrMore, depths: Iterable[int], nested: bool = True) 
         deepest = task.graph.depth
         bad = [depth for depth in listed if not is_int(depth, 1, deepest)]
         require((not bad, f"depths must be in 1..{deepest}, the depth of the task, got {bad}; give a deeper task"))
-        return [_cut(task, depth, nested) for depth in listed]
+        made = []
+        for depth in listed:
+            goal = task.goal[:depth]
+            if not nested and depth < deepest:
+                goal = (*goal[:-1], goal[-1] % task.graph.branching_factor + 1)
+            made.append(replace(task, graph=replace(task.graph, depth=depth), goal=goal))
+        return made
 
     return each(tasks, vary)
 
@@ -287,10 +295,6 @@ def random_tasks(
     return tuple(different(num_tasks, lambda: _random_task(choices, source)))
 
 
-def _check_number(count: int) -> None:
-    require((count <= MOST_TASKS, f"{count} tasks are too many: at most {MOST_TASKS}; use random_goals for a sample"))
-
-
 def _check_draws(name: str, wanted: object, available: int) -> None:
     most = min(available, MOST_TASKS)
     require((is_int(wanted, 1, most), f"{name} must be in 1..{most}, as many as differ, got {wanted!r}"))
@@ -306,13 +310,6 @@ def _random_task(choices: Sequence[Sequence[Any]], source: random.Random) -> Tas
     observations = observations_of(graph, kind)
     goal = _random_goal(graph, source)
     return Task(graph, goal, observations, PaperImages(observations.last_id + 1, seed))
-
-
-def _cut(task: Task, depth: int, nested: bool) -> Task:
-    goal = task.goal[:depth]
-    if not nested and depth < task.graph.depth:
-        goal = (*goal[:-1], goal[-1] % task.graph.branching_factor + 1)
-    return replace(task, graph=replace(task.graph, depth=depth), goal=goal)
 
 
 def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Observations:

@@ -27,7 +27,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Protocol
 from ctgraph_rl.tasks.reference import read_task
 from ctgraph_rl.tasks.task import Task
-from curricula.order import MOST_TASKS, Tasks, sequence
+from curricula.order import MOST_TASKS, sequence
 from curricula.published import one_id_each
 
 MOST_BYTES = 4 * 2**20
@@ -66,7 +66,10 @@ def from_meta_json(path: str | PathLike[str], num_frames: int | Sequence[int], n
         environments = [read_environment(_within(file.parent, config)) for config in meta["config_paths"]]
         pool = Pool([environment["graph"].num_end_states for environment in environments], meta["task_order"])
         numbers = _chosen(meta, pool.size)
-        tasks = tuple(_task(environments[config], leaf) for config, leaf in map(pool.at, numbers))
+        tasks = []
+        for config, leaf in map(pool.at, numbers):
+            graph = environments[config]["graph"]
+            tasks.append(Task(**environments[config] | {"goal": graph.path(graph.num_decision_states + leaf)}))
         source = f"meta-JSON file {file.name}"
         protocol = _labels(meta, tasks, numbers)
         return sequence(name or file.stem, tasks, num_frames, version=1, source=source, protocol=protocol)
@@ -110,11 +113,6 @@ def read_environment(path: Path) -> dict[str, Any]:
         return read_task(content, ())
 
 
-def _task(environment: dict[str, Any], leaf: int) -> Task:
-    graph = environment["graph"]
-    return Task(**{**environment, "goal": graph.path(graph.num_decision_states + leaf)})
-
-
 def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
     """The numbers of the tasks in the order of the curriculum."""
     listed = meta.get("filter_tasks")
@@ -128,22 +126,16 @@ def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
     return numbers
 
 
-def _labels(meta: dict[str, Any], tasks: Tasks, numbers: list[int]) -> Protocol:
-    labels = _label_of_each(meta, numbers)
+def _labels(meta: dict[str, Any], tasks: Sequence[Task], numbers: list[int]) -> Protocol:
+    by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
+    labels = meta.get("task_label_ids", list(range(len(numbers))) if by_place else numbers)
     length = meta["label_dim"]
     require(
         (len(labels) == len(tasks), f"task_label_ids must be one for each of {len(tasks)} tasks, got {len(labels)}"),
         (max(labels) < length, f"label_dim must be at least {max(labels) + 1}, one more than a label, got {length}"),
     )
-    ids = tuple(one_id_each(tasks, labels).values())
+    ids = tuple(one_id_each(tuple(tasks), labels).values())
     return Protocol("one_hot", num_task_ids=length, task_ids=ids)
-
-
-def _label_of_each(meta: dict[str, Any], numbers: list[int]) -> list[int]:
-    if "task_label_ids" in meta:
-        return meta["task_label_ids"]
-    by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
-    return list(range(len(numbers))) if by_place else numbers
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -35,7 +35,6 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
-    ("benchmarks.startup", "TemporaryDirectory"): "a new folder",
     ("benchmarks.sizes", "TemporaryDirectory"): "a folder of its own",
     ("ctgraph_rl.board.isolate", "os.open"): "reads a folder",
     ("ctgraph_rl.board.submit", "yaml.dump"): "into a text",

@@ -259,11 +259,12 @@ def _observation_spec(space: Any, shape: tuple[int, ...]) -> Any:
 def _action_spec(space: Any, num_rows: int) -> Any:
     if hasattr(space, "n"):
         return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64, device="cpu")
-    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        return Unbounded(shape=(num_rows, *space.shape), dtype=torch.float32, device="cpu")
-    low = torch.tensor(space.low, dtype=torch.float32, device="cpu").expand(num_rows, *space.shape)
-    high = torch.tensor(space.high, dtype=torch.float32, device="cpu").expand(num_rows, *space.shape)
-    return Bounded(low, high, shape=(num_rows, *space.shape), dtype=torch.float32, device="cpu")
+    shape = (num_rows, *space.shape)
+    if not np.isfinite([space.low, space.high]).all():
+        return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
+    ends = torch.tensor(np.stack([space.low, space.high]), dtype=torch.float32, device="cpu")
+    low, high = (end.expand(shape) for end in ends)
+    return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 
 def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:

@@ -115,7 +115,7 @@ def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -
     return ObservationParams(
         first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
         first_view=table(lambda task, kind: bank.start[bank_key(task)] + _first_view(task, kind)),
-        views_per_node=table(_views_per_node),
+        views_per_node=table(lambda task, kind: _num_views(task) * _is_by_node(task, kind)),
         num_ids=table(_num_ids),
         bank_start=bank_start,
         num_views=each(list(map(_num_views, tasks))),
@@ -146,11 +146,6 @@ def _first_view(task: Task, kind: StateType) -> int:
     """Return the first view of a kind of state, counted from that of the task."""
     skipped = task.graph.num_decision_states if kind == StateType.END and _is_by_node(task, kind) else 0
     return (task.observations.ids(kind)[0] - skipped) * _num_views(task)
-
-
-def _views_per_node(task: Task, kind: StateType) -> int:
-    """Return how many views lie between those of two nodes; 0 where nodes have no views."""
-    return _num_views(task) * _is_by_node(task, kind)
 
 
 def _num_ids(task: Task, kind: StateType) -> int:
@@ -186,7 +181,6 @@ def _legacy_index(
 
 def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
     changes = [task.goal_change or (0, 0) for task in tasks]
-    pairs = list(zip(tasks, changes, strict=True))
     return RewardParams(
         depth=each([task.graph.depth for task in tasks]),
         num_leaves=each([task.graph.num_end_states for task in tasks]),
@@ -198,7 +192,7 @@ def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[
         multiplicative=each([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
         change_first=each([first for first, _ in changes]),
         change_last=each([last for _, last in changes]),
-        legacy_change=each([task.legacy_goal_change and change[0] > 0 for task, change in pairs], torch.bool),
+        legacy_change=each([task.legacy_goal_change and bool(task.goal_change) for task in tasks], torch.bool),
     )
 
 

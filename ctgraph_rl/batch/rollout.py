@@ -86,16 +86,12 @@ def rollout(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps, kernel: str
     require((is_policy, f"policy must be a function or a tensor of actions, got {type(policy).__name__}"))
     if isinstance(policy, Tensor):
         _check_actions(rows, policy, steps.action.shape)
-    rows.state = _native(rows, policy, steps) if _uses_kernel(rows, kernel) else _tensors(rows, policy, steps)
-    return steps
-
-
-def _uses_kernel(rows: Rows, kernel: str) -> bool:
-    """Return whether the kernel takes the steps; refuse that it cannot where it must."""
     require(kernel_rule(kernel))
     if kernel == "required":
         require_kernel(rows.uses.reward_fns, rows.device)
-    return kernel == "required" or (kernel == "auto" and rows.uses_kernel)
+    is_native = kernel == "required" or (kernel == "auto" and rows.uses_kernel)
+    rows.state = _native(rows, policy, steps) if is_native else _tensors(rows, policy, steps)
+    return steps
 
 
 def _native(rows: Rows, policy: TensorPolicy | Tensor, steps: Steps) -> RowState:

@@ -35,15 +35,12 @@ def _place(task: Task, kind: int, node: int, goal_leaf: int, step_count: int) ->
     graph = task.graph
     goal, way = (" ".join(map(str, graph.path(at))) for at in (graph.num_decision_states + goal_leaf, node))
     place = f"{StateType(kind).name.lower()} state" + (f" after {way}" if way else "")
-    return f"{place}, step {step_count}, goal {goal}{_swap(task)}"
-
-
-def _swap(task: Task) -> str:
+    text = f"{place}, step {step_count}, goal {goal}"
     if task.swapped_branches is None:
-        return ""
+        return text
     path, (first, second) = task.swapped_branches
     at = f"after {' '.join(map(str, path))}" if path else "at the first decision"
-    return f", {first} and {second} swapped {at}"
+    return f"{text}, {first} and {second} swapped {at}"
 
 
 def _blocks(observation: NDArray[np.uint8], white: int) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 from ctgraph_rl.board.rerun import Rerun, RerunCell, check_of_scores, job_of, score_name, score_of
 from ctgraph_rl.board.rescore import Check, of_the_protocol
 from ctgraph_rl.board.submission import Submission
+from ctgraph_rl.board.tracks import HELD_OUT_SEEDS, drawn, held_out_seeds
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CURRICULUM
@@ -25,15 +26,11 @@ from ctgraph_rl.tasks.curriculum_json import file_text
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.task import Task
 
-SEEDS = range(10**6, 2**31)
-"""Seeds that a verifier draws from, of runs and of images, where no track says otherwise."""
-
-
 HELD_OUT = LEVELS[2]
 
 
 def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]:
-    """Return the seeds that a verifier's number draws: by the rule of the track, or from `SEEDS`.
+    """Return the seeds that a verifier's number draws: by the rule of the track, or from `HELD_OUT_SEEDS`.
 
     Args:
         submission: for which.
@@ -42,9 +39,7 @@ def seeds_of(submission: Submission, number: int, count: int) -> tuple[int, ...]
     """
     if submission.track is not None:
         return submission.track.draw_held_out_seeds(submission.digest, number, count)
-    texts = (f"{submission.digest} {number} {place}" for place in range(2 * count + 100))
-    seeds = dict.fromkeys(SEEDS[drawn(text, len(SEEDS))] for text in texts)
-    return tuple(seeds)[:count]
+    return held_out_seeds(f"{submission.digest} {number}", count)
 
 
 def held_out_cells(submission: Submission, number: int, count: int, folder: Path) -> list[RerunCell]:
@@ -100,11 +95,6 @@ def _of_the_protocol(submission: Submission, curriculum: Curriculum, seed: int, 
     return [check._replace(level=HELD_OUT) for check in checks]
 
 
-def drawn(text: str, most: int) -> int:
-    """Return an integer in [0, most) that follows from a text by SHA-256; the first 8 bytes modulo ``most``."""
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % most
-
-
 def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
     """Return a curriculum with other images and goals, and all else alike: what its tasks share, they share still.
 
@@ -132,7 +122,7 @@ def other_task(task: Task, key: str) -> Task:
     """Return a task with other images and another goal; see `other_curriculum`."""
     changed: dict[str, Any] = {"goal": renamed(task.goal, task.graph.branching_factor, key)}
     if task.image_seed is not None:
-        seed = SEEDS[drawn(f"{key} images {task.image_seed}", len(SEEDS))]
+        seed = HELD_OUT_SEEDS[drawn(f"{key} images {task.image_seed}", len(HELD_OUT_SEEDS))]
         changed["images"] = replace(task.images, seed=seed)  # type: ignore[type-var]
     if task.swapped_branches is not None:
         path, pair = task.swapped_branches

@@ -135,12 +135,21 @@ def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
             f"code.repository must be an address, or {OURS}, got {repository!r:.80}",
         ),
         (_matches(COMMIT, commit), f"code.commit must be 7 to 40 hexadecimal digits, in quotes, got {commit!r:.80}"),
-        _entry_rule(method["entry_point"]),
+        (
+            method["entry_point"] is None or _matches(ENTRY_POINT, method["entry_point"]),
+            f"entry_point must be module:function, such as my_learner:train, got {method['entry_point']!r:.80}",
+        ),
         (is_int(track_version(method), 1), f"track_version must be an integer >= 1, got {track_version(method)!r:.80}"),
         _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
         _count_rule("bytes_per_task", method["bytes_per_task"]),
         (whole, f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),
-        *(_hours_rule(key, compute[key]) for key in ("hours", "tuning_hours")),
+        *(
+            (
+                compute[key] is None or is_real(compute[key], 0),
+                f"compute.{key} must be a number >= 0 or null, got {compute[key]!r:.80}",
+            )
+            for key in ("hours", "tuning_hours")
+        ),
         (reasons, f"failed must have a reason for each seed, such as {{3: out of memory}}, got {failed!r:.80}"),
     ]
 
@@ -158,18 +167,9 @@ def _text_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, s
     return _is_text(value) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
 
-def _entry_rule(value: object) -> tuple[bool, str]:
-    fits = value is None or _matches(ENTRY_POINT, value)
-    return fits, f"entry_point must be module:function, such as my_learner:train, got {value!r:.80}"
-
-
 def _count_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, str]:
     choice = "an integer >= 0 or null" if or_null else "an integer >= 0"
     return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
-
-
-def _hours_rule(key: str, value: object) -> tuple[bool, str]:
-    return value is None or is_real(value, 0), f"compute.{key} must be a number >= 0 or null, got {value!r:.80}"
 
 
 def completed(method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -216,7 +216,6 @@ def fact_rules(
     """
     said = method["given"]
     hours = method["compute"]["hours"]
-    pairs = [(key, said[key], value) for key, value in facts["given"].items() if said[key] is not None]
     logged = facts["compute"]["hours"]
     near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
     kept = method["bytes_per_task"] * (num_tasks - 1)
@@ -227,8 +226,11 @@ def fact_rules(
     less = f"bytes_per_task is {further}, {all_kept}, the agents of the runs have {largest:,} bytes in all: correct it"
     return [
         *(
-            (value == known, f"given.{key} is {value!r}, the runs were given {known!r}: write null, or that")
-            for key, value, known in pairs
+            (
+                said[key] in (None, known),
+                f"given.{key} is {said[key]!r}, the runs were given {known!r}: write null, or that",
+            )
+            for key, known in facts["given"].items()
         ),
         (near, f"compute.hours is {hours}, the logs of the runs have {logged}: write null, or that"),
         (fits, less),

@@ -121,15 +121,13 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
         drawn: the runs.
         folder: where each process has a folder.
     """
-    groups = dict.fromkeys(run.group or (run.seed,) for run in drawn)
-    return [_cell(submission, seeds, folder / f"seed{'-'.join(map(str, seeds))}") for seeds in groups]
-
-
-def _cell(submission: Submission, seeds: tuple[int, ...], folder: Path) -> RerunCell:
-    """Return what is learned again for the seeds of a group, or for a single seed."""
-    runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
-    job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
-    return RerunCell(folder, job, runs, submission.curriculum, seconds=max(run.seconds for run in runs))
+    cells = []
+    for seeds in dict.fromkeys(run.group or (run.seed,) for run in drawn):
+        own = folder / f"seed{'-'.join(map(str, seeds))}"
+        runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
+        job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
+        cells.append(RerunCell(own, job, runs, submission.curriculum, max(run.seconds for run in runs)))
+    return cells
 
 
 def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> tuple[tuple[int, tuple[int, ...]], ...]:
@@ -186,20 +184,16 @@ def learn_again(
         return Outcome(0, None, 0.0, "")
     if cell.job.entry_point is not None:
         for run_dir in cell.run_dirs:
-            _remove(run_dir)
+            try:
+                shutil.rmtree(run_dir, ignore_errors=True)
+            except RecursionError:
+                fix = "has too many folders within each other to remove: rm -r it yourself"
+                raise ValueError(f"{run_dir} {fix}") from None
     _with_its_curriculum(cell).write(cell.folder / JOB)
     variables = VARIABLES if is_portable(cell.job.config) else {}
     return run_isolated(
         MODULE, [JOB], cell.folder, limits, isolated=isolated, paths=paths, variables=variables, watch=watch
     )
-
-
-def _remove(run_dir: Path) -> None:
-    """Remove what an entry point has left of a run that was stopped."""
-    try:
-        shutil.rmtree(run_dir, ignore_errors=True)
-    except RecursionError:
-        raise ValueError(f"{run_dir} has too many folders within each other to remove: rm -r it yourself") from None
 
 
 def _with_its_curriculum(cell: RerunCell) -> Relearning:
@@ -372,8 +366,12 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
         run: checks_of(run, submission.log(run), result, submission.experts(run) or () if run.finished else ())
         for run, result in results.items()
     }
-    others = [run for run, checks in by_run.items() if run.finished and _has_other_bits(checks)]
-    differing = {run: log for run in others if (log := results[run].log) is not None}
+    differing = {}
+    for run, checks in by_run.items():
+        log = results[run].log
+        other = any(check.passed is False for check in checks if check.what != BYTES)
+        if run.finished and other and log is not None:
+            differing[run] = log
     if not other_bits or not differing:
         return [check for checks in by_run.values() for check in checks]
     name = score_name(submission)
@@ -383,10 +381,6 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
     check = check_of_scores(submission, [v for v in values if v is not None], what, RERUN, note)
     pairs = [(run, each) for run, checks in by_run.items() for each in checks]
     return [check, *(each for run, each in pairs if run not in differing or each.what == BYTES)]
-
-
-def _has_other_bits(checks: Sequence[Check]) -> bool:
-    return any(check.passed is False for check in checks if check.what != BYTES)
 
 
 def _frames(run_dir: Path) -> int:

@@ -72,9 +72,9 @@ class Check(NamedTuple):
         return f"{where}{self.what}: expected {self.expected}, found {self.found}{note}"
 
 
-def equal(what: str, expected: object, found: object, run: str = "", note: str = "") -> Check:
+def equal(what: str, expected: object, found: object, run: str = "") -> Check:
     """Return the check that two values are equal."""
-    return Check(what, str(expected), str(found), expected == found, run=run, note=note)
+    return Check(what, str(expected), str(found), expected == found, run)
 
 
 def rescore(submission: Submission) -> list[Check]:
@@ -157,10 +157,7 @@ def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     """Yield checks that the logs of experts are those that a log names."""
     said = experts_of(log)
     alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
-    keys = {"curricula": "fingerprint"}
-    if said:
-        keys["groups"] = "together"
-    for what, key in keys.items():
+    for what, key in {"curricula": "fingerprint", **({"groups": "together"} if said else {})}.items():
         expected = [each.get(key) for each in said]
         found = [each.get(key) for each in alone]
         yield equal(f"{what} of experts", expected, found, run.run)
@@ -174,12 +171,11 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
     tasks_at = Evaluator(curriculum, run.seed, log).tasks_at
     wanted = [(at, number, how.num_episodes) for at in curriculum.moments for number, _ in tasks_at(at).values()]
     there = [(m["frames"], m["task"], m.get("episodes")) for m in log.of_kind("evaluation")]
-    missing = sorted({*wanted} - {*there})
-    more = sorted({*there} - {*wanted}, key=str)
-    sides: dict[str, list[Any]] = {"missing": missing, "more": more}
-    notes = [f"{what} (frames, task, episodes): {listed(some)}" for what, some in sides.items() if some]
-    same = wanted == there
-    yield Check("evaluations", str(len(wanted)), str(len(there)), same, run.run, note="; ".join(notes))
+    notes = []
+    for what, some in (("missing", {*wanted} - {*there}), ("more", {*there} - {*wanted})):
+        if some:
+            notes.append(f"{what} (frames, task, episodes): {listed(sorted(some, key=str))}")
+    yield Check("evaluations", str(len(wanted)), str(len(there)), wanted == there, run.run, note="; ".join(notes))
 
 
 def metrics_text(found: Mapping[SubmittedRun, Mapping[str, Metric]]) -> str:
@@ -217,8 +213,7 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
     count = 0
     needed = {name for stated in submission.metrics.values() for name in stated}
     needed |= {*MEASURES} if submission.track is None else {*MEASURES, submission.track.score}
-    runs = {run.run for run in logs}
-    more = sorted(set(submission.metrics) - runs)
+    more = sorted(set(submission.metrics) - {run.run for run in logs})
     rule = "no finished run has this name"
     if more:
         wrong.append(Check(METRICS, "metrics of finished runs", listed(more), False, note=rule))
@@ -245,8 +240,7 @@ def _of_metric(
     what = f"{name} in {METRICS}"
     if cells is None or stated is None:
         return Check(what, _value(cells), _value(stated), False, run)
-    rounded = not same_kind and cells[4:] == stated[4:] and near(_number(cells[3]), _number(stated[3]))
-    if rounded:
+    if not same_kind and cells[4:] == stated[4:] and near(_number(cells[3]), _number(stated[3])):
         return None
     pairs = [pair for pair in zip(cells, stated, strict=True) if pair[0] != pair[1]]
     expected, found = (", ".join(cell or "nothing" for cell in side) for side in zip(*pairs, strict=True))
@@ -274,9 +268,10 @@ def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Chec
         found = parquet_rows(read_regular(submission.path / EVALUATIONS, MOST_BYTES), table)
     except ValueError as error:
         return [Check(EVALUATIONS, f"{len(expected)} rows", "a file that cannot be read", False, note=str(error))]
-    pairs = enumerate(zip_longest(expected, found, fillvalue=NO_ROW), 1)
-    differing = [(f"row {number} of {EVALUATIONS}", pair) for number, pair in pairs if pair[0] != pair[1]]
-    wrong = [Check(what, *_differing(*pair), False) for what, pair in differing]
+    wrong = []
+    for number, pair in enumerate(zip_longest(expected, found, fillvalue=NO_ROW), 1):
+        if pair[0] != pair[1]:
+            wrong.append(Check(f"row {number} of {EVALUATIONS}", *_differing(*pair), False))
     return wrong or [equal(EVALUATIONS, f"{len(expected)} rows", f"{len(expected)} rows")]
 
 

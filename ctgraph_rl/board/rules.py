@@ -110,19 +110,17 @@ def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
     names = dict.fromkeys(name for run in runs for name in run.code)
     mixed = [name for name in names if len(_values(run.code.get(name, "") for run in runs)) > 1]
     yield not mixed, f"runs are of different code, {listed(mixed)} differs between them: run all with one"
-    versions = {name: _values((run.about.get("versions") or {}).get(name) for run in runs) for name in _packages(runs)}
-    other = [f"{name} {' and '.join(values)}" for name, values in versions.items() if len(values) > 1]
+    versions = [run.about.get("versions") or {} for run in runs]
+    other = []
+    for name in dict.fromkeys(name for of_run in versions for name in of_run):
+        values = _values(of_run.get(name) for of_run in versions)
+        other += [f"{name} {' and '.join(values)}"] if len(values) > 1 else []
     yield not other, f"runs are of different versions, {listed(other)}: run all with one"
 
 
 def _values(values: Iterable[Any]) -> list[str]:
     """Return different values as texts, in order."""
     return list(dict.fromkeys(json.dumps(value, sort_keys=True).strip('"') for value in values))
-
-
-def _packages(runs: Sequence[Run]) -> list[str]:
-    """Return the packages whose versions runs store."""
-    return list(dict.fromkeys(name for run in runs for name in run.about.get("versions") or {}))
 
 
 def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:

@@ -17,8 +17,8 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -130,8 +130,7 @@ class SubmittedRun:
     @property
     def cells(self) -> list[Any]:
         """The cells of its line."""
-        values = [getattr(self, field.name) for field in fields(self)]
-        return [" ".join(map(str, value)) if isinstance(value, tuple) else value for value in values]
+        return [" ".join(map(str, each)) if isinstance(each, tuple) else each for each in vars(self).values()]
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,13 @@ class Submission:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over the sums of all files but verifications and hidden ones, in the order of their names."""
-        lines = [f"{name} {sha256_of(self.path / name, MOST_BYTES)}\n" for name in _names(self.path)]
+        names = []
+        for file in _files(self.path):
+            own = file.relative_to(self.path)
+            hidden = any(part.startswith(".") for part in own.parts)
+            if not hidden and own.as_posix() != VERIFICATION:
+                names.append(own.as_posix())
+        lines = [f"{name} {sha256_of(self.path / name, MOST_BYTES)}\n" for name in sorted(names)]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -262,11 +267,13 @@ def _twice(values: Sequence[Any]) -> str:
 
 def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     """Return a line of ``runs.csv``."""
-    numbers = {key: row[key] for key in ("seed", "num_threads")}
     group = row["group"].split(" ") if row["group"] else []
-    whole = {**numbers, **{f"group {number}": number for number in group}}
-    whole |= {"agent_bytes": row["agent_bytes"]} if row["agent_bytes"] else {}
-    sums = {"log_sha256": row["log_sha256"]} | ({"agent_sha256": row["agent_sha256"]} if row["agent_sha256"] else {})
+    whole = {"seed": row["seed"], "num_threads": row["num_threads"]} | {f"group {each}": each for each in group}
+    sums = {"log_sha256": row["log_sha256"]}
+    if row["agent_bytes"]:
+        whole["agent_bytes"] = row["agent_bytes"]
+    if row["agent_sha256"]:
+        sums["agent_sha256"] = row["agent_sha256"]
     is_time = re.fullmatch(r"[0-9]+(\.[0-9]+)?", row["seconds"]) is not None and float(row["seconds"]) <= MOST_SECONDS
     require(
         (NAME.fullmatch(row["run"]) is not None, f"{place}: run must be a name of a file, got {row['run']!r:.80}"),
@@ -287,9 +294,9 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
         ),
         (is_time, f"{place}: seconds must be a number in 0..{MOST_SECONDS:,.0f}, got {row['seconds']!r:.80}"),
     )
-    values: dict[str, Any] = {**row, **{key: int(value) for key, value in numbers.items()}}
-    values |= {"group": tuple(map(int, group)), "seconds": float(row["seconds"])}
-    return SubmittedRun(**values | {"agent_bytes": int(row["agent_bytes"]) if row["agent_bytes"] else None})
+    values: dict[str, Any] = {**row, "agent_bytes": None}
+    values |= {key: int(value) for key, value in whole.items() if key in row}
+    return SubmittedRun(**values | {"group": tuple(map(int, group)), "seconds": float(row["seconds"])})
 
 
 def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str], most: int) -> list[dict[str, str]]:
@@ -400,10 +407,3 @@ def _files(path: Path) -> list[Path]:
         (not large, f"{path} has files of more than {MOST_BYTES:,} bytes, {', '.join(large[:3])}: remove them"),
     )
     return files
-
-
-def _names(path: Path) -> Iterator[str]:
-    """Yield the names of all files of a submission but verifications and hidden ones, sorted."""
-    files = (each.relative_to(path) for each in _files(path))
-    shown = (each for each in files if not any(part.startswith(".") for part in each.parts))
-    yield from sorted(each.as_posix() for each in shown if each.as_posix() != VERIFICATION)

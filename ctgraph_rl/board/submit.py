@@ -86,21 +86,16 @@ def submit(
     lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
-    about = _for_track(completed(method, facts), of_track)
+    about = {key: value for key, value in completed(method, facts).items() if key not in WRITTEN}
+    about["track"] = None
+    if of_track is not None:
+        about |= {"track": of_track.name, "track_version": of_track.version}
     with new_folder(to) as folder:
         _write(folder, runs, lines, about, curriculum=curriculum)
         made = read_submission(folder, of_track)
         wrong = [check.text for check in rescore(made) if not check.passed]
         require((not wrong, f"the submission would not pass its own check: {listed(wrong)}"))
     return read_submission(to, of_track)
-
-
-def _for_track(method: Mapping[str, Any], of_track: Track | None) -> dict[str, Any]:
-    """Return a method with its track and the version of it."""
-    kept = {key: value for key, value in method.items() if key not in WRITTEN}
-    if of_track is None:
-        return {**kept, "track": None}
-    return {**kept, "track": of_track.name, "track_version": of_track.version}
 
 
 def _found(paths: Sequence[Path], only: Mapping[str, Any]) -> list[Run]:
@@ -121,29 +116,23 @@ def _checked(runs: list[Run], method: Mapping[str, Any], of_track: Track | None)
     rules += seed_rules(seeds, method["tuning"]["seeds"], of_track)
     config = runs[0].about["config"]
     rules += [entry_rule(config, method["entry_point"]), oracle_rule(config)]
-    curricula = [(run, run.path / CURRICULUM) for run in runs]
-    unwritten = [path for _, path in curricula if not path.exists()]
+    curricula = [run.path / CURRICULUM for run in runs]
+    unwritten = [path for path in curricula if not path.exists()]
     message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a curriculum of ours"
     rules.append((not unwritten, message))
-    first = None if unwritten else Curriculum.from_json(curricula[0][1])
-    rules += [] if first is None else [curriculum_rule(first, of_track), *_fingerprint_rules(runs, first)]
-    rules += [rule for run in runs if run.reason is None for rule in _expert_rules(run)]
+    first = None if unwritten else Curriculum.from_json(curricula[0])
+    if first is not None:
+        other = [run.path for run in runs if run.curriculum[1] != first.fingerprint]
+        message = f"the logs of {listed(other)} are of another curriculum than {curricula[0]}"
+        rules += [curriculum_rule(first, of_track), (not other, message)]
+    fix = "submit from the directory that the run was started in"
+    for run in runs:
+        missing = [path for path in _experts(run).values() if not path.is_file()] if run.reason is None else []
+        message = f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}"
+        rules.append((not missing, message))
     require(*rules)
     assert first is not None
     return runs, first
-
-
-def _fingerprint_rules(runs: Sequence[Run], curriculum: Curriculum) -> list[tuple[bool, str]]:
-    """Return the rules that logs are of the curriculum that is beside the first of them."""
-    other = [run.path for run in runs if run.curriculum[1] != curriculum.fingerprint]
-    return [(not other, f"the logs of {listed(other)} are of another curriculum than {runs[0].path / CURRICULUM}")]
-
-
-def _expert_rules(run: Run) -> list[tuple[bool, str]]:
-    """Return the rules that the logs of a run's single-task experts are there."""
-    missing = [str(path) for path in _experts(run).values() if not path.is_file()]
-    fix = "submit from the directory that the run was started in"
-    return [(not missing, f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}")]
 
 
 def _experts(run: Run) -> dict[int, Path]:

@@ -111,9 +111,14 @@ class Track:
     @cached_property
     def variants(self) -> tuple[Variant, ...]:
         """What may be submitted: each rung as the track gives it, and then with less."""
-        chosen = {rung: tuple(setting for setting in rung if not _is_value(setting)) for rung in self.rungs}
-        cfgs = {some: self._composed(some) for some in dict.fromkeys(chosen.values())}  # once, as it takes 0.1 s
-        return tuple(variant for rung in self.rungs for variant in self._of_rung(rung, cfgs[chosen[rung]]))
+        cfgs: dict[tuple[str, ...], Any] = {}  # each is composed once, as it takes 0.1 s
+        found: list[Variant] = []
+        for rung in self.rungs:
+            chosen = tuple(setting for setting in rung if not _is_value(setting))
+            if chosen not in cfgs:
+                cfgs[chosen] = config.composed([f"{GROUP}={self.name}", *chosen], self.config_dir)
+            found += self._of_rung(rung, cfgs[chosen])
+        return tuple(found)
 
     @property
     def curriculum(self) -> Curriculum:
@@ -136,18 +141,7 @@ class Track:
             count: how many seeds, >= 1.
         """
         require((is_int(number, 0), f"number must be an integer >= 0, got {number!r}"), *at_least_one(count=count))
-        drawn: dict[int, None] = {}
-        for place in range(2**20):
-            text = f"{self.id} {digest} {number} {place}"
-            value = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
-            drawn[HELD_OUT_SEEDS[value % len(HELD_OUT_SEEDS)]] = None
-            if len(drawn) == count:
-                break
-        return tuple(drawn)
-
-    def _composed(self, choices: Sequence[str]) -> Any:
-        """Return the configuration of the track with other choices of groups."""
-        return config.composed([f"{GROUP}={self.name}", *choices], self.config_dir)
+        return held_out_seeds(f"{self.id} {digest} {number}", count)
 
     def _of_rung(self, rung: Sequence[str], composed: Any) -> Iterator[Variant]:
         """Yield the variants of a rung, from the configuration with its choices of groups."""
@@ -161,6 +155,21 @@ class Track:
             own.protocol.update(less)
             settings = (*rung, *(f"protocol.{key}={value}" for key, value in less.items()))
             yield Variant(settings, _in_words(rung), with_changes(made, own))
+
+
+def drawn(text: str, most: int) -> int:
+    """Return an integer in [0, most) that follows from a text by SHA-256; the first 8 bytes modulo ``most``."""
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % most
+
+
+def held_out_seeds(key: str, count: int) -> tuple[int, ...]:
+    """Return different held-out seeds that follow from a text."""
+    found: dict[int, None] = {}
+    for place in range(2**20):
+        found[HELD_OUT_SEEDS[drawn(f"{key} {place}", len(HELD_OUT_SEEDS))]] = None
+        if len(found) == count:
+            break
+    return tuple(found)
 
 
 def given(protocol: Protocol, blocks: int) -> str:

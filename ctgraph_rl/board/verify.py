@@ -39,6 +39,7 @@ from ctgraph_rl.log.sources import is_ours, targets
 from ctgraph_rl.packages import check_packages
 from ctgraph_rl.parsers import LEVELS, LIMIT_TIMES
 from ctgraph_rl.portable import cpu_model
+from ctgraph_rl.runs.sweep import sigterm_exits
 
 NONE = "none"
 """The level of a submission that fails the first."""
@@ -333,17 +334,12 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
 def _ended_by_signals(message: str) -> Iterator[None]:
     """Leave by an exception when asked to stop, so that processes are ended on the way, and say so."""
 
-    def stop(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, stop)
     try:
-        yield
+        with sigterm_exits():
+            yield
     except (KeyboardInterrupt, SystemExit) as error:
         print(f"\n{message}", file=sys.stderr)
         sys.exit(error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _check(arguments: argparse.Namespace) -> None:

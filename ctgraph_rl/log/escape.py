@@ -11,7 +11,7 @@ import csv
 import html
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
@@ -58,6 +58,12 @@ def markdown_text(text: object) -> str:
         return line
     line = _MARKDOWN.sub(lambda found: "\\" + found[0], html.escape(line, quote=False))
     return _NUMBERED.sub(r"\1\\\2", line)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table in Markdown, of cells that are Markdown."""
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    return "\n".join([lines[0], f"|{'---|' * len(head)}", *lines[1:]])
 
 
 def latex_text(text: object) -> str:

@@ -32,11 +32,6 @@ for _found in iter_modules(__path__):
     import_module(f"{__name__}.{_found.name}")
 
 
-def _place(entry: Entry) -> int:
-    module = entry.metric.__module__.rpartition(".")[2]
-    return ORDER.index(module) if module in ORDER else len(ORDER)
-
-
 def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
     """Compute every metric whose inputs are given, by name.
 
@@ -44,7 +39,12 @@ def of_inputs(given: Mapping[str, Any]) -> dict[str, Metric]:
         given: inputs by the names that `ctgraph_rl.metrics.inputs.INPUTS` has; an `Undefined` in place of one that
             there is not, with the reason.
     """
-    listed = sorted(METRICS.values(), key=_place)  # as a user's own script may define others
+
+    def place(entry: Entry) -> int:
+        module = entry.metric.__module__.rpartition(".")[2]
+        return ORDER.index(module) if module in ORDER else len(ORDER)
+
+    listed = sorted(METRICS.values(), key=place)  # as a user's own script may define others
     return {entry.metric.__name__: entry.of(given) for entry in listed if given.keys() >= {*entry.required}}
 
 

@@ -8,6 +8,7 @@ label. A *change* is where the task of the intervals changes.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -143,7 +144,11 @@ def adjusted_rand_index(labels: Tensor, tasks: Tensor, frames: Tensor) -> float:
     Computed from exact integers, as numbers of pairs of frames do not fit in floats.
     """
     table = counts(tasks, labels, frames)
-    rows, columns = (_sums(table, place) for place in (0, 1))
+    rows: Counter[int] = Counter()
+    columns: Counter[int] = Counter()
+    for (task, label), number in table.items():
+        rows[task] += number
+        columns[label] += number
     pairs = _pairs(sum(table.values()))
     both = sum(map(_pairs, table.values()))
     task_only = sum(map(_pairs, rows.values())) - both
@@ -156,11 +161,11 @@ def adjusted_rand_index(labels: Tensor, tasks: Tensor, frames: Tensor) -> float:
     return above / below
 
 
-def counts(tasks: Tensor, labels: Tensor, frames: Tensor) -> dict[tuple[int, int], int]:
+def counts(tasks: Tensor, labels: Tensor, frames: Tensor) -> Counter[tuple[int, int]]:
     """Return the number of frames of each task and label that occur together."""
-    found: dict[tuple[int, int], int] = {}
+    found: Counter[tuple[int, int]] = Counter()
     for task, label, number in zip(tasks.tolist(), labels.tolist(), frames.tolist(), strict=True):
-        found[task, label] = found.get((task, label), 0) + number
+        found[task, label] += number
     return found
 
 
@@ -175,14 +180,6 @@ def most_frequent(tasks: Sequence[int], labels: Sequence[int], frames: Sequence[
 
 def _pairs(number: int) -> int:
     return number * (number - 1) // 2
-
-
-def _sums(table: dict[tuple[int, int], int], place: int) -> dict[int, int]:
-    """Return the sums of rows or columns of a table."""
-    sums: dict[int, int] = {}
-    for key, number in table.items():
-        sums[key[place]] = sums.get(key[place], 0) + number
-    return sums
 
 
 def _delays(labelling: Labelling) -> Tensor:

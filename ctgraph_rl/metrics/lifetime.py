@@ -72,7 +72,10 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
             task with an empty range is 1 throughout.
     """
     table = RegimeTable.of(regimes)
-    smoothed = table.replaced(_smoothed(table))
+    values = table.values.clone()
+    for i in np.flatnonzero(table.training).tolist():
+        values[table.starts[i] : table.starts[i + 1]] = smooth(table.values_of(i))
+    smoothed = table.replaced(values)
     expert_curves = {task: [smooth(curve) for curve in curves] for task, curves in (experts or {}).items()}
     scales = _ranges(smoothed, expert_curves) if ranges is None else ranges
     low, high = (
@@ -81,7 +84,8 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     of_task = torch.from_numpy(table.task.repeat(table.length))
     scaled = smoothed.replaced(_scaled(smoothed.values, low[of_task], high[of_task]))
     known = {task: curves for task, curves in expert_curves.items() if task in scales}
-    return scaled, {task: [_scaled_by(scales[task], curve) for curve in curves] for task, curves in known.items()}
+    limits = {task: torch.tensor(scales[task], dtype=torch.float64, device="cpu") for task in known}
+    return scaled, {task: [_scaled(curve, *limits[task]) for curve in curves] for task, curves in known.items()}
 
 
 ON_THE_SCALE = from_failure_to_best(OFFSET, OFFSET + SCALE)
@@ -253,7 +257,16 @@ def sample_efficiency(regimes: Regimes, experts: Experts) -> Tensor:
     def of_task(curves: Sequence[Tensor], trainings: list[int]) -> float:
         level, time = _saturation(_joined(table, trainings))
         falls = _falls(table, trainings)
-        return _mean([_efficiency(level, time, *_saturation(curve), falls) for curve in curves])
+        terms = []
+        for curve in curves:
+            expert_level, expert_time = _saturation(curve)
+            if time == 0 or expert_time == 0:
+                terms.append(math.nan)
+            elif falls or level < UNSATURATED_SHARE * expert_level:
+                terms.append(0.0)
+            else:
+                terms.append(_quotient(expert_level, level) * expert_time / time)
+        return _mean(terms)
 
     return _against(table, experts, of_task)
 
@@ -340,14 +353,6 @@ def _saturation(values: Tensor) -> tuple[float, int]:
     return level, _first_at_least(smoothed, level)
 
 
-def _efficiency(level: float, time: int, expert_level: float, expert_time: int, falls: bool) -> float:
-    if time == 0 or expert_time == 0:
-        return math.nan
-    if falls or level < UNSATURATED_SHARE * expert_level:
-        return 0.0
-    return _quotient(expert_level, level) * expert_time / time
-
-
 def _falls(table: RegimeTable, trainings: Sequence[int]) -> bool:
     """Whether the least-squares line through a task's training falls, over the experiences of the whole run."""
     times = torch.cat([torch.arange(table.starts[i], table.starts[i + 1], device="cpu") for i in trainings]).double()
@@ -365,13 +370,6 @@ def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Ten
     return _tensor([value(experts[task], own) if experts.get(task) else math.nan for task, own in trained if own])
 
 
-def _smoothed(table: RegimeTable) -> Tensor:
-    values = table.values.clone()
-    for i in np.flatnonzero(table.training).tolist():
-        values[table.starts[i] : table.starts[i + 1]] = smooth(table.values_of(i))
-    return values
-
-
 def _ranges(table: RegimeTable, experts: Experts) -> Ranges:
     """Lowest and highest value of each task and its experts."""
     both = zip(table.names, table.places(training=True), table.places(training=False), strict=True)
@@ -382,10 +380,6 @@ def _ranges(table: RegimeTable, experts: Experts) -> Ranges:
 
 def _scaled(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.where(low == high, OFFSET, (values - low) / (high - low) * SCALE + OFFSET)
-
-
-def _scaled_by(limits: tuple[float, float], values: Tensor) -> Tensor:
-    return _scaled(values, *torch.tensor(limits, dtype=torch.float64, device="cpu"))
 
 
 def _mean(values: Sequence[float]) -> float:

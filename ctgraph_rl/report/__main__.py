@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 
 from ctgraph_rl import parsers
 from ctgraph_rl.log.escape import terminal_text
@@ -10,10 +11,6 @@ from ctgraph_rl.log.files import METRICS
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.report.page import write_report
 from ctgraph_rl.report.terminal import print_problems, print_summary
-
-
-def _told(sentence: str) -> None:
-    print(sentence, file=sys.stderr)
 
 
 def main() -> None:
@@ -29,7 +26,7 @@ def main() -> None:
             arguments.agent,
             width=arguments.width,
             colours=arguments.colour,
-            progress=_told if sys.stderr.isatty() else None,
+            progress=partial(print, file=sys.stderr) if sys.stderr.isatty() else None,
         )
     incomplete = print_problems(report.problems, report.runs)
     count = len(report.runs)

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from ctgraph_rl.log.escape import markdown_text, terminal_text
+from ctgraph_rl.log.escape import markdown_table, markdown_text, terminal_text
 from ctgraph_rl.parsers import TABLE_FORMATS
 from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell
 from ctgraph_rl.report.latex import latex as latex_table
@@ -54,7 +54,16 @@ def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = L
 
 def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return a table in Markdown for each curriculum."""
-    return "\n\n".join(_markdown(page, modified.get(page.curriculum), legend) for page in pages(rows))
+    parts = []
+    for page in pages(rows):
+        parts.append(f"### {markdown_text(page.curriculum)}")
+        if page.curriculum in modified:
+            parts.append(f"Modified: {markdown_text(modified[page.curriculum])}")
+        lines = [map(markdown_text, line) for line in page.lines]
+        parts += [legend, markdown_table(("agent", "measure", "over seeds", "n", "note"), lines)]
+        if page.notes:
+            parts.append("\n".join(f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)))
+    return "\n\n".join(parts)
 
 
 def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
@@ -71,29 +80,21 @@ def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
         cells = {(row.shown, measure_name(row.measure)): row for row in its if row.measure != NO_RUN_FINISHED}
         notes = list(dict.fromkeys(row.note for row in its if row.note))
         measures = list(dict.fromkeys(measure for _, measure in cells))
-        agents = {
-            agent: _seeds([row for row in its if row.shown == agent])
-            for agent in dict.fromkeys(row.shown for row in its)
-        }
-        lines = [
-            (agent, (TableCell(n), *(_as_cell(cells.get((agent, measure)), notes) for measure in measures)))
-            for agent, n in agents.items()
-        ]
+        lines = []
+        for agent in dict.fromkeys(row.shown for row in its):
+            most = max((row.estimate for row in its if row.shown == agent), key=lambda estimate: estimate.n)
+            line = [TableCell(str(most).rpartition(" n = ")[2])]
+            for measure in measures:
+                row = cells.get((agent, measure))
+                line.append(TableCell("-") if row is None else _as_cell(row, notes))
+            lines.append((agent, line))
         yield Matrix(curriculum, ("n", *measures), lines, notes)
 
 
-def _as_cell(row: Row | None, notes: Sequence[str]) -> TableCell:
+def _as_cell(row: Row, notes: Sequence[str]) -> TableCell:
     """Return a row as a cell of the table of agents and measures."""
-    if row is None:
-        return TableCell("-")
     value, _, interval = str(row.estimate).partition(" n = ")[0].partition(" ")
     return TableCell(value, interval, notes.index(row.note) + 1 if row.note else 0)
-
-
-def _seeds(rows: Sequence[Row]) -> str:
-    """Return the number of an agent's seeds with a value, as ``9/10`` where others have none."""
-    most = max((row.estimate for row in rows), key=lambda estimate: estimate.n)
-    return str(most).rpartition(" n = ")[2]
 
 
 def measure_name(measure: str) -> str:
@@ -149,13 +150,12 @@ def pages(rows: Sequence[Row]) -> Iterator[Page]:
     for curriculum in dict.fromkeys(row.curriculum for row in rows):
         its = [row for row in rows if row.curriculum == curriculum]
         notes = list(dict.fromkeys(row.note for row in its if row.note))
-        yield Page(curriculum, [_line(row, notes) for row in its], notes)
-
-
-def _line(row: Row, notes: list[str]) -> Line:
-    value, _, n = str(row.estimate).partition(" n = ")
-    mark = str(notes.index(row.note) + 1) if row.note else ""
-    return Line(row.shown, measure_name(row.measure), value, n, mark)
+        lines = []
+        for row in its:
+            value, _, n = str(row.estimate).partition(" n = ")
+            mark = str(notes.index(row.note) + 1) if row.note else ""
+            lines.append(Line(row.shown, measure_name(row.measure), value, n, mark))
+        yield Page(curriculum, lines, notes)
 
 
 def _text(page: Page, modified: str | None) -> str:
@@ -178,12 +178,3 @@ def _text(page: Page, modified: str | None) -> str:
     notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
     shown += [textwrap.fill(note, WIDTH, initial_indent="  ", subsequent_indent="      ") for note in notes]
     return "\n".join(shown)
-
-
-def _markdown(page: Page, modified: str | None, legend: str) -> str:
-    columns = ["| agent | measure | over seeds | n | note |", "|---|---|---|---|---|"]
-    about = ["", f"Modified: {markdown_text(modified)}"] if modified else []
-    head = [f"### {markdown_text(page.curriculum)}", *about, "", legend, "", *columns]
-    lines = ["| " + " | ".join(map(markdown_text, line)) + " |" for line in page.lines]
-    notes = [f"{number}. {markdown_text(note)}" for number, note in enumerate(page.notes, 1)]
-    return "\n".join([*head, *lines, *([""] if notes else []), *notes])

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
-from ctgraph_rl.log.escape import markdown_text, terminal_text
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.adaptation import adaptation_curves
 from ctgraph_rl.report.figures.aggregates import improvements, profiles
@@ -23,9 +22,9 @@ from ctgraph_rl.report.figures.learning_curves import learning_curves, mean_curv
 from ctgraph_rl.report.figures.trees import Trees, find_trees, task_trees
 from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell, latex
 from ctgraph_rl.report.names import colours_of, displayed
-from ctgraph_rl.report.sections import Estimates, Result, Section, sections
-from ctgraph_rl.report.statistics import Estimate
+from ctgraph_rl.report.sections import Result, Section, sections
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages, style
+from ctgraph_rl.report.templates import rendered
 from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
 from ctgraph_rl.runs.read import Problem, Run, find_runs
 from ctgraph_rl.runs.settings import flat
@@ -141,7 +140,7 @@ def write_report(
         parts.append(_part(section, gallery))
         if progress is not None and time.perf_counter() - start > QUICK:
             progress(f"report: {len(parts)} of {len(found)} curricula")
-    about = {
+    about: dict[str, Any] = {
         "title": _title(parts),
         "figures": together,
         "smallest": "44rem" if width == "text" else "0",
@@ -157,31 +156,9 @@ def write_report(
     }
     page = Path(folder) / "report.html"
     for name in ("report.html", "report.md"):
-        write_whole(Path(folder) / name, _rendered(name, about))
+        write_whole(Path(folder) / name, rendered(Path(__file__).with_name(f"{name}.j2"), **about))
     write_whole(Path(folder) / "tables.tex", _latex(parts))
     return Report(page, runs, problems)
-
-
-def _rendered(name: str, about: Mapping[str, Any]) -> str:
-    from jinja2 import FileSystemLoader, StrictUndefined
-    from jinja2.sandbox import SandboxedEnvironment
-
-    escapes = name.endswith(".html")
-    environment = SandboxedEnvironment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=escapes,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.finalize = _one_line if escapes else None
-    environment.filters["line"] = lambda value: markdown_text(value)
-    return environment.get_template(f"{name}.j2").render(about)
-
-
-def _one_line(value: Any) -> Any:
-    """Return a text without control characters; HTML, and what is no text, unchanged."""
-    return terminal_text(value) if type(value) is str else value
 
 
 def _title(parts: Sequence[Part]) -> str:
@@ -256,18 +233,14 @@ def _numbers(section: Section, result: Result) -> Iterator[Numbers]:
         return
     tables = (("Mean return after each block", result.performance(), 0), ("Change by each block", result.transfer(), 1))
     for title, matrix, first in tables:
-        yield Numbers(title, ("block", *section.labels), list(_cells(matrix, first, len(result.finished))))
-
-
-def _cells(matrix: Estimates, first: int, n: int) -> Iterator[tuple[str, ...]]:
-    for block, row in enumerate(matrix, first):
-        yield (str(block), *(_cell(estimate, n) for estimate in row))
-
-
-def _cell(estimate: Estimate, n: int) -> str:
-    """Value and interval, and n where it is not that of all cells."""
-    value, _, _ = str(estimate).partition(" n = ")
-    return value if estimate.n in (0, n) else f"{value} n = {estimate.n}"
+        rows = []
+        for block, estimates in enumerate(matrix, first):
+            row = [str(block)]
+            for estimate in estimates:
+                value, _, _ = str(estimate).partition(" n = ")
+                row.append(value if estimate.n in (0, len(result.finished)) else f"{value} n = {estimate.n}")
+            rows.append(tuple(row))
+        yield Numbers(title, ("block", *section.labels), rows)
 
 
 def _runs(result: Result) -> Iterator[tuple[str, ...]]:

@@ -139,8 +139,7 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
             values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
             limits = bounds[first[0]].of_metric(metric)
             found[first[0], first[1], second[1]] = statistics.compare(values, others, bounds=limits)
-    corrected = statistics.holm([each.p_value for each in found.values()])
-    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), corrected, strict=True)}
+    return statistics.corrected(found)
 
 
 def _pairs(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], Comparison]:
@@ -212,7 +211,11 @@ def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple
 def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
     """Return a metric over seeds; a time as its median, infinite for a seed that never got there."""
     if metric in metrics.METRICS and metrics.METRICS[metric].is_time:
-        return statistics.median_time([_time(run, metric) for run in by_seed.values()])
+        times = []
+        for run in by_seed.values():
+            never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
+            times.append(math.inf if never else _value(run, metric))
+        return statistics.median_time(times)
     return _over_seeds([_value(run, metric) for run in by_seed.values()], bounds.of_metric(metric), kind)
 
 
@@ -225,11 +228,6 @@ def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind
     if kind == "iqm":
         return statistics.iqm([values])
     return mean(values, bounds=bounds)
-
-
-def _time(run: Run | None, metric: str) -> float | None:
-    never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
-    return math.inf if never else _value(run, metric)
 
 
 def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
@@ -338,18 +336,15 @@ def main() -> None:
 
 def _sentence(curriculum: str, first: str, second: str, found: Comparison, difference: float | None) -> str:
     record = f"better in {found.wins}, equal in {found.ties}, worse in {found.losses}"
-    p_value = "" if found.p_value is None else f"; sign-flip p = {found.p_value:.3g}, {_verdict(found)}"
-    sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}{p_value}"
+    sentence = f"{curriculum}: {first} - {second}: {found.difference}; {record}"
+    if found.p_value is not None:
+        sentence += f"; sign-flip p = {found.p_value:.3g}, Holm {found.holm:.3g}"
+        if found.holm is None or found.holm > 1 - statistics.LEVEL:
+            sentence += f": not distinguishable with {found.difference.n} seeds"
     if difference is None or not found.std:
         return sentence
     seeds = statistics.seeds_needed(difference, found.std, paired=True)
     return f"{sentence}; {seeds} seeds find a difference of {difference:g} with a chance of 80 %"
-
-
-def _verdict(found: Comparison) -> str:
-    """Return the p-value corrected for all pairs, and what it does not say."""
-    unclear = found.holm is None or found.holm > 1 - statistics.LEVEL
-    return f"Holm {found.holm:.3g}" + (f": not distinguishable with {found.difference.n} seeds" if unclear else "")
 
 
 if __name__ == "__main__":

@@ -17,9 +17,10 @@ A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
@@ -43,6 +44,8 @@ EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and th
 
 MOST_SEEDS = 2**20
 """Number of seeds at which `seeds_needed` gives up."""
+
+Pair = TypeVar("Pair")
 
 Values = Sequence[float | None]
 LowHigh = tuple[float, float] | Bounds
@@ -126,7 +129,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
     bounded = within and math.isfinite(limits.high - limits.low)
     method = f"mean, {'Gaffke' if bounded else 'Student t'} {level:.0%}"
     if len(known) == 0:
-        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+        return _nothing(missing, method)
     centre = math.fsum(known) / len(known)
     reason = None if within else f"a value is outside [{limits.low:g}, {limits.high:g}]"
     low: float | None = None
@@ -158,7 +161,7 @@ def mean_and_std(values: Values) -> Estimate:
     known, missing = _known(values)
     method = "mean, standard deviation over seeds"
     if not known:
-        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+        return _nothing(missing, method)
     std = float(np.std(known, ddof=1)) if len(known) > 1 else None
     reason = "one seed has no standard deviation" if std is None else None
     centre = math.fsum(known) / len(known)
@@ -180,13 +183,10 @@ def iqm(values: Sequence[Values], level: float = LEVEL, resamples: int = RESAMPL
         seed: of the bootstrap.
     """
     stats = scipy("stats")
-    require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
-    require((len(values) > 0, "iqm needs the values of at least one task"))
-    known, missing = zip(*(_known(task) for task in values), strict=True)
-    n, undefined = min(map(len, known)), max(missing)
+    known, n, undefined = _of_tasks(values, "iqm", level, resamples)
     method = f"IQM, percentiles of a stratified bootstrap {level:.0%}"
     if n == 0:
-        return Estimate(None, None, None, 0, undefined, method=method, reason="no seed has a value")
+        return _nothing(undefined, method)
     value = float(stats.trim_mean(np.concatenate(known), 0.25))
     if n == 1:
         return Estimate(value, None, None, n, undefined, method=method, reason="one seed has no interval")
@@ -242,7 +242,7 @@ def median_time(times: Values, level: float = LEVEL) -> Estimate:
     require((min(known, default=0.0) >= 0, f"times must be >= 0, got {min(known, default=0.0)}"))
     n, method = len(known), f"median, order statistics {level:.0%}"
     if n == 0:
-        return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
+        return _nothing(missing, method)
     ordered, k = [0.0, *sorted(known), math.inf], median_ranks(n, level)
     centre = (ordered[(n + 1) // 2] + ordered[n // 2 + 1]) / 2
     reason = None if k else f"the range of the times covers {1 - 0.5 ** (n - 1):.0%}"
@@ -271,11 +271,8 @@ def interquartile_mean(
         seed: of the bootstrap.
         bounds: the lowest and the highest possible value.
     """
-    require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
-    require((len(values) > 0, "interquartile_mean needs the values of at least one task"))
+    known, n, undefined = _of_tasks(values, "interquartile_mean", level, resamples)
     lowest, highest, _ = _checked(bounds)
-    known, missing = zip(*(_known(task) for task in values), strict=True)
-    n, undefined = min(map(len, known)), max(missing)
     method = f"IQM, stratified bootstrap {level:.0%}"
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
@@ -368,6 +365,12 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
+def corrected(found: Mapping[Pair, Comparison]) -> dict[Pair, Comparison]:
+    """Return comparisons with their p-values corrected for the number of all."""
+    p_values = holm([each.p_value for each in found.values()])
+    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), p_values, strict=True)}
+
+
 @takes_numbers
 def seeds_needed(difference: float, std: float, paired: bool = False, level: float = LEVEL, power: float = 0.8) -> int:
     """Seeds of each agent that a t-test needs to find a difference of means with a given power.
@@ -399,6 +402,19 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
         middle = (low + high) // 2
         low, high = (low, middle) if finds(middle) else (middle, high)
     return high
+
+
+def _nothing(missing: int, method: str) -> Estimate:
+    return Estimate(None, None, None, 0, missing, method, "no seed has a value")
+
+
+def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:
+    """Return the values of each task, and the numbers of seeds with and without one; refuse what is out of range."""
+    require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
+    require((len(values) > 0, f"{who} needs the values of at least one task"))
+    found = [_known(task) for task in values]
+    known = [of_task for of_task, _ in found]
+    return known, min(map(len, known)), max(missing for _, missing in found)
 
 
 def _checked(bounds: LowHigh) -> Bounds:

@@ -31,20 +31,24 @@ LONGEST_NAME = 22
 """Characters of a name in a figure."""
 
 
-def require_packages() -> None:
+def require_packages(what: str = "the report", *names: str) -> None:
     """Refuse before any work.
 
+    Args:
+        what: needs packages.
+        names: of packages that the extra ``report`` installs; without any, all of them.
+
     Raises:
-        ModuleNotFoundError: without one of `PACKAGES`; names the extra to install.
+        ModuleNotFoundError: without one of them; names the extra to install.
     """
-    for name in PACKAGES:
+    for name in names or PACKAGES:
         try:
             if name == "matplotlib":
                 import_matplotlib()
             else:
                 import_module(name)
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(f"the report needs {name}: pip install 'ctgraph_rl[report]'") from error
+            raise ModuleNotFoundError(f"{what} needs {name}: pip install 'ctgraph_rl[report]'") from error
 
 
 _WIDTH: ContextVar[str] = ContextVar("width", default="text")

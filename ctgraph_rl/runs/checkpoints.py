@@ -93,7 +93,10 @@ class Checkpoints:
         path = self.path_of(state["frames"])
         content = encoded(state)
         if self._last is None:
-            _require_plain(content)
+            try:
+                read_plain(content.partition(b"\n")[2])
+            except ValueError as error:  # it could be written and never read
+                raise ValueError(f"{NOT_PLAIN}: {error.__cause__}") from error
         made_folder(self.folder)
         try:
             write_whole(path, content)
@@ -226,14 +229,6 @@ def decoded(path: Path) -> RunState:
     if not (isinstance(state, dict) and is_int(state.get("frames"), 0)):
         raise BrokenCheckpoint(f"{path} does not say after how many frames it was made; {advice}")
     return state
-
-
-def _require_plain(checkpoint: bytes) -> None:
-    """Refuse a state that could be written and never read."""
-    try:
-        read_plain(checkpoint.partition(b"\n")[2])
-    except ValueError as error:
-        raise ValueError(f"{NOT_PLAIN}: {error.__cause__}") from error
 
 
 def _digest(content: bytes) -> str:

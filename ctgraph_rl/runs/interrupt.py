@@ -33,8 +33,12 @@ class Interrupt:
 
     def __enter__(self) -> Interrupt:
         if threading.current_thread() is threading.main_thread():
-            numbers = [getattr(signal, name) for name in STOPPING if hasattr(signal, name)]
-            self._before = {number: signal.signal(number, self._ask) for number in numbers if _acts(number)}
+            for name in STOPPING:
+                number = getattr(signal, name, 0)
+                before = signal.getsignal(number) if number else None
+                requeues = number == _requeuing()  # an ignored signal stays so
+                if callable(before) if requeues else before not in (signal.SIG_IGN, None):
+                    self._before[number] = signal.signal(number, self._ask)
         return self
 
     def __exit__(
@@ -69,12 +73,6 @@ class Interrupt:
         for number, before in self._before.items():
             if signal.getsignal(number) == self._ask:
                 signal.signal(number, before)
-
-
-def _acts(number: int) -> bool:
-    """Return whether a signal would stop the process, or put its job into the queue again."""
-    before = signal.getsignal(number)
-    return callable(before) if number == _requeuing() else before not in (signal.SIG_IGN, None)
 
 
 def _is_being_ended() -> bool:

@@ -176,8 +176,12 @@ def read_run(path: Path) -> Run:
     config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
     if _called(config.get("method")) == NO_METHOD:
         del config["method"]
-    seed, agent = config.pop("seed"), _agent(as_before(config))
-    settings = {**dict(flat(as_before(config))), **({"directory": str(path.resolve())} if agent is None else {})}
+    seed = config.pop("seed")
+    config = as_before(config)
+    agent = _agent(config)
+    settings = dict(flat(config))
+    if agent is None:
+        settings["directory"] = str(path.resolve())
     try:
         log = RunLog.read(file)
         history = _history(log)
@@ -186,10 +190,6 @@ def read_run(path: Path) -> Run:
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
     ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if metrics else []
-    success, returns = (
-        {label_of(m): m.get(name) for m in ends} for name in ("success_rate", "return_mean")
-    )  # the last
-    tasks = list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out")))
     return Run(
         path,
         about,
@@ -198,9 +198,9 @@ def read_run(path: Path) -> Run:
         seed,
         reason=why,
         metrics=metrics,
-        success=success,
-        returns=returns,
-        tasks=tasks,
+        success={label_of(m): m.get("success_rate") for m in ends},  # the last
+        returns={label_of(m): m.get("return_mean") for m in ends},
+        tasks=list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out"))),
         history=history,
     )
 
@@ -265,11 +265,14 @@ def _failure(path: Path) -> str | None:
 
 
 def _history(log: RunLog) -> History:
+    about = log.of_kind("run")[0]
     own = [m for m in log.of_kind("evaluation") if not m.get("held_out")]
     performance = log.performance().tolist()
+    known = dict(enumerate(about.get("tasks") or (), 1)) | {m["task"]: label_of(m) for m in own}
     evaluations: dict[str, Curve] = {}
     for m in own:
-        evaluations.setdefault(label_of(m), []).append((m["frames"], _number(m["return_mean"])))
+        mean = math.nan if m["return_mean"] is None else m["return_mean"]
+        evaluations.setdefault(label_of(m), []).append((m["frames"], mean))
     training: dict[int, Curve] = {}
     for m in log.of_kind("training"):
         if m["return_mean"] is not None:
@@ -277,8 +280,8 @@ def _history(log: RunLog) -> History:
     adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
     seconds = log.measurements[-1].get("seconds", 0.0)
     return History(
-        labels=_labels(log, own, len(performance[0])),
-        trained=_trained(log),
+        labels=tuple(str(known.get(task, f"task {task}")) for task in range(1, len(performance[0]) + 1)),
+        trained=tuple(tuple(number - 1 for number in block) for block in about.get("trained") or ()),
         ends=tuple(log.ends()),
         performance=performance,
         evaluations=evaluations,
@@ -288,22 +291,6 @@ def _history(log: RunLog) -> History:
         seconds=seconds,
         experts_together=tuple("together" in each for line in log.of_kind("experts") for each in line["experts"]),
     )
-
-
-def _labels(log: RunLog, own: Iterable[Mapping[str, Any]], count: int) -> tuple[str, ...]:
-    """Name of each task, as the first line says or else its evaluations."""
-    said = log.of_kind("run")[0].get("tasks") or ()
-    known = {**dict(enumerate(said, 1)), **{m["task"]: label_of(m) for m in own}}
-    return tuple(str(known.get(task, f"task {task}")) for task in range(1, count + 1))
-
-
-def _trained(log: RunLog) -> tuple[tuple[int, ...], ...]:
-    said = log.of_kind("run")[0].get("trained") or ()
-    return tuple(tuple(number - 1 for number in block) for block in said)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]:
@@ -340,13 +327,11 @@ def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:
 
 def _in_order(runs: Sequence[Run]) -> list[Run]:
     """Runs of one curriculum and agent where the first of them is, by the settings in which they differ."""
-    alike = _alike(runs)
-    return [
-        run
-        for some in alike.values()
-        for keys in [_differing(some)]
-        for run in sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
-    ]
+    found: list[Run] = []
+    for some in _alike(runs).values():
+        keys = _differing(some)
+        found += sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
+    return found
 
 
 def _rank(value: Any) -> tuple[int, float, str]:
@@ -357,16 +342,17 @@ def _rank(value: Any) -> tuple[int, float, str]:
 def _agent_names(runs: Sequence[Run]) -> list[str]:
     """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
     differing = {key: _differing(some) for key, some in _alike(runs).items()}
-    codes = _codes(runs)
-    return [_named(run, differing[run.group, _name(run)]) + code for run, code in zip(runs, codes, strict=True)]
-
-
-def _codes(runs: Sequence[Run]) -> list[str]:
-    """The code of each run, as far as that of runs that are alike else differs."""
-    of: dict[Any, list[Run]] = {}
+    twins: dict[Any, list[Run]] = {}
     for run in runs:
-        of.setdefault(run.alike, []).append(run)
-    return [f" ({code})" if (code := code_of(run, of[run.alike])) else "" for run in runs]
+        twins.setdefault(run.alike, []).append(run)
+    names = []
+    for run in runs:
+        parts = [_name(run)]
+        for key in differing[run.group, _name(run)]:
+            parts.append(f"{key.removeprefix('agent.').removeprefix('method.')}={run.settings.get(key)}")
+        code = code_of(run, twins[run.alike])
+        names.append(" ".join([*parts, f"({code})"] if code else parts))
+    return names
 
 
 def code_of(run: Run, others: Sequence[Run]) -> str:
@@ -390,18 +376,8 @@ def _alike(runs: Iterable[Run]) -> dict[tuple[Any, ...], list[Run]]:
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:
-    values: dict[str, set[str]] = {}
-    for run in runs:
-        for key in run.settings:
-            values.setdefault(key, set())
-    for key, seen in values.items():
-        seen |= {json.dumps(run.settings.get(key)) for run in runs}
-    return sorted(key for key, seen in values.items() if len(seen) > 1)
-
-
-def _named(run: Run, keys: Iterable[str]) -> str:
-    short = {key: key.removeprefix("agent.").removeprefix("method.") for key in keys}
-    return " ".join([_name(run), *(f"{name}={run.settings.get(key)}" for key, name in short.items())])
+    keys = {key for run in runs for key in run.settings}
+    return sorted(key for key in keys if len({json.dumps(run.settings.get(key)) for run in runs}) > 1)
 
 
 def _name(run: Run) -> str:

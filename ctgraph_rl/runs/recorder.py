@@ -145,8 +145,9 @@ class Recorder:
             make_logger = logger_of(logger)
             self._checkpoints = Checkpoints(self.run_dir / CHECKPOINTS, checkpoint_seconds)
             self.log = self._opened(self.run_dir, overwrite, resume)
-            if not self.finished:
-                self._track(make_logger, self.run_dir)
+            if not self.finished and make_logger is not None:
+                self._tracker = Tracker(make_logger, self.run_dir, dict(flat(self._about["config"])))
+                self.log.listeners.append(self._tracker)
         self._evaluator = Evaluator(curriculum, seed, self.log)
 
     def _opened(self, run_dir: Path, overwrite: bool, resume: bool) -> RunLog:
@@ -205,12 +206,6 @@ class Recorder:
         self.frames = self._evaluated = self._trained = self.curriculum.num_frames
         print(f"{run_dir} holds this run, finished: its results are shown; overwrite=True runs it again")
         return log
-
-    def _track(self, make_logger: Callable[[Path], Logger] | None, run_dir: Path) -> None:
-        """Let a logger have all measurements."""
-        if make_logger is not None:
-            self._tracker = Tracker(make_logger, run_dir, dict(flat(self._about["config"])))
-            self.log.listeners.append(self._tracker)
 
     @takes_numbers
     def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:

@@ -57,7 +57,7 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     job = Job.of(runs[0][0], Interrupt())
     generator = _generator()
-    reason = _why_one_after_the_other(job)
+    reason = why_not_together(job.curriculum) or why_agents_learn_alone(job.agent, job.device)
     if reason is None:
         run_as_one(runs, (job, generator))
     else:
@@ -65,11 +65,6 @@ def run_seeds(cfg: Any, run_dir: Path) -> list[Path]:
         torch.set_rng_state(generator.get_state())
         _run_in_turn(runs, job)
     return [folder for _, folder in runs]
-
-
-def _why_one_after_the_other(job: Job) -> str | None:
-    """Return why seeds of a job's configuration cannot learn as one batch; None if they can."""
-    return why_not_together(job.curriculum) or why_agents_learn_alone(job.agent, job.device)
 
 
 def _run_in_turn(runs: Sequence[JobAndPath], first: Job) -> None:

@@ -176,13 +176,14 @@ def in_digits(arguments: Sequence[str]) -> list[str]:
 
     Settings that have a fraction or a text in a file of ``conf`` are left unchanged.
     """
-    return [_in_digits(*each.partition("=")) if _WITH_EXPONENT.search(each) else each for each in arguments]
-
-
-def _in_digits(name: str, sign: str, value: str) -> str:
-    known = list(_defaults(name.lstrip("+")))
-    is_count = bool(known) and all(each is None or type(each) is int for each in known)
-    return f"{name}{sign}{_WITH_EXPONENT.sub(_whole, value) if is_count else value}"
+    written = []
+    for each in arguments:
+        name, sign, value = each.partition("=")
+        known = list(_defaults(name.lstrip("+"))) if _WITH_EXPONENT.search(each) else []
+        if known and all(default is None or type(default) is int for default in known):
+            value = _WITH_EXPONENT.sub(_whole, value)
+        written.append(f"{name}{sign}{value}")
+    return written
 
 
 def _whole(number: re.Match[str]) -> str:
@@ -218,11 +219,7 @@ def as_typed(message: str, settings: Mapping[str, Any], typed: Iterable[str]) ->
     for key, names in homes.items():
         meant = names if len(names) == 1 else [name for name in names if name in given]
         if len(meant) == 1:
-            message = re.sub(_mention(key), meant[0], message)
+            name = rf"(?<![\w.'\"/(-]){re.escape(key)}"
+            word = rf"{name}(?==)|(?:(?<=^)|(?<=; )){re.escape(key)}(?= must )"
+            message = re.sub(rf"{name}(?![\w.'\"/(-])" if "_" in key else word, meant[0], message)
     return message
-
-
-def _mention(key: str) -> str:
-    """Return the pattern of a setting's name in a message."""
-    name = rf"(?<![\w.'\"/(-]){re.escape(key)}"
-    return rf"{name}(?![\w.'\"/(-])" if "_" in key else rf"{name}(?==)|(?:(?<=^)|(?<=; )){re.escape(key)}(?= must )"

@@ -56,7 +56,10 @@ class RunOutcome(NamedTuple):
     def of(cls, folder: Path) -> RunOutcome:
         """Return what a directory holds; no clock is compared, for that of another machine may be behind."""
         results = _identity(folder / METRICS)
-        return cls(results and (results, _content(folder / SUMS)), _identity(folder / FAILURE))
+        sums = b""
+        with suppress(OSError, ValueError):
+            sums = read_regular(folder / SUMS, MOST_BYTES_OF_SUMS)
+        return cls(results and (results, sums), _identity(folder / FAILURE))
 
 
 NOTHING = RunOutcome()
@@ -80,13 +83,6 @@ def marked_if_it_fails(run_dir: Path) -> Iterator[None]:
             with suppress(OSError):
                 write_whole(mark, f"{type(error).__name__}: {config.explain(error)}\n", synced=False)
         raise
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return read_regular(path, MOST_BYTES_OF_SUMS)
-    except (OSError, ValueError):
-        return b""
 
 
 def _identity(path: Path) -> Hashable:

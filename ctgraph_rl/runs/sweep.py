@@ -137,7 +137,11 @@ class Sweeper(Base):
                     self._launch(self._jobs({folder: cells[folder] for folder in left}), errors)
         finally:
             found = {folder: self._status(folder, before[folder], errors.get(folder)) for folder in cells}
-            self._show(cells, found, len(batch) - len(cells))
+            if self._num_unknown:
+                unsaid = "cells do not say of which source they are, so it may have changed since"
+                print(f"note: {self._num_unknown} {unsaid}")
+            statuses = dict(zip(shortened(list(cells.values())), found.values(), strict=True))
+            print(report(statuses, len(batch) - len(cells), None if self.status else SHOWN))
         if any(state != DONE for state, _ in found.values()):
             sys.exit(1)
         if not self.status:
@@ -169,12 +173,6 @@ class Sweeper(Base):
         values = f"{given}: glob chooses files of a group, such as agent or method; {group} has values, such as 1,2"
         require((bool(names), values))
         require((any(parsed.sweep_iterator()), f"{given} matches none of {', '.join(names)}"))
-
-    def _show(self, cells: Mapping[Path, Overrides], found: Mapping[Path, Status], repeated: int) -> None:
-        if self._num_unknown:
-            print(f"note: {self._num_unknown} cells do not say of which source they are, so it may have changed since")
-        statuses = dict(zip(shortened(list(cells.values())), found.values(), strict=True))
-        print(report(statuses, repeated, None if self.status else SHOWN))
 
     def _status(self, folder: Path, before: RunOutcome, error: str | None) -> Status:
         found = status_of(folder, before, error)
@@ -249,18 +247,16 @@ class Sweeper(Base):
 
     def _value(self, setting: str) -> tuple[str, Any] | None:
         """Return key and value of a setting that changes a value; None for one that chooses a file, adds or removes."""
+        assert self.hydra_context is not None
         if setting not in self._values:
             [parsed] = OverridesParser.create().parse_overrides([setting])
-            self._values[setting] = (parsed.key_or_group, parsed.value()) if self._is_value(parsed) else None
+            key = parsed.key_or_group
+            value = parsed.value()
+            plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(value, dict)
+            options = self.hydra_context.config_loader.get_group_options
+            is_file = key.startswith("hydra") or ("." not in key and options(key))  # asking Hydra is slow
+            self._values[setting] = (key, value) if plain and not is_file else None
         return self._values[setting]
-
-    def _is_value(self, parsed: Override) -> bool:
-        assert self.hydra_context is not None
-        key = parsed.key_or_group
-        plain = parsed.type == OverrideType.CHANGE and parsed.package is None and not isinstance(parsed.value(), dict)
-        may_be_group = "." not in key  # asking Hydra is slow
-        is_file = key.startswith("hydra") or (may_be_group and self.hydra_context.config_loader.get_group_options(key))
-        return plain and not is_file
 
     def _jobs(self, cells: Mapping[Path, Overrides]) -> dict[Overrides, list[Path]]:
         """Return the settings of jobs, each with the cells that it runs: one, or with ``together`` those of all seeds.
@@ -277,7 +273,13 @@ class Sweeper(Base):
             begun = self._begun.get(folder)
             alone = seed if begun == () or not seed else ""
             groups.setdefault((others, begun, alone), {})[seed] = folder
-        return {_job(others, list(group)): list(group.values()) for (others, *_), group in groups.items()}
+        jobs: dict[Overrides, list[Path]] = {}
+        for (others, *_), group in groups.items():
+            first = next(iter(group))
+            own = [f"seed={first}"] if first else []
+            own += ["together=true", f"+seeds=[{','.join(group)}]"] if len(group) > 1 else []
+            jobs[*others, *own] = list(group.values())
+        return jobs
 
     def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:
         """Let the launcher run the jobs; collect what they raise by the directories of their cells."""
@@ -300,13 +302,6 @@ class Sweeper(Base):
 
 def _key(setting: str) -> str:
     return setting.partition("=")[0]
-
-
-def _job(others: Overrides, seeds: Sequence[str]) -> Overrides:
-    """Return the settings of a job that runs cells which differ only in their seeds."""
-    own = [f"seed={seed}" for seed in seeds[:1] if seed]
-    group = ["together=true", f"+seeds=[{','.join(seeds)}]"] if len(seeds) > 1 else []
-    return (*others, *own, *group)
 
 
 @contextmanager

@@ -76,7 +76,9 @@ class Tracker:
             raise
         except Exception as error:
             self._give_up(error)
-        self._send("log_hparams", {name: _plain(value) for name, value in hyperparameters.items()})
+        kinds = (bool, int, float, str)  # that every logger takes
+        given = {name: each if isinstance(each, kinds) else str(each) for name, each in hyperparameters.items()}
+        self._send("log_hparams", given)
 
     def __call__(self, measurement: Mapping[str, Any]) -> None:
         """Send one measurement, with the run's frames as the step; before the first, those of a resumed run's log."""
@@ -222,8 +224,3 @@ def _need(package: str) -> None:
 def _name(folder: Path) -> str:
     """A run's name from its directory, such as ``su_b1_4tasks/dqn-seed0-1a2b3c4d``."""
     return "/".join(folder.parent.parts[-2:])
-
-
-def _plain(value: Any) -> Any:
-    """A hyperparameter as every logger takes it."""
-    return value if isinstance(value, (bool, int, float, str)) else str(value)

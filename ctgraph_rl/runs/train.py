@@ -89,24 +89,6 @@ def _agent_rule(agent: object) -> tuple[bool, str]:
     return built, f"{name} is no agent, it lacks {', '.join(missing)}: {fix}"
 
 
-def _part_rules(
-    curriculum: Any, experts: Any, checkpoints: object, listeners: object, console: object
-) -> list[tuple[bool, str]]:
-    """The rules of what `train` is given beside the curriculum and the agent."""
-    count = len(curriculum.tasks) if isinstance(curriculum, Curriculum) else 0
-    is_list = isinstance(experts, Sequence) and all(isinstance(each, Expert) for each in experts)
-    one_each = experts is None or (is_list and len(experts) == count)
-    can_listen = isinstance(listeners, Sequence) and all(map(callable, listeners))
-    is_console = console is None or isinstance(console, Console)
-    kept = checkpoints is None or isinstance(checkpoints, Checkpoints)
-    return [
-        (one_each, f"experts must be the Expert of each of {count} tasks, or None, got {experts!r:.80}"),
-        (kept, f"checkpoints must be Checkpoints(folder), or None, got {checkpoints!r:.80}"),
-        (can_listen, f"listeners must be a list of functions, such as [print], got {listeners!r:.80}"),
-        (is_console, f"console must be a rich.console.Console, or None, got {console!r:.80}"),
-    ]
-
-
 def _takes_specs(make_agent: Callable[..., object]) -> tuple[bool, str]:
     """The rule that a function can be called with the two specs."""
     try:
@@ -161,13 +143,22 @@ def train(
             the directory holds a run that cannot be resumed.
     """
     run_dir = as_path("run_dir", run_dir)
+    count = len(curriculum.tasks) if isinstance(curriculum, Curriculum) else 0
+    is_list = isinstance(experts, Sequence) and all(isinstance(each, Expert) for each in experts)
+    one_each = experts is None or (is_list and len(experts) == count)
+    can_listen = isinstance(listeners, Sequence) and all(map(callable, listeners))
+    is_console = console is None or isinstance(console, Console)
+    kept = checkpoints is None or isinstance(checkpoints, Checkpoints)
     require(
         _curriculum_rule(curriculum),
         _agent_rule(agent),
         seed_rule(seed),
         (is_json_object(config), f"config must be plain JSON values by name, got {config!r:.80}"),
         (run_dir.is_dir(), f"run_dir must be an existing directory, got {str(run_dir)!r:.80}; make it"),
-        *_part_rules(curriculum, experts, checkpoints, listeners, console),
+        (one_each, f"experts must be the Expert of each of {count} tasks, or None, got {experts!r:.80}"),
+        (kept, f"checkpoints must be Checkpoints(folder), or None, got {checkpoints!r:.80}"),
+        (can_listen, f"listeners must be a list of functions, such as [print], got {listeners!r:.80}"),
+        (is_console, f"console must be a rich.console.Console, or None, got {console!r:.80}"),
     )
     device, config = checked_device(device), {"seed": seed, **(config or {})}
     check_rows(curriculum, agent.num_envs)
@@ -210,7 +201,8 @@ class RunDirectory:
         if self.together:
             about |= {"together": list(self.together), "numbers": NUMBERS_TOGETHER}
         if saved is None:
-            log = _new_log(run_dir)
+            remove_results(run_dir)  # what a run left that was stopped before its first checkpoint
+            log = RunLog(run_dir / LOG)
         else:
             if saved["frames"] < curriculum.num_frames:
                 require(_same_group(run_dir, self.together))
@@ -341,12 +333,6 @@ def write_results(log: RunLog, curriculum: Curriculum, run_dir: Path, experts: S
     metrics = scores(log, curriculum, experts)
     write_sums(run_dir, metrics_text(metrics))
     write_metrics(run_dir / METRICS, metrics)
-
-
-def _new_log(run_dir: Path) -> RunLog:
-    """Return a new log in place of what a run left that was stopped before its first checkpoint."""
-    remove_results(run_dir)
-    return RunLog(run_dir / LOG)
 
 
 def remove_results(run_dir: Path) -> None:

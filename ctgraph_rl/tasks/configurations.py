@@ -16,6 +16,7 @@ from ctgraph_rl.checks import did_you_mean, is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
+from ctgraph_rl.tasks.paper_json import shown_ids
 from ctgraph_rl.tasks.task import Task
 
 OBSERVABILITY = ("full", "decisions", "surjective", "confounding")
@@ -68,16 +69,10 @@ def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Ob
         (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
         (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
     )
-    unique = kind in ("full", "decisions")
-    waits = {"full": graph.num_wait_states, "confounding": num_wait_images}.get(kind, 1)
-    decisions, ends = (graph.num_decision_states, graph.num_end_states) if unique else (1, 1)
-    order = [("wait", waits), ("decision", decisions)] if unique else [("decision", decisions), ("wait", waits)]
-    ids: dict[str, Any] = {}
-    first = 2
-    for name, size in (*order, ("end", ends)):
-        ids[f"{name}_ids"] = (first, first + size - 1)
-        first += size
-    return Observations(**ids, unique_waits=kind == "full", unique_decisions=unique)
+    found: dict[str, Any] = {"unique_waits": kind == "full", "unique_decisions": kind in ("full", "decisions")}
+    if kind == "confounding":
+        found |= {"decision_ids": (2, 2), "wait_ids": (3, 2 + num_wait_images)}
+    return shown_ids(graph, found)
 
 
 def ct_fo_b1(goal: tuple[int, ...] = (1, 1), image_seed: int = 1) -> Task:

@@ -102,19 +102,17 @@ class Curriculum:
         trained = set(self.tasks)
         trained_too = [task for task in self.evaluation.held_out if task in trained]
         one_each = self.protocol.task_id != "at_boundaries" or all(len(set(block.tasks)) == 1 for block in self.blocks)
+        how = self.evaluation
+        at_once = how.before and (how.tasks == "all" or bool(how.held_out))
+        evaluates = how.at_block_ends or at_once or 0 < how.every <= self.num_frames
         return [
             (one_shape, f"all tasks of a curriculum must show observations of one shape, got {shapes}"),
             (pads or len(actions) == 1, f"all tasks of a curriculum must have as many actions, got {actions}"),
             (not trained_too, f"held_out tasks must not be trained, got {trained_too[:3]}"),
             (self.num_frames <= LARGEST_INT, f"the blocks have {self.num_frames:,} frames together, at most 2**63 - 1"),
             (one_each, "task ids given at_boundaries need blocks of one task each"),
-            (self._ever_evaluates(), "nothing would be evaluated: set before, every or at_block_ends"),
+            (evaluates, "nothing would be evaluated: set before, every or at_block_ends"),
         ]
-
-    def _ever_evaluates(self) -> bool:
-        how = self.evaluation
-        at_once = how.before and (how.tasks == "all" or bool(how.held_out))
-        return how.at_block_ends or at_once or 0 < how.every <= self.num_frames
 
     @cached_property
     def tasks(self) -> tuple[TaskLike, ...]:
@@ -246,16 +244,16 @@ def _some(names: Sequence[str], between: str = ", ") -> str:
 def _canonical(value: Any) -> Any:
     """A value as plain JSON: dataclasses by name with the compared fields that differ from their defaults."""
     if is_dataclass(value) and not isinstance(value, type):
-        compared = [f for f in fields(value) if f.compare]
-        given = {f.name: getattr(value, f.name) for f in compared if getattr(value, f.name) != _default(f)}
-        return {"type": type_name(type(value)), **{name: _canonical(item) for name, item in given.items()}}
+        found = {"type": type_name(type(value))}
+        for field_ in fields(value):
+            item = getattr(value, field_.name)
+            default = field_.default if field_.default_factory is MISSING else field_.default_factory()
+            if field_.compare and item != default:
+                found[field_.name] = _canonical(item)
+        return found
     if isinstance(value, Iterable) and not isinstance(value, str):
         return [_canonical(item) for item in value]
     plain = value is None or isinstance(value, (bool, int, float, str))
     fix = "put @dataclass(frozen=True) above its class, whose fields then are part of the fingerprint"
     require((plain, f"a curriculum's parts must be dataclasses or plain values, got {value!r:.80}: {fix}"))
     return value
-
-
-def _default(field_: Any) -> Any:
-    return field_.default if field_.default_factory is MISSING else field_.default_factory()

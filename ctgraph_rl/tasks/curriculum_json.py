@@ -25,8 +25,8 @@ from ctgraph_rl import __version__
 from ctgraph_rl.checks import is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
-from ctgraph_rl.disk import read_regular, write_whole
-from ctgraph_rl.strict import json_value
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.strict import json_object
 from ctgraph_rl.tasks.images import IMAGE_SETS
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, is_kind
@@ -74,7 +74,13 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     }
     with _within(curriculum.name):
         _check_form(content)
-    content[_DERIVED] = _about(curriculum)
+    content[_DERIVED] = {
+        "written_by": f"ctgraph_rl {__version__}",
+        "num_frames": curriculum.num_frames,
+        "tasks": [
+            {"label": label} | _of_graph(task) for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
+        ],
+    }
     if path is not None:
         write_whole(path, file_text(content))
     return content
@@ -84,7 +90,7 @@ def read_curriculum(
     path_or_dict: str | PathLike[str] | Mapping[str, Any], make: Callable[..., Curriculum]
 ) -> Curriculum:
     """Return the curriculum of a JSON file or of its content, which ``make`` makes; see `Curriculum.from_json`."""
-    source, content = _load(path_or_dict)
+    source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     with _within(source):
         _check_form({key: value for key, value in content.items() if key != _DERIVED})
         schema = content.get("schema")
@@ -133,16 +139,6 @@ def _names(kind: type) -> list[str]:
     return [field.name for field in fields(kind) if field.init]
 
 
-def _about(curriculum: Curriculum) -> dict[str, Any]:
-    return {
-        "written_by": f"ctgraph_rl {__version__}",
-        "num_frames": curriculum.num_frames,
-        "tasks": [
-            {"label": label} | _of_graph(task) for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
-        ],
-    }
-
-
 def _of_graph(task: TaskLike) -> dict[str, Any]:
     """Return numbers that follow from a CT-graph."""
     if not isinstance(task, Task):
@@ -174,30 +170,6 @@ def _within(place: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from error
-
-
-def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-    """Return the name of the source for errors, and its content."""
-    if isinstance(path_or_dict, Mapping):
-        return "curriculum", path_or_dict
-    is_path = isinstance(path_or_dict, (str, PathLike))
-    require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
-    try:
-        data = read_regular(path_or_dict, MAX_BYTES)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
-    with _within(str(path_or_dict)):
-        return str(path_or_dict), _parse(data)
-
-
-def _parse(data: bytes) -> Mapping[str, Any]:
-    """The object that a file holds."""
-    try:
-        content = json_value(data, finite=False, nesting=MAX_NESTING)  # `_check_form` says where a number is not
-    except ValueError as error:
-        raise ValueError(f"must be JSON: {error}") from error
-    require((isinstance(content, dict), f"must hold a JSON object, got {type(content).__name__}"))
-    return content
 
 
 def _check_form(value: Any, nesting: int = 1) -> None:
@@ -247,7 +219,9 @@ def _task(content: Any) -> TaskLike:
     if not isinstance(content, Mapping) or "type" not in content:
         return _graph(content)
     task = _built(_kind(content["type"]), {key: item for key, item in content.items() if key != "type"}, {})
-    unknown = [name for name in getattr(task, "modules", ()) if not _is_known(name)]
+    known = ("ctgraph_rl", "curricula", "gymnasium")
+    needed = [name for name in getattr(task, "modules", ()) if name not in sys.modules]
+    unknown = [name for name in needed if name.partition(".")[0] not in known]
     fix = "import them first, as nothing of a file is imported"
     require((not unknown, f"the task needs the modules {', '.join(unknown)}: {fix}"))
     return task
@@ -264,11 +238,6 @@ def _kind(name: Any) -> type:
     known = isinstance(kind, type) and kind.__module__ == module and is_kind(kind)
     require((known, f"type {name!r:.80} is no kind of tasks that is known here: {fix}"))
     return kind  # type: ignore[return-value]
-
-
-def _is_known(module: str) -> bool:
-    """Return whether a module may be imported for a file: it is imported, ours or Gymnasium's."""
-    return module in sys.modules or module.partition(".")[0] in ("ctgraph_rl", "curricula", "gymnasium")
 
 
 def _graph(content: Any) -> Task:

@@ -72,7 +72,10 @@ class Observations:
         rotation = self.read_rotation
         degrees = f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {rotation!r}"
         require(
-            *((_is_range(ids), _range_rule(name, ids)) for name, ids in given.items()),
+            *(
+                (_is_range(ids), f"{name} must be (first, last) with 0 <= first <= last, got {ids!r}")
+                for name, ids in given.items()
+            ),
             *_overlap_rules({name: ids for name, ids in given.items() if _is_range(ids)}),
             *true_or_false(**{field.name: getattr(self, field.name) for field in fields(self) if "bool" in field.type}),
             (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
@@ -105,21 +108,18 @@ class Observations:
 
     def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
         """Return the rules on a graph: unique ids need as many ids as there are states."""
-        kinds = (kind for kind in StateType if self.is_unique(kind))
-        return [self._room_rule(kind, getattr(graph, f"num_{kind.name.lower()}_states")) for kind in kinds]
-
-    def _room_rule(self, kind: StateType, count: int) -> tuple[bool, str]:
-        name, (first, last) = f"{kind.name.lower()}_ids", self.ids(kind)
-        need = f"unique_{kind.name.lower()}s needs {count} {name}, got {last - first + 1} in ({first}, {last})"
-        return last - first + 1 >= count, f"{need}; use ({first}, {first + count - 1})"
+        found = []
+        for kind in filter(self.is_unique, StateType):
+            name = kind.name.lower()
+            count = getattr(graph, f"num_{name}_states")
+            first, last = self.ids(kind)
+            need = f"unique_{name}s needs {count} {name}_ids, got {last - first + 1} in ({first}, {last})"
+            found.append((last - first + 1 >= count, f"{need}; use ({first}, {first + count - 1})"))
+        return found
 
 
 def _is_range(value: object) -> bool:
     return isinstance(value, tuple) and len(value) == 2 and is_int(value[0], 0) and is_int(value[1], value[0])
-
-
-def _range_rule(name: str, value: object) -> str:
-    return f"{name} must be (first, last) with 0 <= first <= last, got {value!r}"
 
 
 def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:

@@ -17,8 +17,10 @@ from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
 
+SHAPE = {"d": "depth", "b": "branching_factor", "p": "wait_prob"}
+
 SECTIONS: dict[str, dict[str, str]] = {
-    "graph_shape": {"d": "depth", "b": "branching_factor", "p": "wait_prob"},
+    "graph_shape": SHAPE,
     "reward": {"high_r": "goal_reward", "fail_r": "fail_reward", "std_r": "reward_std"},
     "observations": {
         "MDP_D": "unique_decisions",
@@ -38,8 +40,6 @@ SECTIONS: dict[str, dict[str, str]] = {
 
 SEED = "Seed"
 """Seed of the environment's random numbers, which is no part of a task."""
-
-REQUIRED = ("depth", "branching_factor")
 
 DEFAULTS: dict[str, Any] = {
     "wait_prob": 0.0,
@@ -75,7 +75,7 @@ def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int]
     found = dict(_found(source, content))
     require(
         (goal is not None, "goal is not in Table 3 and must be given: d decisions in 1..b, such as goal=(1, 2)"),
-        *((name in found, f"{source}: graph_shape.{key} is missing") for key, name in _required()),
+        *((SHAPE[key] in found, f"{source}: graph_shape.{key} is missing") for key in ("d", "b")),
     )
     found = DEFAULTS | found
     graph = CTGraph(found["branching_factor"], found["depth"], found["wait_prob"])
@@ -88,10 +88,6 @@ def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int]
     return {"graph": graph, "goal": goal, "observations": observations, "images": images, **rewards}
 
 
-def _required() -> Iterator[tuple[str, str]]:
-    return ((key, name) for key, name in SECTIONS["graph_shape"].items() if name in REQUIRED)
-
-
 def _found(source: str, content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield what a file says, in our words."""
     for written, section in content.items():
@@ -99,17 +95,18 @@ def _found(source: str, content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]
         if name == SEED:
             continue
         known = SECTIONS.get(name)
-        require((known is not None, f"{source}: unknown section {written!r}{_choices(name, [*SECTIONS, SEED])}"))
+        require((known is not None, f"{source}: unknown section {written!r}{suggested(name, [*SECTIONS, SEED])}"))
         require((isinstance(section, Mapping), f"{source}: section {written!r} must be an object, got {section!r}"))
         for key, value in section.items():
             meaning = known.get(key.replace(" ", "_"))  # type: ignore[union-attr]
-            unknown = f"{source}: Table 3 has no {written}.{key}{_choices(key, list(known))}"  # type: ignore[arg-type]
+            unknown = f"{source}: Table 3 has no {written}.{key}{suggested(key, list(known))}"  # type: ignore[arg-type]
             require((meaning is not None, unknown))
             yield str(meaning), value
 
 
-def _choices(name: str, known: Sequence[str]) -> str:
-    close = get_close_matches(name, known, n=1)
+def suggested(name: object, known: Sequence[str]) -> str:
+    """Return the end of a message about an unknown name: the nearest one, or all."""
+    close = get_close_matches(str(name), known, n=1)
     return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING, Any
@@ -16,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 from ctgraph_rl.checks import is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
-from ctgraph_rl.disk import read_regular, write_whole
-from ctgraph_rl.strict import json_value
+from ctgraph_rl.disk import write_whole
+from ctgraph_rl.strict import json_object
 from ctgraph_rl.tasks.images import ReferenceImages, ReferenceOneHot
 from ctgraph_rl.tasks.images.image_set import WHITE
 from ctgraph_rl.tasks.images.reference_images import MAX_SEED
 from ctgraph_rl.tasks.observations import MAX_READ_ROTATION, Observations
-from ctgraph_rl.tasks.paper_json import is_paper_json, read_paper_json
+from ctgraph_rl.tasks.paper_json import is_paper_json, read_paper_json, suggested
 
 if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
@@ -72,7 +71,7 @@ _LEGACY: dict[str, Any] = {"reward_cue": True, "cue_wraps": True, "legacy_index"
 
 def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
     """The arguments of `Task` for a configuration file; see `Task.from_json`."""
-    source, content = _load(path_or_dict)
+    source, content = json_object(path_or_dict, "configuration", MAX_BYTES)
     if is_paper_json(content):
         return read_paper_json(source, content, goal)
     draws = "the authors' implementation draws one at random or sets it with set_high_reward_path, counting from 0"
@@ -85,24 +84,6 @@ def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Seque
         found.update(min_episodes=-1, max_episodes=-1)
     require(*_value_rules(found, _places(dialect)))
     return {"goal": goal, **_arguments(found)}
-
-
-def _load(path_or_dict: str | PathLike[str] | Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-    """Return the name of the source for errors, and its content."""
-    if isinstance(path_or_dict, Mapping):
-        return "configuration", path_or_dict
-    is_path = isinstance(path_or_dict, (str, PathLike))
-    require((is_path, f"from_json needs the path of a JSON file or a dict, got {path_or_dict!r}"))
-    try:
-        data = read_regular(path_or_dict, MAX_BYTES)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path_or_dict} must be a JSON file that can be read: {error}") from error
-    try:
-        content = json_value(data, finite=False)
-    except ValueError as error:
-        raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
-    require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))
-    return str(path_or_dict), content
 
 
 def _places(dialect: str) -> dict[str, tuple[str, str]]:
@@ -122,7 +103,7 @@ def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
     """Return the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
     wanted = _places(dialect).values()
     names = (*_SECTIONS, "general_seed")
-    unknown = [f"unknown section {name!r}{_suggest(name, names)}" for name in content if name not in names]
+    unknown = [f"unknown section {name!r}{suggested(name, names)}" for name in content if name not in names]
     whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
     absent = {name: "must be an object" if name in content else "is missing" for name in _SECTIONS if name not in whole}
     no_section = [f"section {name!r} {fault}" for name, fault in absent.items()]
@@ -147,12 +128,7 @@ def _surplus(section: str, key: str, dialect: str) -> str:
                 fix = f"use {here[name][1]!r}" if name in here else "leave it out"
                 return f"{section}.{key} is of the {other} dialect, the other keys of the {dialect} one: {fix}"
     keys = [known for home, known in here.values() if home == section]
-    return f"unknown key {section}.{key}{_suggest(key, keys)}"
-
-
-def _suggest(name: object, choices: Sequence[str]) -> str:
-    close = get_close_matches(str(name), choices, n=1)
-    return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(choices)}"
+    return f"unknown key {section}.{key}{suggested(key, keys)}"
 
 
 def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[tuple[bool, str]]:

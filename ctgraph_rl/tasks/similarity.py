@@ -107,7 +107,7 @@ def shared_images(tasks: Sequence[Task]) -> Tensor:
     Raises:
         ValueError: for image sets of more than `MAX_COMPARED_BYTES`, and too many states with unique ids.
     """
-    shown = [_images_shown(task) for task in _tasks(tasks)]
+    shown = [{content for kind in StateType for content in _contents(task, _ids(task, kind))} for task in _tasks(tasks)]
     return _matrix(shown, lambda one, other: len(one & other) / len(one | other))
 
 
@@ -121,7 +121,13 @@ def graph_containment(tasks: Sequence[Task]) -> Tensor:
     def share(one: Task, other: Task) -> float:
         smaller = min(task.graph.num_decision_states for task in (one, other))
         common = _common(one, other)
-        return (common.num_decision_states - _num_rewired(one, other, common)) / smaller
+        b = common.branching_factor
+        swaps = {one.swapped_branches, other.swapped_branches}
+        rewired = set()  # decision states of the common tree that lead elsewhere in one of the tasks
+        for swap in swaps if len(swaps) > 1 else ():
+            if swap is not None and len(swap[0]) < common.depth and max((*swap[0], swap[1][0])) <= b:
+                rewired.add(swap[0])
+        return (common.num_decision_states - len(rewired)) / smaller
 
     return _matrix(_tasks(tasks), share)
 
@@ -147,15 +153,6 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
         for j, other in enumerate(items[: i + 1]):
             matrix[i, j] = matrix[j, i] = share(one, other)
     return matrix
-
-
-def _num_rewired(one: Task, other: Task, common: CTGraph) -> int:
-    """Return how many decision states of the common tree lead elsewhere in one of two tasks than in the other."""
-    swaps = {one.swapped_branches, other.swapped_branches}
-    b = common.branching_factor
-    differing = [swap for swap in swaps if swap is not None] if len(swaps) > 1 else []
-    inside = [path for path, (first, _) in differing if len(path) < common.depth and max((*path, first)) <= b]
-    return len(set(inside))
 
 
 def _common(one: Task, other: Task) -> CTGraph:
@@ -212,7 +209,8 @@ def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[Stat
     step = task.step_reward
     p = task.graph.wait_prob
     fails = step + task.fail_reward
-    margin = ROUNDING * _largest(task)
+    steps = 2 * (task.graph.depth + 1) / (1 - p)
+    margin = ROUNDING * (abs(task.goal_reward) + abs(task.fail_reward) + abs(step) * steps)  # of the largest value
     arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)
     sets = {}
     for level in reversed(range(task.graph.depth + 1)):
@@ -224,11 +222,6 @@ def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[Stat
             sets[StateType.DECISION, level - 1] = _best(deciding, fails, num_actions, 1, margin)
             arrival = gamma * best.at_decision(children, level - 1)
     return sets
-
-
-def _largest(task: Task) -> float:
-    steps = 2 * (task.graph.depth + 1) / (1 - task.graph.wait_prob)
-    return abs(task.goal_reward) + abs(task.fail_reward) + abs(task.step_reward) * steps
 
 
 def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: float) -> list[int]:
@@ -299,10 +292,6 @@ def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]
             ids = _unique_ids(task, kind, level)
             sets = choice.of_nodes(kind, level, range(len(ids)))
             yield from (([number], actions) for number, actions in zip(ids, sets, strict=True))
-
-
-def _images_shown(task: Task) -> set[bytes]:
-    return {content for kind in StateType for content in _contents(task, _ids(task, kind))}
 
 
 def _ids(task: Task, kind: StateType) -> Sequence[int]:

@@ -113,7 +113,8 @@ class Task:
         self._check_parts()
         object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
-        object.__setattr__(self, "swapped_branches", _nested(self.swapped_branches))
+        swap = as_tuple(self.swapped_branches)
+        object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, swap)) if isinstance(swap, tuple) else swap)
         one_hot = len(self.images.shape) == 1
         x = self.observations
         varies = x.read_noise or x.read_rotation or (x.reward_cue and not has_cue_element(self.images))
@@ -237,7 +238,9 @@ class Task:
         return holds, message
 
     def _swap_rule(self) -> tuple[bool, str]:
-        (b, d), swap = (self.graph.branching_factor, self.graph.depth), self.swapped_branches
+        b = self.graph.branching_factor
+        d = self.graph.depth
+        swap = self.swapped_branches
         pairs = isinstance(swap, tuple) and len(swap) == 2 and all(isinstance(part, tuple) for part in swap)
         in_range = pairs and all(is_int(branch, 1, b) for part in swap or () for branch in part)
         holds = in_range and swap is not None and len(swap[0]) < d and len(swap[1]) == 2 and swap[1][0] < swap[1][1]
@@ -317,15 +320,22 @@ class Task:
 
     @property
     def label_parts(self) -> dict[str, str]:
-        """Parts of a task's label in tables: goal, depth, branching factor, wait probability and images."""
+        """Parts of a task's label in tables: goal, depth, branching factor, wait probability, images and swap.
+
+        A swap is ``swap1.2at2`` for the branches 1 and 2 of the decision state behind branch 2.
+        """
         images = type(self.images).__name__.lower() if self.image_seed is None else f"img{self.image_seed}"
+        swap = "noswap"
+        if self.swapped_branches is not None:
+            path, pair = (".".join(map(str, part)) for part in self.swapped_branches)
+            swap = f"swap{pair}" + (f"at{path}" if path else "")
         return {
             "goal": f"goal{'.'.join(map(str, self.goal))}",
             "depth": f"d{self.graph.depth}",
             "branching_factor": f"b{self.graph.branching_factor}",
             "wait_prob": f"p{self.graph.wait_prob:g}",
             "images": images,
-            "swapped_branches": _swap_label(self.swapped_branches),
+            "swapped_branches": swap,
         }
 
 
@@ -346,20 +356,6 @@ def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
     """
     require((are_graphs(tasks), f"{what} needs CT-graphs, not {type(tasks[0]).__name__}; take another curriculum"))
     return tasks  # type: ignore[return-value]
-
-
-def _nested(value: object) -> object:
-    """A list-like value of list-like values as a tuple of tuples; anything else unchanged."""
-    outer = as_tuple(value)
-    return tuple(map(as_tuple, outer)) if isinstance(outer, tuple) else outer
-
-
-def _swap_label(swap: tuple[tuple[int, ...], tuple[int, int]] | None) -> str:
-    """Return ``swap1.2at2`` for the branches 1 and 2 of the decision state behind branch 2."""
-    if swap is None:
-        return "noswap"
-    path, pair = (".".join(map(str, part)) for part in swap)
-    return f"swap{pair}" + (f"at{path}" if path else "")
 
 
 def _reward_rule(name: str, value: object) -> tuple[bool, str]:

@@ -116,7 +116,10 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
     Raises:
         ValueError: for other rewards, saying which; their best policies may fail on purpose or seek several end states.
     """
-    require(*_ceiling_rules(task))
+    b = task.graph.branching_factor
+    shares_ids = task.observations.legacy_index and task.observations.unique_decisions and b > 2
+    own = f"ids that no two states share, not a legacy_index with branching_factor={b}, where they do"
+    require(*_needle_rules(task, "memoryless"), (not shares_ids, f"the memoryless ceiling is exact only for {own}"))
     if task.observations.unique_decisions:
         return task.goal_reward
     counts = list(Counter(task.goal_decisions).values())
@@ -380,13 +383,6 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
     wrong = ~((policy >= 0).all(-1) & ((sums - 1).abs() <= SUM_TOLERANCE))
     rows = wrong.nonzero().flatten()[:5].tolist()
     return [(not rows, f"rows of policy must be >= 0 and sum to 1, not so rows {rows}")]
-
-
-def _ceiling_rules(task: Task) -> list[tuple[bool, str]]:
-    b = task.graph.branching_factor
-    shares = task.observations.legacy_index and task.observations.unique_decisions and b > 2
-    own = f"ids that no two states share, not a legacy_index with branching_factor={b}, where they do"
-    return [*_needle_rules(task, "memoryless"), (not shares, f"the memoryless ceiling is exact only for {own}")]
 
 
 def _needle_rules(task: Task, ceiling: str) -> list[tuple[bool, str]]:

@@ -6,7 +6,7 @@ The panels leave wait states out: there is one before each decision and end stat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,14 +67,14 @@ def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     for number, block in enumerate(curriculum.blocks, 1):
         for task in dict.fromkeys(ct_graphs(block.tasks, "a figure of graphs")):
             blocks.setdefault(task.graph, {}).setdefault(task.goal, []).append(number)
-    return {graph: {goal: _label(goal, of) for goal, of in goals.items()} for graph, goals in blocks.items()}
-
-
-def _label(goal: Goal, blocks: Sequence[int]) -> str:
-    numbers = sorted(set(blocks))
-    where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
-    where = f"block {numbers[0]}" if len(numbers) == 1 else where
-    return f"{in_digits(goal)}\n{where}"
+    labels: dict[CTGraph, dict[Goal, str]] = {}
+    for graph, goals in blocks.items():
+        for goal, of_goal in goals.items():
+            numbers = sorted(set(of_goal))
+            where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
+            where = f"block {numbers[0]}" if len(numbers) == 1 else where
+            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{where}"
+    return labels
 
 
 def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
@@ -85,22 +85,16 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
     level = len(layout.leaves) <= MOST_LEVEL
     _draw_edges(axes, layout, places, shown)
     _draw_states(axes, layout, places, shown)
-    for end in shown:
-        _write(axes, places[end], labels[end], level=level)
-    axes.set_title(_title(graph, len(goals), len(shown)), fontsize=9)
-    axes.set(xlim=(-0.02, 1.02), ylim=(-graph.depth - _room(graph.depth, level), 0.3))
+    below: dict[str, Any] = {"xytext": (0, -9), "textcoords": "offset points", "ha": "center", "va": "top"}
+    for end in shown:  # labels stand upright where there is little room
+        words = labels[end] if level else labels[end].replace("\n", "  ")
+        axes.annotate(words, places[end], fontsize=7, rotation=0 if level else 90, **below)
+    some = f", {len(shown)} shown" if len(shown) < len(goals) else ""
+    count = f"{len(goals):,} {'goal' if len(goals) == 1 else 'goals'}{some}"
+    axes.set_title(f"{shape_of(graph)}: {count}, {graph.num_end_states:,} end states", fontsize=9)
+    room = (0.16 if level else 0.32) * graph.depth + 0.2  # for labels, in decisions
+    axes.set(xlim=(-0.02, 1.02), ylim=(-graph.depth - room, 0.3))
     axes.axis("off")
-
-
-def _title(graph: CTGraph, goals: int, shown: int) -> str:
-    some = f", {shown} shown" if shown < goals else ""
-    count = f"{goals:,} {'goal' if goals == 1 else 'goals'}{some}"
-    return f"{shape_of(graph)}: {count}, {graph.num_end_states:,} end states"
-
-
-def _room(depth: int, level: bool) -> float:
-    """Height below the end states for labels, in decisions."""
-    return (0.16 if level else 0.32) * depth + 0.2
 
 
 def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
@@ -124,18 +118,3 @@ def _draw_states(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], go
     ):
         if points:
             axes.plot(*zip(*points, strict=True), zorder=3, clip_on=False, **style)
-
-
-def _write(axes: Any, place: PlanePoint, text: str, level: bool) -> None:
-    """A goal's label below it, upright where there is little room."""
-    words, rotation = (text, 0) if level else (text.replace("\n", "  "), 90)
-    axes.annotate(
-        words,
-        place,
-        xytext=(0, -9),
-        textcoords="offset points",
-        ha="center",
-        va="top",
-        fontsize=7,
-        rotation=rotation,
-    )

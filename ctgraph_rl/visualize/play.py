@@ -6,7 +6,6 @@ terminal, keys are read from its lines.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -28,7 +27,7 @@ from ctgraph_rl.core.graph import StateType
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.task import Task
-from ctgraph_rl.visualize.arguments import Selection, select
+from ctgraph_rl.visualize.arguments import select
 from ctgraph_rl.visualize.layout import lay_out
 from ctgraph_rl.visualize.player import Player
 from ctgraph_rl.visualize.states import kind_of
@@ -94,7 +93,13 @@ class Game:
         self.is_over = self.player.step(action)
         self._show(f"after action {self.player.action}")
         if self.is_over:
-            self._tell_result()
+            data = self.player.data
+            outcome = int(data["outcome"])
+            self.episodes += 1
+            self.successes += outcome == OUTCOME_GOAL
+            result = f"return {float(data['episode_reward']):g} in {int(data['step_count'])} steps"
+            self._say(f"{OUTCOMES[outcome]}; {result}")
+            self._say(f"{self.score()}. r begins another, q quits.")
 
     def _show(self, what: str) -> None:
         if self.console.is_terminal:
@@ -109,15 +114,6 @@ class Game:
 
     def _keys(self) -> str:
         return f"0..{self.graph.branching_factor} act, r restarts, ? tells the truth, q quits"
-
-    def _tell_result(self) -> None:
-        data = self.player.data
-        outcome = int(data["outcome"])
-        self.episodes += 1
-        self.successes += outcome == OUTCOME_GOAL
-        result = f"return {float(data['episode_reward']):g} in {int(data['step_count'])} steps"
-        self._say(f"{OUTCOMES[outcome]}; {result}")
-        self._say(f"{self.score()}. r begins another, q quits.")
 
     def score(self) -> str:
         """Return how often the goal was reached, and how often random actions reach it."""
@@ -181,16 +177,14 @@ def picture(observation: NDArray[np.uint8], white: float, colours: bool) -> Text
         white: the brightest level.
         colours: whether the terminal has them.
     """
-    image = observation[0] if observation.ndim == 3 else _in_lines(observation)
+    if observation.ndim == 3:
+        image = observation[0]
+    else:
+        columns = min(len(observation), VECTOR_COLUMNS)
+        image = np.pad(observation, (0, -len(observation) % columns)).reshape(-1, columns)
     levels = np.clip(image.astype(int) * 255 // int(white), 0, 255)
     times = max(1, WIDTH // levels.shape[1])
     return _blocks(levels.repeat(times, 0).repeat(times, 1)) if colours else _shades(levels, max(1, times // 2))
-
-
-def _in_lines(vector: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A vector row by row."""
-    columns = min(len(vector), VECTOR_COLUMNS)
-    return np.pad(vector, (0, -len(vector) % columns)).reshape(-1, columns)
 
 
 def _blocks(levels: NDArray[np.int_]) -> Text:
@@ -264,18 +258,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         selection = select(arguments)
         game = Game(selection.player(arguments.seed, not arguments.sampled), Console(highlight=False))
     try:
-        _run(game, selection, arguments)
+        if selection.policy is not None:
+            watch(game, arguments.episodes, arguments.delay)
+        else:
+            with keyboard(sys.stdin, game.graph.branching_factor) as keys:
+                play(game, keys)
     except KeyboardInterrupt:
         print()
     game.console.print(Text(game.score()), soft_wrap=True)
-
-
-def _run(game: Game, selection: Selection, arguments: argparse.Namespace) -> None:
-    if selection.policy is not None:
-        watch(game, arguments.episodes, arguments.delay)
-        return
-    with keyboard(sys.stdin, game.graph.branching_factor) as keys:
-        play(game, keys)
 
 
 if __name__ == "__main__":

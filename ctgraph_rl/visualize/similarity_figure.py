@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from ctgraph_rl.log.escape import figure_text
@@ -54,11 +53,8 @@ def _draw_matrix(axes: Any, matrix: Tensor, labels: Sequence[str], title: str) -
     axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
     axes.set_yticks(range(len(labels)), labels, fontsize=size)
     if len(labels) <= MOST_NUMBERS:
-        for i, j in product(range(len(labels)), repeat=2):
-            _write_number(axes, i, j, matrix[i, j].item())
+        for (i, j), value in np.ndenumerate(matrix.numpy()):
+            ink = "white" if value > 0.6 else "black"
+            if not np.isnan(value):
+                axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=ink)
     return image
-
-
-def _write_number(axes: Any, i: int, j: int, value: float) -> None:
-    if not math.isnan(value):
-        axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if value > 0.6 else "black")

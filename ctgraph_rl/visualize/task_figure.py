@@ -82,16 +82,14 @@ class _TaskPicture:
         self.goal = task.graph.node_at(task.goal)
         self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
         self.values = {key: [float(value) for value in of] for key, of in values.items()}
-        self.layout = lay_out(self.graph, [self.goal, *self._most_visited()])
+        counts = {node: count for (kind, node), count in visits.items() if kind == END and node != self.goal}
+        most_visited = sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
+        self.layout = lay_out(self.graph, [self.goal, *most_visited])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
         self.places = {state: self._place(state) for state in drawn.states(self.layout, self.waits)}
         self.size, beside = self._sizes()
         self.has_room = beside >= ROOM
         self.has_numbers = beside >= ROOM_FOR_NUMBERS
-
-    def _most_visited(self) -> list[int]:
-        counts = {node: count for (kind, node), count in self.visits.items() if kind == END and node != self.goal}
-        return sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
 
     def _place(self, state: Key) -> PlanePoint:
         """x in (0, 1), y a row of states below 0."""
@@ -125,27 +123,20 @@ class _TaskPicture:
             self._draw_loops()
             self._draw_ways_to_fail()
         title = f"{shape_of(self.graph)}, goal {in_digits(self.task.goal, '.')}"
-        self.axes.set_title(title + self._left_out(), fontsize=9)
+        if not self.layout.is_whole:
+            waits = "" if self.waits else ", wait states left out"
+            title += f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
+        self.axes.set_title(title, fontsize=9)
         self.axes.set(xlim=(-0.02, 1.02), ylim=(-self.height - 0.9, 0.6))
         self.axes.axis("off")
         if legend:
             self._draw_legend()
 
-    def _left_out(self) -> str:
-        """Return words on the part of the tree that is not drawn."""
-        if self.layout.is_whole:
-            return ""
-        waits = "" if self.waits else ", wait states left out"
-        return f"\n{len(self.layout.leaves)} of {self.graph.num_end_states:,} end states drawn{waits}"
-
     def _draw_edges(self) -> None:
-        found = list(drawn.edges(self.task, self.layout, self.waits))
+        found = sorted(drawn.edges(self.task, self.layout, self.waits), key=self._is_strong)
         lines = [[self.places[edge.start], self.places[edge.end]] for edge in found]
-        strong = [self._is_strong(edge) for edge in found]
-        widths = [self._width(edge) for edge in found]
-        order = sorted(range(len(found)), key=strong.__getitem__)
-        colours = ["0" if strong[i] else GREY for i in order]
-        draw_lines(self.axes, [lines[i] for i in order], colors=colours, linewidths=[widths[i] for i in order])
+        colours = ["0" if self._is_strong(edge) else GREY for edge in found]
+        draw_lines(self.axes, lines, colors=colours, linewidths=list(map(self._width, found)))
         row = 1.0 if self.waits else 0.5
         nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
         draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, others_slow, parameters_equal, saved_and_loaded
+from helpers.startup import BARE, RUN, seconds
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
@@ -23,8 +24,6 @@ from baselines.update.seeds import SeedGroup, why_not_together
 from baselines.update.update import update
 from benchmarks import agents as benchmark
 from benchmarks import environment_ladder as ladder_of_envs
-from benchmarks.roofline import Products
-from benchmarks.startup import BARE, RUN, seconds
 from ctgraph_rl import CTGraphEnv
 from ctgraph_rl.learn.collect import collect, in_time_order, take_step
 from curricula.paper import ct_su_b1
@@ -328,26 +327,6 @@ def test_the_ratio_is_our_median_speed_over_theirs_and_most_seeds_must_solve():
     rows = [[cell.strip() for cell in line.split("|")[3:-1]] for line in benchmark.table([ours, theirs]).splitlines()]
 
     assert rows[2:] == [["ours", "200", "", "12", "2.00"], ["SB3", "40", "5.0 x", "1 of 3 seeds", ""]]
-
-
-def test_the_roofline_counts_the_multiply_adds_of_products_and_of_an_lstm():
-    linear, lstm = nn.Linear(5, 3), nn.LSTM(3, 4, batch_first=True)
-    inputs = torch.ones(7, 5)
-
-    with Products() as products:
-        linear(inputs).sum().backward()
-        with torch.no_grad():
-            lstm(torch.ones(2, 6, 3))
-
-    once = {
-        (7, 5, 3): 1,
-        (3, 7, 5): 1,
-        (12, 3, 16): 1,
-        (12, 4, 16): 1,
-    }  # forward, backward; the LSTM
-    assert products.shapes == once
-    assert products.multiply_adds == 7 * 5 * 3 * 2 + 12 * 16 * (3 + 4)
-    assert products.seconds() > 0
 
 
 @pytest.mark.slow

@@ -34,13 +34,14 @@ def ceilings_of(curriculum: Curriculum) -> Ceilings:
         optimal = None if isinstance(best, Undefined) else best.mean().item()
         return Ceilings(optimal, *[None] * (len(Ceilings._fields) - 1))
     changes = any(task.goal_change is not None for task in tasks)
+    plain = all(map(_is_plain, tasks))
     return Ceilings(
         optimal=_mean(tasks, lambda task: task.optimal_value(1.0)),
         one_policy=_one_policy(tasks, curriculum.protocol),
         search=_search(tasks, curriculum.evaluation.episodes_per_row),
         memoryless=None if changes else _mean(tasks, memoryless_ceiling),
         open_loop=None if changes else _mean(tasks, open_loop_ceiling),
-        random=_mean(tasks, _random) if all(map(_is_plain, tasks)) else None,
+        random=_mean(tasks, lambda task: task.graph.reward_prob_random * task.goal_reward) if plain else None,
         random_frames=max(map(random_frames_to_goal, tasks)),
     )
 
@@ -55,12 +56,16 @@ def in_words(ceilings: Ceilings) -> list[tuple[str, str]]:
         "open_loop": "best sequence of actions without observations",
         "random": "random policy",
     }
-    shown = [(name, getattr(ceilings, key)) for key, name in names.items()]
-    values = [(name, f"{value:.3g}") for name, value in shown if value is not None]
-    if ceilings.random_frames is None:
-        return values
-    frames = f"{ceilings.random_frames:,.0f}" if ceilings.random_frames < 1e7 else f"{ceilings.random_frames:.1e}"
-    return [*values, ("frames to its first reward, on the hardest task", frames)]
+    shown = []
+    for key, name in names.items():
+        value = getattr(ceilings, key)
+        if value is not None:
+            shown.append((name, f"{value:.3g}"))
+    frames = ceilings.random_frames
+    if frames is not None:
+        count = f"{frames:,.0f}" if frames < 1e7 else f"{frames:.1e}"
+        shown.append(("frames to its first reward, on the hardest task", count))
+    return shown
 
 
 def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None:
@@ -74,10 +79,6 @@ def _mean(tasks: Sequence[Task], value: Callable[[Task], float]) -> float | None
 def _is_plain(task: Task) -> bool:
     """Whether a task pays only at its goal."""
     return is_needle(task) and task.goal_reward > 0 and task.fail_reward == task.step_reward == 0
-
-
-def _random(task: Task) -> float:
-    return task.graph.reward_prob_random * task.goal_reward
 
 
 def _one_policy(tasks: Sequence[Task], protocol: Protocol) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import yaml
@@ -12,7 +12,7 @@ from ctgraph_rl.board.method import OURS
 from ctgraph_rl.board.standings.ceilings import in_words
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
 from ctgraph_rl.board.standings.tables import BoardTable, Standing, is_significant
-from ctgraph_rl.log.escape import csv_text, markdown_text
+from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
 from ctgraph_rl.report.latex import PREAMBLE, Labels, TableCell, latex
@@ -50,34 +50,26 @@ class BoardColumn(NamedTuple):
 def columns(line: Standing) -> list[BoardColumn]:
     """Return the cells of a line."""
     entry = line.entry
-    compute = line.entry.method["compute"]
+    hours = entry.hours
     per_task = entry.method["bytes_per_task"]
-    numbers = [_measure(name, estimate) for name, estimate in line.estimates.items()]
+    numbers = []
+    for name, estimate in line.estimates.items():
+        value, _, interval = str(estimate).partition(" n = ")[0].partition(" ")
+        numbers.append(BoardColumn(measure_name(name), value, estimate.value, interval))
     n = str(line.score).rpartition(" n = ")[2]
+    size = "-" if entry.agent_bytes is None else f"{entry.agent_bytes:,}"
+    time = "-" if hours is None else f"{hours:.2g}" if hours < 10 else f"{hours:,.0f}"
     return [
         BoardColumn("rank", line.rank, line.best_rank),
         BoardColumn("method", line.name, line.name.lower()),
         *numbers,
         BoardColumn("n", n, line.score.n),
         BoardColumn("bytes per task", f"{per_task:,}", per_task),
-        BoardColumn("bytes of the agent", _count(entry.agent_bytes), entry.agent_bytes),
+        BoardColumn("bytes of the agent", size, entry.agent_bytes),
         BoardColumn("steps", f"{entry.frames:,}", entry.frames),
-        BoardColumn("hours", _hours(compute["hours"]), compute["hours"]),
+        BoardColumn("hours", time, hours),
         BoardColumn("level", entry.verified, LEVELS.index(entry.level)),
     ]
-
-
-def _measure(name: str, estimate: Estimate) -> BoardColumn:
-    value, _, interval = str(estimate).partition(" n = ")[0].partition(" ")
-    return BoardColumn(measure_name(name), value, estimate.value, interval)
-
-
-def _count(value: int | None) -> str:
-    return "-" if value is None else f"{value:,}"
-
-
-def _hours(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}" if value < 10 else f"{value:,.0f}"
 
 
 def notes(table: BoardTable) -> list[str]:
@@ -107,49 +99,43 @@ def facts(table: BoardTable) -> list[tuple[str, str]]:
 
 def verdicts(table: BoardTable) -> list[tuple[str, str, str]]:
     """Return each comparison of a table: the pair, the difference of the scores, and the corrected p-value."""
-    return [
-        (f"{one} - {other}", str(found.difference).partition(" n = ")[0], _p_value(found.holm, is_significant(found)))
-        for (one, other), found in table.pairs.items()
-    ]
-
-
-def _p_value(holm: float | None, significant: bool) -> str:
-    return "-" if holm is None else f"{holm:.2g}" + ("" if significant else ", not distinguishable")
+    shown = []
+    for (one, other), found in table.pairs.items():
+        unclear = "" if is_significant(found) else ", not distinguishable"
+        p_value = "-" if found.holm is None else f"{found.holm:.2g}{unclear}"
+        shown.append((f"{one} - {other}", str(found.difference).partition(" n = ")[0], p_value))
+    return shown
 
 
 def markdown(tables: Sequence[BoardTable]) -> str:
     """Return all tables in Markdown."""
-    parts = [part for table in tables for part in _markdown(table)]
-    return "\n\n".join(["# Board", f"{LEGEND}.", *parts]) + "\n"
-
-
-def _markdown(table: BoardTable) -> Iterator[str]:
-    yield f"## {markdown_text(table.title)}"
-    yield f"{markdown_text(table.track.measures)} Breakthrough: {markdown_text(table.track.breakthrough)}"
-    yield "; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + "."
-    lines = [columns(line) for line in table.standings]
-    head = [f"| {' | '.join(cell.head for cell in lines[0])} |", f"|{'---|' * len(lines[0])}"]
-    rows = [[markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells] for cells in lines]
-    yield "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows)])
-    if notes(table):
-        yield "\n".join(f"- {markdown_text(note)}" for note in notes(table))
+    parts = ["# Board", f"{LEGEND}."]
+    for table in tables:
+        track = table.track
+        parts.append(f"## {markdown_text(table.title)}")
+        parts.append(f"{markdown_text(track.measures)} Breakthrough: {markdown_text(track.breakthrough)}")
+        parts.append("; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + ".")
+        lines = [columns(line) for line in table.standings]
+        rows = [[markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells] for cells in lines]
+        parts.append(markdown_table([cell.head for cell in lines[0]], rows))
+        if notes(table):
+            parts.append("\n".join(f"- {markdown_text(note)}" for note in notes(table)))
+    return "\n\n".join(parts) + "\n"
 
 
 def tables_tex(tables: Sequence[BoardTable]) -> str:
     """Return all tables in LaTeX."""
     labels = Labels()
-    return "\n\n".join([PREAMBLE, *(_latex(table, labels) for table in tables)]) + "\n"
-
-
-def _latex(table: BoardTable, labels: Labels) -> str:
-    lines = [[cell for cell in columns(line) if cell.head not in NOT_IN_LATEX] for line in table.standings]
-    rows = [
-        (line.name, [TableCell(cell.shown, cell.interval) for cell in cells])
-        for line, cells in zip(table.standings, lines, strict=True)
-    ]
-    label = labels.new("board", table.track.id, table.variant.rung, table.variant.given)
-    caption = f"{table.title}: {LEGEND}."
-    return latex(LatexTable(caption, label, "method", [cell.head for cell in lines[0]], rows))
+    parts = [PREAMBLE]
+    for table in tables:
+        rows = []
+        for line in table.standings:
+            cells = [cell for cell in columns(line) if cell.head not in NOT_IN_LATEX]
+            rows.append((line.name, [TableCell(cell.shown, cell.interval) for cell in cells]))
+        label = labels.new("board", table.track.id, table.variant.rung, table.variant.given)
+        caption = f"{table.title}: {LEGEND}."
+        parts.append(latex(LatexTable(caption, label, "method", [cell.head for cell in cells], rows)))
+    return "\n\n".join(parts) + "\n"
 
 
 ENTRY_COLUMNS = {
@@ -186,17 +172,18 @@ SCORE_COLUMNS = {
 
 def entries_csv(tables: Sequence[BoardTable]) -> str:
     """Return a line for each entry."""
-    rows = [list(_entry_cells(table, line)) for table in tables for line in table.standings]
-    return csv_text([list(ENTRY_COLUMNS), *rows])
-
-
-def _entry_cells(table: BoardTable, line: Standing) -> Iterator[Any]:
-    entry = line.entry
-    score = line.score
-    yield from (entry.id, entry.name, table.track.id, table.variant.rung, table.variant.given)
-    yield from (table.variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
-    yield from (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
-    yield from (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, entry.verified)
+    rows: list[Sequence[Any]] = [list(ENTRY_COLUMNS)]
+    for table in tables:
+        variant = table.variant
+        for line in table.standings:
+            entry = line.entry
+            score = line.score
+            about = (entry.id, entry.name, table.track.id, variant.rung, variant.given)
+            learned = (variant.curriculum.fingerprint, entry.frames, line.best_rank, line.worst_rank)
+            reached = (table.track.score, score.value, score.low, score.high, score.n, score.n_undefined)
+            kept = (entry.method["bytes_per_task"], entry.agent_bytes, entry.hours, entry.verified)
+            rows.append([*about, *learned, *reached, *kept])
+    return csv_text(rows)
 
 
 def scores_csv(tables: Sequence[BoardTable]) -> str:
@@ -245,24 +232,19 @@ def _json(table: BoardTable) -> dict[str, Any]:
 
 def _json_line(line: Standing) -> dict[str, Any]:
     entry = line.entry
-    ranks = {"best_rank": line.best_rank, "worst_rank": line.worst_rank, "why_not_ranked": entry.why_not_ranked}
-    estimates = {name: _numbers(estimate) for name, estimate in line.estimates.items()}
-    values = {name: list(values) for name, values in entry.values.items()}
-    about: dict[str, Any] = {
+    return {
         "name": line.name,
         "digest": entry.digest,
         "method": dict(entry.method),
         "level": entry.level,
-    }
-    about["bits"] = entry.verification.bits
-    failed = {str(seed): reason for seed, reason in entry.failed.items()}
-    return {
-        **about,
-        **ranks,
-        "measures": estimates,
-        "values": values,
+        "bits": entry.verification.bits,
+        "best_rank": line.best_rank,
+        "worst_rank": line.worst_rank,
+        "why_not_ranked": entry.why_not_ranked,
+        "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
+        "values": {name: list(values) for name, values in entry.values.items()},
         "agent_bytes": entry.agent_bytes,
-        "failed": failed,
+        "failed": {str(seed): reason for seed, reason in entry.failed.items()},
     }
 
 
@@ -285,7 +267,6 @@ def _result(table: BoardTable, line: Standing) -> dict[str, Any]:
     """Return the result of an entry: task, data set, metrics and source."""
     variant = table.variant
     method = line.entry.method
-    named = {name: estimate for name, estimate in line.estimates.items() if estimate.value is not None}
     return {
         "task": dict(TASK),
         "dataset": {
@@ -296,7 +277,8 @@ def _result(table: BoardTable, line: Standing) -> dict[str, Any]:
         },
         "metrics": [
             {"type": name, "value": estimate.value, "name": f"{measure_name(name)}, {estimate.method}, {estimate}"}
-            for name, estimate in named.items()
+            for name, estimate in line.estimates.items()
+            if estimate.value is not None
         ],
         "source": {
             "name": f"submission {line.entry.id}, {line.entry.verified}",

@@ -21,7 +21,8 @@ from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
-from ctgraph_rl.report.intervals import scipy
+from ctgraph_rl.report.style import require_packages
+from ctgraph_rl.report.templates import rendered
 from ctgraph_rl.runs.read import Problem
 
 PAGE = "board.html"
@@ -55,7 +56,7 @@ def write_board(
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no submission that can be read.
     """
-    _require_packages()
+    require_packages("the board", "jinja2", "scipy")
     entries, problems = read_entries(paths, config_dir)
     require((bool(entries), "; ".join(problem.reason for problem in problems)))
     made = tables(entries)
@@ -81,21 +82,11 @@ def write_board(
 
 def html(made: Sequence[BoardTable], problems: Sequence[Problem] = ()) -> str:
     """Return the page: without JavaScript plain tables, with it tables that are sorted and filtered."""
-    from jinja2 import FileSystemLoader, StrictUndefined
-    from jinja2.sandbox import SandboxedEnvironment
-
-    here = Path(__file__).parent
-    environment = SandboxedEnvironment(
-        loader=FileSystemLoader(here),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.finalize = lambda value: terminal_text(value) if type(value) is str else value
-    script = (here / "board.js").read_text(encoding="utf-8")
+    here = Path(__file__)
+    script = here.with_name("board.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return environment.get_template(f"{PAGE}.j2").render(
+    return rendered(
+        here.with_name(f"{PAGE}.j2"),
         tables=made,
         problems=problems,
         formats=formats,
@@ -113,19 +104,6 @@ def link_of(entry: BoardEntry) -> str | None:
     """Return the address of the paper of an entry, else of its code; None if neither is one."""
     addresses = (str(entry.method["paper"]), str(entry.method["code"]["repository"]))
     return next(filter(ADDRESS.fullmatch, addresses), None)
-
-
-def _require_packages() -> None:
-    """Refuse before any work.
-
-    Raises:
-        ModuleNotFoundError: without jinja2 or scipy; names the extra to install.
-    """
-    try:
-        import jinja2  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("the board needs jinja2: pip install 'ctgraph_rl[report]'") from error
-    scipy("stats")
 
 
 def main() -> None:

@@ -89,13 +89,12 @@ def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
     for entry in entries:
         found.setdefault((entry.track.id, entry.variant.curriculum.fingerprint), []).append(entry)
     made = [_table(some) for some in found.values()]
-    return sorted(made, key=lambda table: (table.track.name != "small", table.track.id, _place(table)))
 
+    def place(table: BoardTable) -> tuple[bool, str, int]:
+        variants = [each.curriculum.fingerprint for each in table.track.variants]
+        return table.track.name != "small", table.track.id, variants.index(table.variant.curriculum.fingerprint)
 
-def _place(table: BoardTable) -> int:
-    """Return the place of a table's variant in its track."""
-    given = [each.curriculum.fingerprint for each in table.track.variants]
-    return given.index(table.variant.curriculum.fingerprint)
+    return sorted(made, key=place)
 
 
 def _table(entries: Sequence[BoardEntry]) -> BoardTable:
@@ -119,8 +118,7 @@ def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
     for one, other in combinations(lines, 2):
         bounds = bounds_of_curriculum(one.entry.variant.curriculum).of_metric(one.entry.track.score)
         found[one.name, other.name] = statistics.compare(one.entry.scores, other.entry.scores, bounds=bounds)
-    corrected = statistics.holm([each.p_value for each in found.values()])
-    return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), corrected, strict=True)}
+    return statistics.corrected(found)
 
 
 def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison]) -> Standing:

@@ -123,7 +123,8 @@ class GroupedImages(SquareImages):
         within_ok = is_real(self.within, lowest, UNRELATED)
         reach = f"[{math.ceil(lowest * 1e5) / 1e5:.5f}, {UNRELATED:.5f}]"
         if is_real(self.within, 1e-9, lowest):
-            reach += f" for cells={self.cells} (use cells={_cells_for(self.within)} or more)"
+            enough = math.ceil((1 - math.sqrt(1 - self.within / UNRELATED)) ** -0.5)
+            reach += f" for cells={self.cells} (use cells={enough} or more)"
         between_ok = is_real(self.between, self.within if within_ok else lowest, UNRELATED)
         return [
             (within_ok, f"within must be in {reach}, got {self.within!r}"),
@@ -225,11 +226,6 @@ def _redraw(levels: Tensor, share: float, words: Tensor) -> Tensor:
     count = (words[..., 2 * n : 2 * n + 1] + int(share * n * 2**32)) >> 32
     rank = words[..., :n].argsort(dim=-1, stable=True).argsort(dim=-1)
     return torch.where(rank < count, randint(words[..., n : 2 * n], WHITE + 1), levels)
-
-
-def _cells_for(distance: float) -> int:
-    """Cells along a side from which on a distance within groups is in reach."""
-    return math.ceil((1 - math.sqrt(1 - distance / UNRELATED)) ** -0.5)
 
 
 def _seed_rule(seed: object) -> tuple[bool, str]:

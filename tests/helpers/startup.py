@@ -1,9 +1,8 @@
-"""The processor time of a run until its first step, beside that of the bare imports, for `baselines.benchmark`."""
+"""The processor time of a run until its first step, beside that of the bare imports."""
 
 from __future__ import annotations
 
 import os
-import statistics
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from baselines.ppo import PPO
+from helpers.paths import CHECKOUT
 
 BARE = ("-c", "import os, torch, torchrl; os._exit(0)")
 RUN = ("-m", "ctgraph_rl.run", "agent=ppo", "curriculum=ct2_interfering", f"agent._target_={__name__}.UntilFirstStep")
@@ -25,27 +25,11 @@ class UntilFirstStep(PPO):
         self.policy.register_forward_pre_hook(lambda *_: os._exit(0))
 
 
-def table(rounds: int) -> str:
-    """Measure both in turn; return medians in Markdown, and the median ratio."""
-    times = [(seconds(BARE), seconds(RUN)) for _ in range(rounds)]
-    bare, run = (statistics.median(values) for values in zip(*times, strict=True))
-    ratio = statistics.median(run / bare for bare, run in times)
-    lines = [
-        f"| import torch, torchrl | {bare:.2f} | |",
-        f"| ctgraph-rl, to the first step | {run:.2f} | {ratio:.2f} |",
-    ]
-    return "\n".join(["| processor time | s | ratio |", "|---|---|---|", *lines])
-
-
 def seconds(arguments: Sequence[str]) -> float:
-    """Return the processor time of a Python process with these arguments, in an empty directory.
-
-    Raises:
-        subprocess.CalledProcessError: if it fails.
-    """
+    """Return the processor time of a Python process with these arguments, in an empty directory."""
     before = _processor_time()
     with TemporaryDirectory() as folder:
-        path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+        path = os.pathsep.join([str(CHECKOUT), str(Path(__file__).parents[1])])
         subprocess.run([sys.executable, *arguments], cwd=folder, check=True, env={**os.environ, "PYTHONPATH": path})
     return _processor_time() - before
 

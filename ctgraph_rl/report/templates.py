@@ -1,0 +1,36 @@
+"""Pages made of templates of jinja2, with what other people have written in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ctgraph_rl.log.escape import markdown_text, terminal_text
+
+
+def rendered(template: Path, **values: Any) -> str:
+    """Return a page; in HTML texts are escaped, each in one line without control characters.
+
+    Args:
+        template: its file, ``NAME.html.j2`` or ``NAME.md.j2``.
+        values: by the names that it uses.
+    """
+    from jinja2 import FileSystemLoader, StrictUndefined
+    from jinja2.sandbox import SandboxedEnvironment
+
+    escapes = template.name.endswith(".html.j2")
+    environment = SandboxedEnvironment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=escapes,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.finalize = _one_line if escapes else None
+    environment.filters["line"] = markdown_text
+    return environment.get_template(template.name).render(values)
+
+
+def _one_line(value: Any) -> Any:
+    """Return a text in one line; what is HTML already and what is no text as it is."""
+    return terminal_text(value) if type(value) is str else value
