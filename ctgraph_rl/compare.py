@@ -12,7 +12,7 @@ import torch
 
 from ctgraph_rl import parsers
 from ctgraph_rl.checks import is_real, positive, require
-from ctgraph_rl.log.escape import terminal_lines, terminal_text
+from ctgraph_rl.log.escape import listed, terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
 from ctgraph_rl.log.measurement import without_time
 from ctgraph_rl.log.refuse import refused_by
@@ -163,13 +163,8 @@ def _where(line: LogLine) -> str:
 
 def _changes(one: Mapping[str, Any], other: Mapping[str, Any], most: int) -> str:
     """Return in words which values differ."""
-    return _first_of([f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b], most)
-
-
-def _first_of(texts: Sequence[str], most: int) -> str:
-    """Return the first texts, and how many more there are."""
-    more = f" and {len(texts) - most} more" if len(texts) > most else ""
-    return terminal_text(", ".join(texts[:most]) + more)
+    pairs = [f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b]
+    return terminal_text(listed(pairs, most))
 
 
 def _weights(one: Path, other: Path) -> str:
@@ -184,7 +179,7 @@ def _weights(one: Path, other: Path) -> str:
     unequal = [key for key in state if not _same(state[key], others[key])]
     if not unequal:
         return "equal, bit for bit"
-    return f"different in {len(unequal)} of {len(state)} parts: {_first_of(unequal, 3)}"
+    return f"different in {len(unequal)} of {len(state)} parts: {terminal_text(listed(unequal))}"
 
 
 def _state(path: Path) -> Mapping[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.core.graph import CTGraph
+from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.sheets import LISTED, Sheet
 from ctgraph_rl.log.sheets import print_sheet as print_sheet
 from ctgraph_rl.log.sheets import to_latex as to_latex
@@ -246,8 +247,7 @@ def _ceilings(curriculum: Curriculum) -> Sheet:
             lost.append(f"{label} {_number(memoryless)} of {_number(optimal)}")
     no_memory = f"No memory is needed for {', '.join(easy)}: a deterministic policy without memory is optimal, "
     easily = [f"{no_memory}{SAME_DECISIONS}"] if easy else []
-    shown = ", ".join(lost[:MOST_LOST]) + f" and {len(lost) - MOST_LOST} more" * (len(lost) > MOST_LOST)
-    needed = [f"{NEEDS_MEMORY} {shown}."] if lost else []
+    needed = [f"{NEEDS_MEMORY} {listed(lost, MOST_LOST)}."] if lost else []
     notes = (*CEILING_NOTES, *dict.fromkeys(reasons), *needed, *compress(limited, limited.values()), *easily)
     return Sheet("Ceilings", {"task": "l", **dict.fromkeys(CEILINGS, "r")}, tuple(rows), notes)
 

@@ -12,7 +12,7 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 from ctgraph_rl.board.method import fact_rules, facts_of, track_version
-from ctgraph_rl.board.rules import curriculum_rule, entry_rule, listed, one_line, oracle_rule, seed_rules
+from ctgraph_rl.board.rules import curriculum_rule, entry_rule, one_line, oracle_rule, seed_rules
 from ctgraph_rl.board.submission import (
     CONFIG,
     EVALUATIONS,
@@ -30,7 +30,7 @@ from ctgraph_rl.board.submission import (
 from ctgraph_rl.checks import is_real
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.log.escape import csv_text
+from ctgraph_rl.log.escape import csv_text, listed
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.run_log import MOST_BYTES, RunLog
 from ctgraph_rl.log.scores import scores

@@ -12,6 +12,7 @@ from typing import Any
 
 from ctgraph_rl.board.tracks import Track
 from ctgraph_rl.log.damage import damaged
+from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
 from ctgraph_rl.log.sources import SCRIPTS, sources_of
 from ctgraph_rl.packages import class_named, is_published
@@ -22,22 +23,12 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 Rule = tuple[bool, str]
 
-MOST_SHOWN = 3
-"""Of things that a message lists."""
-
 
 OF_OURS = "baselines."
 """Beginning of the names of our classes."""
 
 MAY_BE_READ = ("", "the frames of each block")
 """What methods may read of tasks beside what the protocol gives: a track fixes the frames of its blocks."""
-
-
-def listed(values: Iterable[Any]) -> str:
-    """Return the first of some values for a message, and how many more there are."""
-    texts = [str(value) for value in values]
-    more = f" and {len(texts) - MOST_SHOWN} more" if len(texts) > MOST_SHOWN else ""
-    return ", ".join(texts[:MOST_SHOWN]) + more
 
 
 def one_line(reason: str) -> str:

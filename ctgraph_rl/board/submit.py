@@ -19,7 +19,6 @@ from ctgraph_rl.board.rules import (
     curriculum_rule,
     entry_rule,
     failure_rules,
-    listed,
     one_line,
     oracle_rule,
     same_rules,
@@ -41,7 +40,7 @@ from ctgraph_rl.board.submission import (
 from ctgraph_rl.board.tracks import Track, track
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
-from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
 from ctgraph_rl.log.provenance import machine
 from ctgraph_rl.log.refuse import refused_by

@@ -51,6 +51,13 @@ def _printable(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+def listed(values: Iterable[object], most: int = 3) -> str:
+    """Return the first of some values as text, and how many more there are."""
+    texts = [str(value) for value in values]
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more
+
+
 def markdown_text(text: object) -> str:
     """Return one line that Markdown shows unchanged: no link, no image, no HTML, no formula and no end of a cell."""
     line = terminal_text(text)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
@@ -98,6 +99,34 @@ def new_figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
+
+
+def panels(count: int, most: int, height: float, width: float = 1, room: float = 0.5, **shared: bool) -> Any:
+    """Return the axes of a new figure, in rows of up to ``most``; those that are not needed stay empty.
+
+    Args:
+        count: how many are needed.
+        most: in a row of a page's text.
+        height: of a row, in inches.
+        width: share of the width of a whole figure.
+        room: beside the rows, in inches.
+        shared: ``sharex`` and ``sharey``.
+    """
+    columns = min(beside(most), count)
+    rows = math.ceil(count / columns)
+    figure = new_figure(figure_width() * width, rows * height + room)
+    grid = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in grid.ravel()[count:]:
+        axes.axis("off")
+    return grid
+
+
+def agents_legend(figure: Any, looks: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+    """Names of agents above all panels, with the looks of their curves."""
+    from matplotlib.lines import Line2D
+
+    marks = [Line2D([], [], label=name, **look) for name, look in looks]
+    figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
 
 
 def agent_style(position: int, agent: str = "") -> dict[str, Any]:

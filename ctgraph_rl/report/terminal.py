@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ctgraph_rl.checks import require
-from ctgraph_rl.log.escape import terminal_text
+from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.provenance import numbers_of
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.names import modification
@@ -207,10 +207,8 @@ def _sentence(states: Sequence[Sequence[Run]]) -> str:
     parts = []
     for some in states:
         said = [f"fingerprint {some[0].group[1]}"] * fingerprints + [code_of(some[0], every)]
-        seeds = sorted(run.seed for run in some)
-        more = f" and {len(seeds) - MOST_SEEDS} more" if len(seeds) > MOST_SEEDS else ""
-        shown = ", ".join(map(str, seeds[:MOST_SEEDS])) + more
-        parts.append(f"seed{'s' * (len(seeds) > 1)} {shown} ({', '.join(filter(None, said))})")
+        seeds = listed(sorted(run.seed for run in some), MOST_SEEDS)
+        parts.append(f"seed{'s' * (len(some) > 1)} {seeds} ({', '.join(filter(None, said))})")
     who = f"{every[0].agent or every[0].path} on {every[0].group[0]} was run with different code, shown apart"
     return f"{who}: {'; '.join(parts)}; overwrite=stale runs what is stale again"
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.figures.learning_curves import BANDS, draw_means
 from ctgraph_rl.report.sections import Section
-from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, frames_axis, new_figure, short
+from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, frames_axis, panels, short
 
 MOST_EXPERIMENTS = 12
 """Curricula that have a panel."""
@@ -36,29 +35,17 @@ def draw_experiments(found: Sequence[Section]) -> Any:
     shown = found[:MOST_EXPERIMENTS]
     agents = _agents(shown)[:MOST_AGENTS]
     looks = {agent: agent_style(position, agent) for position, agent in enumerate(agents)}
-    columns = min(beside(COLUMNS), len(shown))
-    rows = math.ceil(len(shown) / columns)
-    figure = new_figure(figure_width(), 1.7 * rows + 0.5)
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    grid = panels(len(shown), COLUMNS, 1.7, sharey=True)
+    figure = grid[0, 0].figure
     for axes, section in zip(grid.ravel(), shown, strict=False):
         draw_means(axes, section, looks)
         axes.set_title(short(section.name))
         frames_axis(axes)
-    for axes in grid.ravel()[len(shown) :]:
-        axes.axis("off")
     for row in grid:
         row[0].set_ylabel("mean return")
     figure.supxlabel("frames", fontsize=8)
-    marks = [_line(agent, look) for agent, look in looks.items()]
-    figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
+    agents_legend(figure, [(short(agent), look) for agent, look in looks.items()])
     return figure
-
-
-def _line(agent: str, look: dict[str, Any]) -> Any:
-    """Return the line of an agent in a legend."""
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], label=short(agent), **look)
 
 
 def _agents(found: Sequence[Section]) -> list[str]:

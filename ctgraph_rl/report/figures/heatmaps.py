@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ctgraph_rl.report.figures.gallery import INTERVAL, CaptionedFigure
 from ctgraph_rl.report.figures.trees import Trees
 from ctgraph_rl.report.sections import Estimates, Result, Section
@@ -25,8 +27,6 @@ NEGATIVE = -0.05
 
 NO_VALUE = (0.85, 0.85, 0.85)
 """Colour of a cell without a value."""
-
-CellValues = list[list[float]]
 
 
 def transfer_maps(section: Section, result: Result, trees: Trees) -> CaptionedFigure:
@@ -66,11 +66,8 @@ def draw_matrices(section: Section, result: Result) -> Any:
 def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
     """The performance matrix on a scale from 0, or the lowest value, to 1, or the highest; row 0 is untrained."""
     values = _values(matrix)
-    known = [value for row in values for value in row if not math.isnan(value)]
-    low = min([0.0, *known])
-    high = max([1.0, *known])
-    image = _show(axes, values, "viridis", low, high)
-    _name(axes, labels, len(values), 0)
+    image = _show(axes, values, "viridis", np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0))
+    _name(axes, labels, len(matrix), 0)
     _write(axes, matrix, image, "")
     _box(axes, trained, 1)
     axes.set(ylabel="after block", title="mean return on each task")
@@ -79,25 +76,27 @@ def draw_performance(axes: Any, matrix: Estimates, labels: Sequence[str], traine
 def draw_transfer(axes: Any, matrix: Estimates, labels: Sequence[str], trained: Sequence[Sequence[int]]) -> None:
     """Changes of return, centred on zero; a dash marks losses where cells have no numbers, for grey prints."""
     values = _values(matrix)
-    largest = max([abs(value) for row in values for value in row if not math.isnan(value)], default=0.0) or 1.0
+    largest = np.nanmax(abs(values), initial=0.0) or 1.0
     image = _show(axes, values, "PuOr", -largest, largest)
-    _name(axes, labels, len(values), 1)
+    _name(axes, labels, len(matrix), 1)
     _write(axes, matrix, image, "+")
     if len(labels) > MOST_NUMBERS:
-        cells = [(j, i) for i, row in enumerate(values) for j, value in enumerate(row) if value < NEGATIVE * largest]
-        axes.plot(*(zip(*cells, strict=True) if cells else ((), ())), marker="_", linestyle="", color="black")
+        blocks, tasks = np.nonzero(values < NEGATIVE * largest)
+        axes.plot(tasks, blocks, marker="_", linestyle="", color="black")
     _box(axes, trained, 0)
     axes.set(ylabel="training in block", title="change of return by the block's training")
 
 
-def _values(matrix: Estimates) -> CellValues:
-    return [[math.nan if cell.value is None else cell.value for cell in row] for row in matrix]
+def _values(matrix: Estimates) -> np.ndarray:
+    """Return values as float64 [rows, tasks], nan where there is none."""
+    return np.array([[cell.value for cell in row] for row in matrix], dtype=np.float64, ndmin=2)
 
 
-def _show(axes: Any, values: CellValues, colours: str, low: float, high: float) -> Any:
+def _show(axes: Any, values: np.ndarray, colours: str, low: float, high: float) -> Any:
     """Draw the cells, with a scale beside them; what has no value is grey."""
     axes.set_facecolor(NO_VALUE)
-    image = axes.imshow(values or [[math.nan]], cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
+    cells = values if values.size else [[math.nan]]
+    image = axes.imshow(cells, cmap=colours, vmin=low, vmax=high, aspect="auto", interpolation="none")
     axes.figure.colorbar(image, ax=axes, shrink=0.9, pad=0.02)
     axes.spines[:].set_visible(False)
     return image

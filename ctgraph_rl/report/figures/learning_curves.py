@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
@@ -19,7 +20,7 @@ from ctgraph_rl.report.sections import (
     over_seeds,
     training_curve,
 )
-from ctgraph_rl.report.style import MOST_AGENTS, agent_style, beside, figure_width, frames_axis, new_figure, short
+from ctgraph_rl.report.style import MOST_AGENTS, agent_style, agents_legend, beside, frames_axis, panels, short
 
 MOST_TASKS = 32
 """Tasks that have a panel."""
@@ -88,12 +89,8 @@ def _agents(section: Section) -> str:
 def draw_tasks(section: Section) -> Any:
     """Draw a panel for each task: mean return at all evaluations of each agent, with its interval and its seeds."""
     labels = section.labels[:MOST_TASKS]
-    rows = math.ceil(len(labels) / beside(COLUMNS))
-    columns = min(beside(COLUMNS), len(labels))
-    figure = new_figure(figure_width() * max(0.5, columns / beside(COLUMNS)), 1.45 * rows + 0.5)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for panel in grid.ravel()[len(labels) :]:
-        panel.axis("off")
+    width = min(max(0.5, len(labels) / beside(COLUMNS)), 1)
+    grid = panels(len(labels), COLUMNS, 1.45, width, sharex=True, sharey=True)
     for task, (axes, label) in enumerate(zip(grid.ravel(), labels, strict=False)):
         _mark_blocks(axes, section, task)
         for position, result in enumerate(section.results[:MOST_AGENTS]):
@@ -102,18 +99,16 @@ def draw_tasks(section: Section) -> Any:
             look = agent_style(position, result.agent)
             _draw(axes, look, [evaluation_curve(result.finished, label, result.bounds.of_task(label))], seeds)
         axes.set_title(short(label))
-    _finish(figure, grid, section, "mean return")
-    return figure
+    return _finished(grid, section, "mean return")
 
 
 def draw_mean(section: Section) -> Any:
     """Draw the mean return over all tasks, a curve for each agent."""
-    figure = new_figure(figure_width(), 2.3)
-    axes = figure.subplots()
+    grid = panels(1, 1, 2.3, room=0)
+    [[axes]] = grid
     shown = section.results[:MOST_AGENTS]
     draw_means(axes, section, {result.agent: agent_style(i, result.agent) for i, result in enumerate(shown)})
-    _finish(figure, [[axes]], section, "mean return over all tasks")
-    return figure
+    return _finished(grid, section, "mean return over all tasks")
 
 
 def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]]) -> None:
@@ -128,8 +123,8 @@ def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]])
 
 def draw_training(section: Section) -> Any:
     """Draw the return while training over all blocks, a curve for each agent."""
-    figure = new_figure(figure_width(), 2.3)
-    axes = figure.subplots()
+    grid = panels(1, 1, 2.3, room=0)
+    [[axes]] = grid
     _mark_blocks(axes, section, None)
     blocks = list(enumerate(zip(section.ends, section.ends[1:], strict=False), 1))
     places = max(4, PLACES // max(len(blocks), 1))
@@ -139,8 +134,7 @@ def draw_training(section: Section) -> Any:
         alone = [_training(replace(result, by_seed={run.seed: run}), blocks, places) for run in result.finished if few]
         seeds = [[(point.frames, point.value) for point in piece] for each in alone for piece in each if piece]
         _draw(axes, agent_style(position, result.agent), pieces, seeds)
-    _finish(figure, [[axes]], section, "return while training")
-    return figure
+    return _finished(grid, section, "return while training")
 
 
 def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:
@@ -176,37 +170,35 @@ def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], see
     for points in pieces:
         if points:
             frames = [point.frames for point in points]
-            axes.plot(frames, [point.value for point in points], markevery=_every(points), zorder=3, **look)
+            values = [point.value for point in points]
+            axes.plot(frames, values, markevery=1 + len(points) // 8, zorder=3, **look)
         if points and points[0].low is not None:
             lows, highs = zip(*((point.low, point.high) for point in points), strict=True)
             axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
 
 
-def _every(points: Sequence[Point]) -> int:
-    """Marks on one of so many points."""
-    return 1 + len(points) // 8
-
-
-def _finish(figure: Any, grid: Any, section: Section, ylabel: str) -> None:
-    """One scale for all panels, from the curves' means, names of axes, and a legend of the agents."""
-    from matplotlib.lines import Line2D
-
-    panels = [axes for row in grid for axes in row]
-    heights = [y for axes in panels for line in axes.lines if len(line.get_xdata()) > 2 for y in line.get_ydata()]
-    known = [y for y in heights if y is not None and not math.isnan(y)]
-    low, high = min([0.0, *known]), max([1.0, *known])
+def _finished(grid: Any, section: Section, ylabel: str) -> Any:
+    """Return a figure with one scale for all panels, from the curves' means, names of axes, and a legend of agents."""
+    low = 0.0
+    high = 1.0
+    for axes in grid.ravel():
+        frames_axis(axes)
+        for line in axes.lines:
+            if len(line.get_xdata()) > 2:
+                heights = np.array(line.get_ydata(), dtype=float)
+                low = np.nanmin(heights, initial=low)
+                high = np.nanmax(heights, initial=high)
     room = 0.05 * (high - low)
-    panels[0].set_ylim(low - room, high + room)
     last = max(section.ends[-1], 1)
-    panels[0].set_xlim(-MARGIN * last, (1 + MARGIN) * last)  # room for marks at the ends
+    x = -MARGIN * last, (1 + MARGIN) * last  # room for marks at the ends
+    grid[0, 0].set(xlim=x, ylim=(low - room, high + room))
     for row in grid:
         row[0].set_ylabel(ylabel)
-    for axes in panels:
-        frames_axis(axes)
+    figure = grid[0, 0].figure
     figure.supxlabel("frames", fontsize=8)
-    shown = section.results[:MOST_AGENTS]
-    marks = [Line2D([], [], label=named(result), **agent_style(i, result.agent)) for i, result in enumerate(shown)]
-    figure.legend(handles=marks, loc="outside upper left", ncols=min(beside(3), len(marks)))
+    shown = enumerate(section.results[:MOST_AGENTS])
+    agents_legend(figure, [(named(result), agent_style(i, result.agent)) for i, result in shown])
+    return figure
 
 
 def named(result: Result) -> str:

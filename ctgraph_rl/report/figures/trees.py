@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ctgraph_rl.log.files import AGENT, CURRICULUM
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Result, Section
-from ctgraph_rl.report.style import beside, figure_width, new_figure, short
+from ctgraph_rl.report.style import panels, short
 from ctgraph_rl.runs.load import Trained, load
 from ctgraph_rl.runs.read import Run
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -50,22 +50,13 @@ def draw_trees(trees: Trees, seed: int) -> Any:
     """Draw a panel for each task: its tree and goal, with visits and actions of the agent where there is one."""
     assert trees.curriculum is not None
     tasks = list(zip(ct_graphs(trees.curriculum.tasks, "a tree"), trees.curriculum.labels, strict=True))[:MOST_TREES]
-    columns = min(beside(COLUMNS), len(tasks))
-    rows = math.ceil(len(tasks) / columns)
-    figure = new_figure(figure_width(), rows * max(_height(task.graph.depth) for task, _ in tasks))
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (task, label) in zip(grid, tasks, strict=False):
+    deepest = max(task.graph.depth for task, _ in tasks)
+    grid = panels(len(tasks), COLUMNS, min(0.4 * (2 * deepest + 4), 5.0), room=0)
+    for axes, (task, label) in zip(grid.ravel(), tasks, strict=False):
         seen = Visits({}, {}) if trees.trained is None else _visits(trees.trained, task, seed)
         draw_task(axes, task, seen.counts, seen.actions, ids=False, legend=task is tasks[-1][0])
         axes.set_title(f"{short(label)}\n{axes.get_title()}")
-    for axes in grid[len(tasks) :]:
-        axes.axis("off")
-    return figure
-
-
-def _height(depth: int) -> float:
-    """Inches that a tree's states need below each other to hold numbers."""
-    return min(0.4 * (2 * depth + 4), 5.0)
+    return grid[0, 0].figure
 
 
 def find_trees(run: Run) -> Trees:
