@@ -10,8 +10,10 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate, pairwise, zip_longest
+from itertools import accumulate, zip_longest
 from typing import NamedTuple
+
+import numpy as np
 
 from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import measure_name
@@ -75,7 +77,7 @@ class Result:
 
     def transfer(self) -> Estimates:
         """Changes of each task by each block: differences of successive rows of the performance matrix."""
-        changes = [_differences(history.performance) for history in _histories(self.finished)]
+        changes = [np.diff(history.performance, axis=0).tolist() for history in _histories(self.finished)]
         return self._over_seeds(changes, self.bounds.of_change)
 
     def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Estimates:
@@ -212,10 +214,6 @@ def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
 
 def _histories(runs: Iterable[Run]) -> list[History]:
     return [run.history for run in runs if run.history is not None]
-
-
-def _differences(rows: list[list[float]]) -> list[list[float]]:
-    return [[after - before for before, after in zip(*pair, strict=True)] for pair in pairwise(rows)]
 
 
 def _at(rows: list[list[float]], i: int, j: int) -> float | None:

@@ -17,6 +17,7 @@ A seed without a value is counted, never replaced. Quantiles are scipy's: ``pip 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -394,14 +395,11 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
         limit = stats.t.ppf((1 + level) / 2, freedom)
         return float(stats.nct.sf(limit, freedom, shift) + stats.nct.cdf(-limit, freedom, shift)) >= power
 
-    low, high = 1, 2
+    high = 2
     while not finds(high):
-        low, high = high, 2 * high
+        high *= 2
         require((high <= MOST_SEEDS, f"{MOST_SEEDS} seeds do not find a difference of {difference} at std {std}"))
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if finds(middle) else (middle, high)
-    return high
+    return bisect_left(range(high), True, lo=high // 2 + 1, key=finds)
 
 
 def _nothing(missing: int, method: str) -> Estimate:
