@@ -112,8 +112,8 @@ def json_object(
     try:
         content = json_value(data, finite=False, nesting=nesting)
     except ValueError as error:
-        raise ValueError(f"{path_or_dict}: must be JSON: {error}") from error
-    require((isinstance(content, dict), f"{path_or_dict}: must hold a JSON object, got {type(content).__name__}"))
+        raise ValueError(f"{path_or_dict} must be JSON: {error}") from error
+    require((isinstance(content, dict), f"{path_or_dict} must hold a JSON object, got {type(content).__name__}"))
     return str(path_or_dict), content
 
 

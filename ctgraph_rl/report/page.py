@@ -140,23 +140,24 @@ def write_report(
         parts.append(_part(section, gallery))
         if progress is not None and time.perf_counter() - start > QUICK:
             progress(f"report: {len(parts)} of {len(found)} curricula")
-    about: dict[str, Any] = {
-        "title": _title(parts),
-        "figures": together,
-        "smallest": "44rem" if width == "text" else "0",
-        "parts": parts,
-        "problems": problems,
-        "code": [*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
-        "legend": formats.LEGEND,
-        "legend_of_means": formats.MEANS,
-        "definitions": _definitions(parts),
-        "version": __version__,
-        "missing": [run for part in parts for run in part.section.runs if run.reason is not None],
-        "num_runs": len(runs),
-    }
     page = Path(folder) / "report.html"
-    for name in ("report.html", "report.md"):
-        write_whole(Path(folder) / name, rendered(Path(__file__).with_name(f"{name}.j2"), **about))
+    for file in (page, page.with_suffix(".md")):
+        text = rendered(
+            Path(__file__).with_name(f"{file.name}.j2"),
+            title=_title(parts),
+            figures=together,
+            smallest="44rem" if width == "text" else "0",
+            parts=parts,
+            problems=problems,
+            code=[*mixed_code(runs), *code_notes(runs), *label_notes(runs)],
+            legend=formats.LEGEND,
+            legend_of_means=formats.MEANS,
+            definitions=_definitions(parts),
+            version=__version__,
+            missing=[run for part in parts for run in part.section.runs if run.reason is not None],
+            num_runs=len(runs),
+        )
+        write_whole(file, text)
     write_whole(Path(folder) / "tables.tex", _latex(parts))
     return Report(page, runs, problems)
 

@@ -403,7 +403,7 @@ def seeds_needed(difference: float, std: float, paired: bool = False, level: flo
 
 
 def _nothing(missing: int, method: str) -> Estimate:
-    return Estimate(None, None, None, 0, missing, method, "no seed has a value")
+    return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a value")
 
 
 def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) -> tuple[list[list[float]], int, int]:

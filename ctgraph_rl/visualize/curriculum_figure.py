@@ -85,10 +85,18 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
     level = len(layout.leaves) <= MOST_LEVEL
     _draw_edges(axes, layout, places, shown)
     _draw_states(axes, layout, places, shown)
-    below: dict[str, Any] = {"xytext": (0, -9), "textcoords": "offset points", "ha": "center", "va": "top"}
     for end in shown:  # labels stand upright where there is little room
         words = labels[end] if level else labels[end].replace("\n", "  ")
-        axes.annotate(words, places[end], fontsize=7, rotation=0 if level else 90, **below)
+        axes.annotate(
+            words,
+            places[end],
+            (0, -9),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=7,
+            rotation=0 if level else 90,
+        )
     some = f", {len(shown)} shown" if len(shown) < len(goals) else ""
     count = f"{len(goals):,} {'goal' if len(goals) == 1 else 'goals'}{some}"
     axes.set_title(f"{shape_of(graph)}: {count}, {graph.num_end_states:,} end states", fontsize=9)

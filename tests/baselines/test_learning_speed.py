@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.scripted import BARE, RUN, seconds
 from helpers.small_agents import GREEDY, SAMPLED, batches, learnt_from, others_slow, parameters_equal, saved_and_loaded
-from helpers.startup import BARE, RUN, seconds
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
