@@ -46,7 +46,7 @@ def test_a_table_is_the_exact_model_of_a_fully_observable_task():
 def test_a_table_cannot_be_the_model_of_a_task_that_needs_memory():
     task = surjective(2, 2, 0.5, goal=(1, 2))
 
-    assert share_learned(TableModel, task, policy=NavigationPolicy, name="navigation") < 0.9
+    assert share_learned(TableModel, task, 64, NavigationPolicy, "navigation") < 0.9
 
 
 @pytest.mark.slow
@@ -58,7 +58,7 @@ def test_a_gru_is_the_exact_model_of_a_task_that_needs_memory():
 def test_a_table_forgets_where_its_tasks_disagree():
     tasks = [fully_observable(goal=(1, 1)), fully_observable(goal=(2, 2))]
 
-    matrix = performance_matrix(TableModel, tasks, num_steps=128)
+    matrix = performance_matrix(TableModel, tasks, num_steps=64)
 
     assert matrix[1, 0] == pytest.approx(1, abs=0.02)
     assert metrics.forgetting(matrix, [[0], [1]]).value == pytest.approx((matrix[1, 0] - matrix[2, 0]).item())
