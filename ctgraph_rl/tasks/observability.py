@@ -166,4 +166,4 @@ def _index_rule(task: Task) -> tuple[bool, str]:
     b = task.graph.branching_factor
     x = task.observations
     own = not (x.legacy_index and b > 2 and any(map(x.is_unique, PLACED)))
-    return own, f"observability is exact where no states share an id, not with a legacy_index with branching_factor={b}"
+    return own, f"observability is exact for ids that no states share, not a legacy_index with branching_factor={b}"
