@@ -150,14 +150,14 @@ def test_the_best_of_a_segment_has_all_its_children():
 
 
 def test_the_best_individual_stays_and_is_the_first():
-    parents = some_population()
+    parents = some_population(count=12)
     always = Reproduction(5, crossover_prob=1, insert_prob=1, duplicate_prob=0, delete_prob=0, precision=1)
 
-    children = always.children(parents, torch.tensor([0.0, 1, 2, 9, 3, 4]))
+    children = always.children(parents, torch.tensor([0.0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 20, 10]))  # in no first segment
 
-    width = int(parents.size[3])
-    kept = [(children.genes[0, : 3 + width, :width], parents.genes[3, : 3 + width, :width])]
-    kept += [(children.rule[0], parents.rule[3]), (children.size[0], parents.size[3])]
+    width = int(parents.size[10])
+    kept = [(children.genes[0, : 3 + width, :width], parents.genes[10, : 3 + width, :width])]
+    kept += [(children.rule[0], parents.rule[10]), (children.size[0], parents.size[10])]
     assert all(torch.equal(*pair) for pair in kept)
     assert children.genes[0].count_nonzero() == (3 + width) * width
 
