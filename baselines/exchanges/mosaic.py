@@ -30,6 +30,9 @@ LARGEST_RETURN = 0.9999
 
 SIMILARITY = Number(-1.001, 1.001)  # rounding
 
+ABOUT: Fields = {"task": TASK_ID, "reward": Number()}
+"""Of which task a message is, and the sender's return in it."""
+
 
 class Mosaic(MaskExchange):
     """Each member sends its task's embedding to all others, and combines masks of similar ones with a higher return.
@@ -106,13 +109,12 @@ class Mosaic(MaskExchange):
         require((self.top_n <= room, f"top_n must be at most method.max_received={room}, got {self.top_n}"))
         self.num_actions = max(method.num_actions for method in self.methods)
         self.known: list[KnownMask] = [KnownMask() for _ in agents]
-        about: Fields = {"task": TASK_ID, "reward": Number()}
         scores = Array((len(self.methods[0].weights),))
         self.kinds = {
-            "query": {**about, "embedding": Array(())},  # its length is that of the first one that is made
-            "offer": {**about, "similarity": SIMILARITY},
+            "query": {**ABOUT, "embedding": Array(())},  # its length is that of the first one that is made
+            "offer": {**ABOUT, "similarity": SIMILARITY},
             "request": {"task": TASK_ID, "similarity": SIMILARITY},
-            "mask": {**about, "similarity": SIMILARITY, "scores": scores},
+            "mask": {**ABOUT, "similarity": SIMILARITY, "scores": scores},
         }
 
     def observe(self, member: int, batch: TensorDictBase, episode_return: float) -> None:

@@ -49,7 +49,7 @@ def catalogue(group: str) -> Iterator[CatalogueEntry]:
 def constants(target: str) -> dict[str, Any]:
     """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
     module, _, name = target.rpartition(".")
-    tree = ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
+    tree = _tree_of(module)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
     found: dict[str, Any] = {}
@@ -58,6 +58,10 @@ def constants(target: str) -> dict[str, Any]:
         if home.startswith("baselines."):
             found |= constants(f"{home}.{base}")
     return found | dict(_assigned(classes[name]))
+
+
+def _tree_of(module: str) -> ast.Module:
+    return ast.parse(ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8"))
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:

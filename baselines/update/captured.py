@@ -150,10 +150,14 @@ class CapturedGroup(SeedGroup):
             for minibatch in self._minibatches(items):
                 steps.append(self.gradient_step(minibatch))
         self.stack.write()
-        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
-        largest = torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0).cpu()
         columns = table_of(steps).cpu().unbind(2)
+        largest = self._largest_weights().cpu()
         return [or_error(finite_means, list(steps[0]), *each) for each in zip(columns, largest, strict=True)]
+
+    def _largest_weights(self) -> Tensor:
+        """Return the size of the largest weight of each seed, [seeds]."""
+        weights = [self.stack.kept[name].detach().flatten(1) for name in self.stack.weights]
+        return torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0)
 
     @torch.no_grad()
     def _items(self, batch: TensorDictBase) -> dict[str, Tensor]:

@@ -198,7 +198,7 @@ class RunLog:
     def of_content(cls, content: bytes, path: Path | str) -> RunLog:
         """Return the log whose file has this content; see `read`. Errors name ``path``."""
         *lines, last = content.split(b"\n")
-        log, most = cls(), FEW + len(content) // BYTES_OF_A_NUMBER
+        log = cls()
         log._num_bytes = len(content)
         for number, line in enumerate(lines, 1):
             try:
@@ -210,16 +210,21 @@ class RunLog:
                 log.measurements.append(parsed(last))
             except ValueError:
                 log.torn_lines = 1
-        for number, measurement in enumerate(log.measurements, 1):
+        log._check(path)
+        return log
+
+    def _check(self, path: Path | str) -> None:
+        """Refuse what this version has not written; errors name ``path``."""
+        most = FEW + self._num_bytes // BYTES_OF_A_NUMBER
+        for number, measurement in enumerate(self.measurements, 1):
             try:
                 check(measurement, most)
             except ValueError as error:
                 raise ValueError(f"{path}: line {number}: {error}") from None
-        for run in log.of_kind("run"):
+        for run in self.of_kind("run"):
             schema = run.get("schema", SCHEMA)
             newer = f"{path} has schema {schema}, this version reads {SCHEMA}: update ctgraph_rl"
             require((schema <= SCHEMA, newer))
-        return log
 
     @classmethod
     def begun(cls, path: Path | str) -> dict[str, Any] | None:
