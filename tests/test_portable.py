@@ -40,7 +40,8 @@ del EMULATIONS["avx512" if torch.backends.cpu.get_cpu_capability() != "AVX512" e
 LEARNERS = [
     {"agent": "lstm_ppo"},
     {"agent": "dqn"},
-    {"agent": "ppo_published", "agent.num_minibatches": 8, "method": "mask_lc", "protocol.task_id": "one_hot"},
+    {"agent": "ppo_published", "agent.num_minibatches": 8},
+    {"agent": "ppo", "method": "mask_lc", "protocol.task_id": "one_hot"},
 ]
 
 
