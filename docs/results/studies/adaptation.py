@@ -1,0 +1,163 @@
+"""Agents that adapt to a uniform goal, beside the best search: adaptation.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from studies.raw import HERE, TEMPLATES, Raw, groups, machine_of, machines, mean_of, read, table, write
+
+NAME = "adaptation"
+PAGE = HERE / "adaptation.md"
+PICTURE = HERE / "adaptation.png"
+
+LABELS = {
+    "rl2": "RL^2",
+    "cavia": "CAVIA",
+    "maml": "MAML",
+    "pearl": "PEARL",
+}
+GATES = {
+    "none": "",
+    "soft": ", soft gate",
+    "hard": ", hard gate (as released)",
+    "hard_straight_through": ", hard gate, straight through",
+}
+SUCCESS = (0.0, 1.0)
+
+
+def collect(name: str, folders: Sequence[Path]) -> None:
+    """Write a line for each episode of rows in the last evaluation of the finished runs under some folders."""
+    paths = [path for folder in folders for path in folder.rglob("metrics.json")]
+    lines = [line for path in sorted(paths) for line in measured(path.parent)]
+    write(name, sorted(lines, key=lambda line: (line["depth"], line["agent"], line["gate"], line["seed"])))
+
+
+def measured(run: Path) -> list[dict[str, Any]]:
+    """Return a line for each episode of rows in the last evaluation of a run: means over its tasks."""
+    from ctgraph_rl.log.files import LOG
+    from ctgraph_rl.log.run_log import RunLog
+
+    log = RunLog.read(run / LOG)
+    about = log.of_kind("run")[0]
+    config = about["config"]
+    adaptation = log.adaptation()
+    if adaptation is None:
+        raise ValueError(f"{run} has no evaluation with adaptation: run it with evaluation.adapt_episodes")
+    common = {
+        "depth": config["curriculum"]["depth"],
+        "agent": config["agent"]["_target_"].split(".")[1],
+        "gate": config["agent"].get("gate", "none"),
+        "seed": config["seed"],
+        "frames": log.of_kind("adaptation")[-1]["frames"],
+        "adapt_episodes": config["evaluation"]["adapt_episodes"],
+        **machine_of(about),
+    }
+    success = adaptation.success.mean(dim=0).tolist()
+    returns = adaptation.returns.mean(dim=0).tolist()
+    exact = adaptation.exact.mean(dim=0).tolist()
+    episodes = enumerate(zip(success, returns, exact, strict=True), start=1)
+    return [
+        {
+            **common,
+            "episode": episode,
+            "success": round(reached, 6),
+            "return": round(gained, 6),
+            "best_search": round(best, 6),
+        }
+        for episode, (reached, gained, best) in episodes
+    ]
+
+
+def runs(depth: int) -> dict[tuple[str, ...], dict[tuple[str, ...], Raw]]:
+    """Return the lines of each seed of each agent and gate at a depth, in the order of `LABELS` and `GATES`."""
+    lines = [line for line in read(NAME) if line["depth"] == str(depth)]
+    of = groups(lines, "agent", "gate")
+    order = [(agent, gate) for agent in LABELS for gate in GATES if (agent, gate) in of]
+    return {key: groups(of[key], "seed") for key in order}
+
+
+def label(agent: str, gate: str) -> str:
+    """Return what a row of a table is called."""
+    return LABELS[agent] + GATES[gate]
+
+
+def first(lines: Raw) -> float:
+    """Return the success of a run's first episodes, before any adaptation."""
+    return float(lines[0]["success"])
+
+
+def adapted(lines: Raw) -> float:
+    """Return the mean success of a run's episodes after the adaptation."""
+    after = [float(line["success"]) for line in lines if int(line["episode"]) > int(line["adapt_episodes"])]
+    return sum(after) / len(after)
+
+
+def regret(lines: Raw) -> float:
+    """Return the goals that a run's rows miss beside the best search, in all of their episodes."""
+    return sum(float(line["best_search"]) - float(line["success"]) for line in lines)
+
+
+def adaptation_table(depth: int) -> str:
+    """Return a row for each agent and gate: means over seeds with their intervals; a row for the best search."""
+    rows = []
+    best: Raw = []
+    for (agent, gate), of in runs(depth).items():
+        seeds = list(of.values())
+        best = seeds[0]
+        rows.append(
+            [
+                label(agent, gate),
+                str(len(seeds)),
+                best[0]["frames"],
+                mean_of([first(lines) for lines in seeds], SUCCESS),
+                mean_of([adapted(lines) for lines in seeds], SUCCESS),
+                mean_of([regret(lines) for lines in seeds], (-float(len(best)), float(len(best)))),
+            ]
+        )
+    if best:
+        rows.append(["*best search*", "exact", "-", best[0]["best_search"], "1.00", "0.00"])
+    head = ["agent", "seeds", "frames", "success in episode 1", "success after adaptation", "regret"]
+    return table(head, rows)
+
+
+def draw(path: Path) -> None:
+    """Draw the success in each episode of a row: a panel for each depth, a line for each seed, and the best search."""
+    from ctgraph_rl.visualize.style import new_figure, save_figure
+
+    depths = [depth for depth in (1, 2, 3) if runs(depth)]
+    figure = new_figure(7.2, 3.2)
+    panels = figure.subplots(1, len(depths), squeeze=False, sharey=True)[0]
+    for axes, depth in zip(panels, depths, strict=True):
+        _draw_depth(axes, depth)
+    panels[0].set_ylabel("share at the goal")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=3, fontsize=7)
+    save_figure(figure, path, 220)
+
+
+def _draw_depth(axes: Any, depth: int) -> None:
+    lines: Raw = []
+    for position, ((agent, gate), of) in enumerate(runs(depth).items()):
+        for number, lines in enumerate(of.values()):
+            success = [float(line["success"]) for line in lines]
+            name = label(agent, gate) if number == 0 else None
+            axes.plot(range(1, len(lines) + 1), success, color=f"C{position}", linewidth=0.9, label=name)
+    best = [float(line["best_search"]) for line in lines]
+    axes.plot(range(1, len(best) + 1), best, "k--", linewidth=1, label="best search")
+    axes.set(title=f"depth {depth}", xlabel="episode of a row", ylim=(-0.05, 1.05))
+
+
+def page() -> str:
+    """Return the page: its template with its tables and numbers."""
+    text = (TEMPLATES / "adaptation.md").read_text(encoding="utf-8")
+    tables = {f"depth_{depth}": adaptation_table(depth) for depth in (1, 2, 3)}
+    return Template(text).substitute(tables, machines=machines(NAME))
+
+
+def make() -> None:
+    """Write the page and its figure."""
+    draw(PICTURE)
+    PAGE.write_text(page(), encoding="utf-8")
