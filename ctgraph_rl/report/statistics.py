@@ -21,7 +21,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +46,6 @@ EQUAL_SEEDS = "all seeds are equal; few seeds leave other means possible, and th
 MOST_SEEDS = 2**20
 """Number of seeds at which `seeds_needed` gives up."""
 
-Pair = TypeVar("Pair")
 
 Values = Sequence[float | None]
 LowHigh = tuple[float, float] | Bounds
@@ -366,7 +365,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def corrected(found: Mapping[Pair, Comparison]) -> dict[Pair, Comparison]:
+def corrected(found: Mapping[Any, Comparison]) -> dict[Any, Comparison]:
     """Return comparisons with their p-values corrected for the number of all."""
     p_values = holm([each.p_value for each in found.values()])
     return {pair: replace(each, holm=p) for (pair, each), p in zip(found.items(), p_values, strict=True)}

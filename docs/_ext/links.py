@@ -87,9 +87,9 @@ def with_plain_defaults(
 ) -> tuple[str | None, str | None]:
     """Write a default that a factory makes as ``...``: the whole signature could not be parsed else.
 
-    A class whose metaclass hides its arguments, as TorchRL's, gets those of its ``__init__``.
+    A class of ours whose metaclass hides its arguments, as TorchRL's, gets those of its ``__init__``.
     """
-    if what == "class" and signature == "(*args, **kwargs)":
+    if what == "class" and signature == "(*args, **kwargs)" and obj.__init__.__module__ == obj.__module__:
         own = signature_of(obj.__init__, bound_method=True)
         signature = stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
     return signature and signature.replace("<factory>", "..."), returned
