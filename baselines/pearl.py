@@ -250,7 +250,7 @@ class PEARL(Learner):
             step = torch.randint(num_steps, (self.minibatch_size, 1), device=begins.device)
             trial = row, first[row, step], last[row, step]
             context = {("context", key): value for key, value in self._steps(*trial, self.context_size).items()}
-            noise = torch.randn(self.minibatch_size, self.num_context, device=begins.device)
+            noise = torch.randn(self.minibatch_size, self.num_context, dtype=torch.float32, device=begins.device)
             yield {**self._steps(*trial, self.batch_size), **context, "noise": noise}
 
     def _store(self, batch: TensorDictBase) -> None:
@@ -266,7 +266,7 @@ class PEARL(Learner):
 
     def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> dict[Any, Tensor]:
         """Draw steps of trials with replacement, [num_trials, number]; row, first and last are [num_trials, 1]."""
-        share = torch.rand(len(row), number, device=row.device)
+        share = torch.rand(len(row), number, dtype=torch.float32, device=row.device)
         step = (first + (share * (last + 1 - first)).long()).minimum(last)
         return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}
 

@@ -135,7 +135,8 @@ class Reproduction(NamedTuple):
 
     def children(self, parents: Population, fitness: Tensor) -> Population:
         """Return the next generation; its first individual is the best of this one, unchanged."""
-        chosen = winners(fitness, self.segment_size, int(torch.randint(self.segment_size, ())))
+        offset = torch.randint(self.segment_size, (), dtype=torch.int64, device="cpu")
+        chosen = winners(fitness, self.segment_size, int(offset))
         chosen[0] = fitness.argmax()
         mates = torch.randint(len(fitness), fitness.shape, device=fitness.device)
         crossed = self.crossed(parents.take(chosen), parents.take(mates))
@@ -230,7 +231,7 @@ def winners(fitness: Tensor, segment_size: int, offset: int) -> Tensor:
 
 def first_population(count: int, num_inputs: int) -> Population:
     """Draw the first generation; its first individual has no weights."""
-    modulates = torch.tensor(NEURONS, device="cpu").repeat(count, 1)
+    modulates = torch.tensor(NEURONS, dtype=torch.bool, device="cpu").repeat(count, 1)
     size = modulates.new_full((count,), len(NEURONS), dtype=torch.int64)
     genes = torch.zeros(count, num_inputs + len(NEURONS), len(NEURONS), dtype=torch.float32, device="cpu")
     return mutated(Population(genes, genes[:, :5, 0], modulates, size), FIRST_PRECISION)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
@@ -35,16 +37,18 @@ class GRUModel:
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.embedding = nn.Embedding(len(symbols.images) * symbols.num_actions, hidden_size, device="cpu")
-            self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True, device="cpu")
-            self.head = nn.Linear(hidden_size, symbols.num_pairs, device="cpu")
+            self.embedding = nn.Embedding(
+                len(symbols.images) * symbols.num_actions, hidden_size, dtype=torch.float32, device="cpu"
+            )
+            self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True, dtype=torch.float32, device="cpu")
+            self.head = nn.Linear(hidden_size, symbols.num_pairs, dtype=torch.float32, device="cpu")
         layers = nn.ModuleList([self.embedding, self.gru, self.head])
         self.optimiser = torch.optim.Adam(layers.parameters(), learning_rate)
 
     def learn(self, transitions: Transitions) -> None:
         """See `Predictor`; minibatches of 16 rows."""
         for _ in range(self.num_epochs):
-            for rows in torch.randperm(len(transitions.pair), generator=self.generator).split(16):
+            for rows in torch.randperm(len(transitions.pair), generator=self.generator, device="cpu").split(16):
                 batch = Transitions(*(each[rows] for each in transitions))
                 self.optimiser.zero_grad()
                 self._nats(batch).mean().backward()
@@ -53,7 +57,7 @@ class GRUModel:
     @torch.no_grad()
     def bits(self, transitions: Transitions) -> Tensor:
         """See `Predictor`."""
-        return self._nats(transitions) / torch.tensor(2.0, device="cpu").log()
+        return self._nats(transitions) / math.log(2)
 
     def _nats(self, transitions: Transitions) -> Tensor:
         memory, _ = self.gru(self.embedding(transitions.image * self.num_actions + transitions.action))
