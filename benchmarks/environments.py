@@ -205,24 +205,26 @@ def _gymnasium(task: Task, num_rows: int, kernel: str) -> Iterator[tuple[str, Ca
     envs.reset(seed=0)
     actions = torch.randint(0, 3, (16, num_rows), device="cpu").numpy()
 
-    def run_batch() -> int:
+    def run() -> int:
         for action in actions:
             envs.step(action)
         return actions.size
 
-    yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run_batch
-    if num_rows == 1:
-        env = CTGraphGymEnv(task, kernel=kernel)
-        choices = torch.randint(0, 3, (256,), device="cpu").tolist()
-        env.reset(seed=0)
+    yield f"Gymnasium VectorEnv{SUFFIX[kernel]}", run
 
-        def run() -> int:
-            for choice in choices:
-                if env.step(choice)[2]:
-                    env.reset()
-            return len(choices)
 
-        yield f"Gymnasium Env{SUFFIX[kernel]}", run
+def _single(task: Task, kernel: str) -> Iterator[tuple[str, Callable[[], int]]]:
+    env = CTGraphGymEnv(task, kernel=kernel)
+    actions = torch.randint(0, 3, (256,), device="cpu").tolist()
+    env.reset(seed=0)
+
+    def run() -> int:
+        for action in actions:
+            if env.step(action)[2]:
+                env.reset()
+        return len(actions)
+
+    yield f"Gymnasium Env{SUFFIX[kernel]}", run
 
 
 def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list[Way]:
@@ -245,6 +247,8 @@ def contenders(num_rows: list[int], names: list[str], with_kernel: bool) -> list
                     make = partial(CTGraphEnv, [task] * n, check_actions=False, kernel=kernel, info=info)
                     add(name, n, _torchrl(make, suffix=suffix + SUFFIX[kernel]))
                 add(name, n, _gymnasium(task, n, kernel))
+                if n == 1:
+                    add(name, n, _single(task, kernel))
     return found
 
 

@@ -113,14 +113,14 @@ class CTGraphEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        n = self.batch_size[0]
+        rows = self.batch_size
         device = self.device
-        specs = specs_of(self.rows.pool, (n,), self.num_task_ids, self.info)
+        specs = specs_of(self.rows.pool, rows, self.num_task_ids, self.info)
         self.observation_spec, self.action_spec = (spec.to(device) for spec in specs)
-        self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32, device=device)
-        flag = Binary(1, shape=(n, 1), dtype=torch.bool, device=device)
+        self.reward_spec = Unbounded(shape=(*rows, 1), dtype=torch.float32, device=device)
+        flag = Binary(1, shape=(*rows, 1), dtype=torch.bool, device=device)
         truncated = {"truncated": flag.clone()} if self.info else {}
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), **truncated, shape=(n,), device=device)
+        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), **truncated, shape=rows, device=device)
 
     @property
     def tasks(self) -> tuple[Task, ...]:

@@ -141,11 +141,12 @@ def profile_innate(num_frames: int = 102_400) -> Curriculum:
     Args:
         num_frames: frames of each block.
     """
-    deepest = ct_graph(2, 4, 0.0, _alternating(4), image_seed=2)
+    decisions = _alternating(4)
+    deepest = ct_graph(2, 4, 0.0, decisions, image_seed=2)
     [two, three] = growing_depth(deepest, (2, 3))
     graphs = [(two, (2, 1), 0.0), (two, (2, 2), 0.5), (three, (2, 1, 2), 0.0), (three, (2, 2, 1), 0.5)]
     innate = [replace(task, goal=goal, graph=replace(task.graph, wait_prob=p)) for task, goal, p in graphs]
-    return _profile("innate", [ct_graph(2, 4, 0.0, _alternating(4)), innate, deepest], num_frames, CURVES)
+    return _profile("innate", [ct_graph(2, 4, 0.0, decisions), innate, deepest], num_frames, CURVES)
 
 
 def _alternating(depth: int) -> tuple[int, ...]:

@@ -162,6 +162,10 @@ def test_a_function_has_at_most_400_tokens():
     assert architecture.long_functions(modules, 400) == []
 
 
+def test_nine_functions_in_ten_have_at_most_150_tokens():
+    assert architecture.p90_of_functions(modules_of_packages()) <= 150
+
+
 def test_keywords_stand_at_the_call_and_not_in_a_dict_made_for_it():
     assert architecture.starred_dicts([*modules_of_packages(), *modules_of_results()]) == []
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -107,16 +108,17 @@ class AMD(Detector):
         longest = int(63 / math.log2(self.num_outcomes + 1)) - 1
         rule = f"order must be at most {longest} with {num_actions} actions and {num_observations} observations"
         require((self.order <= longest, f"{rule}, got {self.order}"))
+        integers = partial(torch.zeros, dtype=torch.int64, device="cpu")
         self.models: dict[int, Counts] = {0: Counts()}
         """Of each label."""
 
-        self.recent = torch.zeros(num_rows, self.order - 1, dtype=torch.int64, device="cpu")
+        self.recent = integers(num_rows, self.order - 1)
         """The last pairs of action and next observation of each row's episode, from 1; 0 stands for none."""
 
-        self.last_action = torch.zeros(num_rows, dtype=torch.int64, device="cpu")
+        self.last_action = integers(num_rows)
         """Of each row."""
 
-        self.pending = torch.zeros(0, 3, dtype=torch.int64, device="cpu")
+        self.pending = integers(0, 3)
         """History, action and next observation of the steps behind the last window."""
 
     def observe(self, seen: Seen) -> Verdict:

@@ -260,10 +260,10 @@ def _action_spec(space: Any, num_rows: int) -> Any:
     if hasattr(space, "n"):
         return Categorical(int(space.n), shape=(num_rows,), dtype=torch.int64, device="cpu")
     shape = (num_rows, *space.shape)
-    if not np.isfinite([space.low, space.high]).all():
+    ends = np.stack([space.low, space.high])
+    if not np.isfinite(ends).all():
         return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
-    ends = torch.tensor(np.stack([space.low, space.high]), dtype=torch.float32, device="cpu")
-    low, high = (end.expand(shape) for end in ends)
+    low, high = (torch.tensor(end, dtype=torch.float32, device="cpu").expand(shape) for end in ends)
     return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 

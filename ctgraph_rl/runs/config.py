@@ -82,6 +82,7 @@ def of_hydra(function: Function) -> Function:
     return function if IS_NEXT_HYDRA else partial(function, version_base="1.3")  # type: ignore[return-value]
 
 
+_NO_SETTINGS = {"_target_", "hydra"}
 _PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a class that hydra.utils.get_class gets
 
 
@@ -394,11 +395,11 @@ def _unknown_file(group: str, name: str, choices: Sequence[str]) -> str:
 def _unknown_setting(asked: str, node: DictConfig) -> str:
     """Return why a setting is none, and what was probably meant: a key beside it or, of the whole run, any below."""
     group, _, key = asked.rpartition(".")
-    beside = [f"{group}.{name}".lstrip(".") for name in map(str, node) if name not in ("_target_", "hydra")]
+    beside = [f"{group}.{name}".lstrip(".") for name in map(str, node) if name not in _NO_SETTINGS]
     groups = [] if group else [path.name for path in Path(conf_dir()).iterdir() if path.is_dir()]
     below = [] if group else [name for name, _ in flat(plain(node))]
     ends = {name.rpartition(".")[2]: name for name in (*reversed(below), *groups, *beside)}  # the last one counts
-    near = nearest(key, set(ends) - {"_target_", "hydra"})
+    near = nearest(key, set(ends) - _NO_SETTINGS)
     hint = f"choices: {', '.join(beside) or 'none'}" if near is None else f"did you mean {ends[near]!r}?"
     return f"unknown setting {asked!r}: {hint}"
 

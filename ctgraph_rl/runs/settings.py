@@ -161,14 +161,22 @@ def digest(settings: Mapping[str, Any]) -> str:
 
 def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]:
     """Return in words which settings of a stored run differ from those that are given."""
-    before, now = dict(flat(as_before(stored))), dict(flat(as_before(given)))
+    before = dict(flat(as_before(stored)))
+    now = dict(flat(as_before(given)))
+    found = []
+    for key in sorted({*before, *now}):
+        added = _value_before(key, given)
+        old = before.get(key, added)
+        new = now.get(key, added)
+        if old != new:
+            found.append(f"{key}={old!r} instead of {new!r}")
+    return found
 
-    def value_of(key: str, values: Mapping[str, Any]) -> Any:
-        group, _, name = key.partition(".")
-        return values.get(key, dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key)))
 
-    pairs = {key: (value_of(key, before), value_of(key, now)) for key in sorted({*before, *now})}
-    return [f"{key}={old!r} instead of {new!r}" for key, (old, new) in pairs.items() if old != new]
+def _value_before(key: str, given: Mapping[str, Any]) -> Any:
+    """Return the value that stands for a setting that was added later."""
+    group, _, name = key.partition(".")
+    return dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
 
 
 def in_digits(arguments: Sequence[str]) -> list[str]:

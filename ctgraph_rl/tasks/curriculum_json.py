@@ -54,6 +54,12 @@ MAX_BANK_BYTES = 2**36
 _KEYS = ("schema", "fingerprint", "name", "version", "source", "tasks", "blocks", "evaluation", "protocol")
 _DERIVED = "about"
 
+_CHOSEN = (*IMAGE_SETS, *REWARD_FNS, *SWITCHES)
+"""Types of which a curriculum has one of several, so that JSON names it."""
+
+_OURS = (*_CHOSEN, Task, CTGraph, Observations, Block, Evaluation, Protocol)
+"""All types in the JSON of a curriculum of CT-graphs."""
+
 TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 """Kinds of tasks of this package by name, beside `Task`, whose JSON names none."""
 
@@ -114,10 +120,8 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
         return [_plain(item, places) for item in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    chosen = (*IMAGE_SETS, *REWARD_FNS, *SWITCHES)
-    known = (*chosen, Task, CTGraph, Observations, Block, Evaluation, Protocol)
-    require((type(value) in known, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
-    kind = {"type": type(value).__name__} if type(value) in chosen else {}
+    require((type(value) in _OURS, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
+    kind = {"type": type(value).__name__} if type(value) in _CHOSEN else {}
     return {**kind, **{name: _plain(getattr(value, name), places) for name in _names(type(value))}}
 
 

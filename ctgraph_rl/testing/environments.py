@@ -124,8 +124,7 @@ class EnvironmentContract(_OfTasks):
         again = list(self.steps(self.make_env(tasks, seed=3), actions))
 
         for (step, following), (other, other_following) in zip(once, again, strict=True):
-            assert all(step["next", key].equal(other["next", key]) for key in (*SHOWN, "reward", "done"))
-            assert all(following[key].equal(other_following[key]) for key in SHOWN)
+            _assert_equal(step, other, following, other_following)
 
     def test_a_row_changes_its_task_where_its_episode_ends(self) -> None:
         """``set_tasks(tasks, at_episode_end=True)``, by the ids that rows show."""
@@ -158,5 +157,12 @@ class EnvironmentContract(_OfTasks):
             env.rand_action(data)
             step, following = env.step_and_maybe_reset(data.clone())
             again, data = other.step_and_maybe_reset(data.clone())
-            assert all(step["next", key].equal(again["next", key]) for key in (*SHOWN, "reward", "done"))
-            assert all(following[key].equal(data[key]) for key in SHOWN)
+            _assert_equal(step, again, following, data)
+
+
+def _assert_equal(
+    step: TensorDictBase, other: TensorDictBase, following: TensorDictBase, other_following: TensorDictBase
+) -> None:
+    """Two steps, and what follows each, show the same."""
+    assert all(step["next", key].equal(other["next", key]) for key in (*SHOWN, "reward", "done"))
+    assert all(following[key].equal(other_following[key]) for key in SHOWN)

@@ -6,7 +6,7 @@ The panels leave wait states out: there is one before each decision and end stat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +70,14 @@ def goals_by_graph(curriculum: Curriculum) -> dict[CTGraph, dict[Goal, str]]:
     labels: dict[CTGraph, dict[Goal, str]] = {}
     for graph, goals in blocks.items():
         for goal, of_goal in goals.items():
-            numbers = sorted(set(of_goal))
-            where = f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
-            where = f"block {numbers[0]}" if len(numbers) == 1 else where
-            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{where}"
+            labels.setdefault(graph, {})[goal] = f"{in_digits(goal)}\n{_blocks_in_words(sorted(set(of_goal)))}"
     return labels
+
+
+def _blocks_in_words(numbers: Sequence[int]) -> str:
+    if len(numbers) == 1:
+        return f"block {numbers[0]}"
+    return f"blocks {', '.join(map(str, numbers))}" if len(numbers) <= 3 else f"{len(numbers)} blocks"
 
 
 def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:

@@ -253,8 +253,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = parsers.play()
     arguments = parser.parse_args(argv)
     with refused_by(parser):
-        delay_rule = f"--delay must be seconds >= 0, got {arguments.delay}"
-        require((is_real(arguments.delay, 0), delay_rule), *at_least_one(episodes=arguments.episodes))
+        require(
+            (is_real(arguments.delay, 0), f"--delay must be seconds >= 0, got {arguments.delay}"),
+            *at_least_one(episodes=arguments.episodes),
+        )
         selection = select(arguments)
         game = Game(selection.player(arguments.seed, not arguments.sampled), Console(highlight=False))
     try:
