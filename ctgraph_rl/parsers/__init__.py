@@ -59,12 +59,10 @@ def board() -> ArgumentParser:
     the results file that model hubs read. The exit code is 1 if something was left out.
     """
     parser = _parser(board)
-    parser.add_argument(
-        "submissions", type=Path, nargs="+", metavar="DIR", help="submissions, or folders that hold them"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="where the files go")
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="folder with your own tracks, track/NAME.yaml")
-    parser.add_argument("--date", type=date.fromisoformat, help="the day that the metadata names (default: today)")
+    _add(parser, "submissions", "submissions, or folders that hold them", nargs="+", metavar="DIR")
+    _add(parser, "--out", "where the files go", required=True, metavar="FOLDER")
+    _add(parser, "--config-dir", "folder with your own tracks, track/NAME.yaml", metavar="DIR")
+    _add(parser, "--date", "the day that the metadata names (default: today)", type=date.fromisoformat)
     return parser
 
 
@@ -75,10 +73,8 @@ def collectives() -> ArgumentParser:
     of members, and who helped whom; the same as tidy CSV files. ctgraph-rl report takes members like other runs.
     """
     parser = _parser(collectives)
-    parser.add_argument("runs", type=Path, nargs="+", help="directories of collectives, or folders that hold them")
-    parser.add_argument(
-        "--out", type=Path, default=Path("collectives"), help="where the page goes (default: collectives/)"
-    )
+    _add(parser, "runs", "directories of collectives, or folders that hold them", nargs="+")
+    _add(parser, "--out", "where the page goes (default: collectives/)", default=Path("collectives"))
     return parser
 
 
@@ -89,12 +85,12 @@ def compare() -> ArgumentParser:
     what is no run.
     """
     parser = _parser(compare)
-    parser.add_argument("one", type=Path, metavar="A", help="a run directory")
-    parser.add_argument("other", type=Path, metavar="B", help="another one")
+    _add(parser, "one", "a run directory", metavar="A")
+    _add(parser, "other", "another one", metavar="B")
     within = (
         "largest difference that counts as rounding, as a share of the field's largest value (default: %(default)g)"
     )
-    parser.add_argument("--bound", type=float, default=BOUND, help=within)
+    _add(parser, "--bound", within, default=BOUND, type=float)
     return parser
 
 
@@ -104,11 +100,11 @@ def draw() -> ArgumentParser:
     _add_task(parser)
     what = "what a figure has: observation ids in the states, their kinds, or the images"
     parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
-    parser.add_argument("--dpi", type=int, default=DPI, help=f"pixels an inch of a .png; default: {DPI}")
-    parser.add_argument("--dot", type=Path, metavar="FILE", help="write the graph for Graphviz")
-    parser.add_argument("--gif", type=Path, metavar="FILE", help="write an episode of the policy as a film")
-    parser.add_argument("--episodes", type=int, default=1000, help="episodes used to count visits; default: 1000")
+    _add(parser, "--figure", "write a figure (.png, .pdf, .svg)", metavar="FILE")
+    _add(parser, "--dpi", f"pixels an inch of a .png; default: {DPI}", default=DPI, type=int)
+    _add(parser, "--dot", "write the graph for Graphviz", metavar="FILE")
+    _add(parser, "--gif", "write an episode of the policy as a film", metavar="FILE")
+    _add(parser, "--episodes", "episodes used to count visits; default: 1000", default=1000, type=int)
     return parser
 
 
@@ -120,9 +116,9 @@ def export() -> ArgumentParser:
     count experiences, so runtimes mean nothing.
     """
     parser = _parser(export)
-    parser.add_argument("run", type=Path, help="a run directory")
+    _add(parser, "run", "a run directory")
     parser.add_argument("--format", choices=EXPORT_FORMATS, default=EXPORT_FORMATS[0], help="the format to write")
-    parser.add_argument("--out", type=Path, required=True, help="the folder to write; for l2logger new or empty")
+    _add(parser, "--out", "the folder to write; for l2logger new or empty", required=True)
     return parser
 
 
@@ -130,8 +126,8 @@ def play() -> ArgumentParser:
     """Play a CT-graph in the terminal, or watch a policy play it."""
     parser = _parser(play)
     _add_task(parser)
-    parser.add_argument("--episodes", type=int, default=3, help="of a policy; default: 3")
-    parser.add_argument("--delay", type=float, default=0.5, help="seconds between a policy's steps; default: 0.5")
+    _add(parser, "--episodes", "of a policy; default: 3", default=3, type=int)
+    _add(parser, "--delay", "seconds between a policy's steps; default: 0.5", default=0.5, type=float)
     return parser
 
 
@@ -145,8 +141,8 @@ def profile() -> ArgumentParser:
     """
     parser = _parser(profile)
     parser.add_argument("words", nargs="+", metavar="SETTING=VALUE|FOLDER", help="what to train, or runs to score")
-    parser.add_argument("--config-dir", type=Path, help="a folder with an agent of your own, agent/NAME.yaml")
-    parser.add_argument("--out", type=Path, help="where the page goes (default: profile/ within the first folder)")
+    _add(parser, "--config-dir", "a folder with an agent of your own, agent/NAME.yaml")
+    _add(parser, "--out", "where the page goes (default: profile/ within the first folder)")
     _add_agent(parser)
     return parser
 
@@ -154,8 +150,8 @@ def profile() -> ArgumentParser:
 def report() -> ArgumentParser:
     """Write a page of figures and tables of runs."""
     parser = _parser(report)
-    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
-    parser.add_argument("--out", type=Path, help="where the report goes (default: report/ within the one folder given)")
+    _add(parser, "runs", "run directories, or folders that hold them", nargs="+")
+    _add(parser, "--out", "where the report goes (default: report/ within the one folder given)")
     _add_agent(parser)
     parser.add_argument("--width", default="text", help="of figures: text of a page, or column, one of its two")
     parser.add_argument(
@@ -176,7 +172,7 @@ def results() -> ArgumentParser:
     of one configuration has changed between runs; these runs are named and shown separately.
     """
     parser = _parser(results)
-    parser.add_argument("runs", type=Path, nargs="+", help="run directories, or folders that hold them")
+    _add(parser, "runs", "run directories, or folders that hold them", nargs="+")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
     which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
@@ -185,13 +181,11 @@ def results() -> ArgumentParser:
     of_seeds = parser.add_mutually_exclusive_group()
     of_seeds.add_argument("--statistics", choices=STATISTICS, default="exact", help=f"{kinds} (default: exact)")
     of_seeds.add_argument("--per-seed", action="store_true", help="show single runs, a row for each measure")
-    parser.add_argument("--csv", type=Path, help="also write the table with every measure into this file")
-    parser.add_argument(
-        "--tidy", type=Path, metavar="FILE", help="also write every evaluation as a row into this .csv or .parquet file"
-    )
+    _add(parser, "--csv", "also write the table with every measure into this file")
+    _add(parser, "--tidy", "also write every evaluation as a row into this .csv or .parquet file", metavar="FILE")
     _add_agent(parser)
     parser.add_argument("--compare", metavar="METRIC", help="also compare every two agents, seed by seed")
-    parser.add_argument("--difference", type=float, help="how many seeds would find a true difference of this size")
+    _add(parser, "--difference", "how many seeds would find a true difference of this size", type=float)
     return parser
 
 
@@ -201,14 +195,14 @@ def submit() -> ArgumentParser:
     --template > method.yaml prints what an author says about a method, to fill in once.
     """
     parser = _parser(submit)
-    parser.add_argument("runs", type=Path, nargs="*", help="run directories, or folders that hold them")
-    parser.add_argument("--to", type=Path, metavar="DIR", help="the folder to make")
+    _add(parser, "runs", "run directories, or folders that hold them", nargs="*")
+    _add(parser, "--to", "the folder to make", metavar="DIR")
     about = "what you say about the method (default: %(default)s)"
-    parser.add_argument("--method", type=Path, default=Path("method.yaml"), metavar="FILE", help=about)
+    _add(parser, "--method", about, default=Path("method.yaml"), metavar="FILE")
     parser.add_argument("--track", metavar="NAME", help="the track; default: as the file says")
     only = "leave out runs with another value, such as --only curriculum.depth=4"
-    parser.add_argument("--only", metavar="SETTING=VALUE", nargs="+", type=_setting, default=[], help=only)
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="folder with your own track, track/NAME.yaml")
+    _add(parser, "--only", only, metavar="SETTING=VALUE", nargs="+", default=[], type=_setting)
+    _add(parser, "--config-dir", "folder with your own track, track/NAME.yaml", metavar="DIR")
     parser.add_argument("--template", action="store_true", help="print a method.yaml to fill in, and do nothing else")
     return parser
 
@@ -221,33 +215,30 @@ def verify() -> ArgumentParser:
     and the scores are no lower.
     """
     parser = _parser(verify)
-    parser.add_argument("submission", type=Path, metavar="DIR", help="the folder of a submission")
+    _add(parser, "submission", "the folder of a submission", metavar="DIR")
     parser.add_argument("--level", choices=LEVELS, default=LEVELS[1], help="how far to verify (default: %(default)s)")
-    parser.add_argument("--cells", type=int, default=2, metavar="N", help="runs of each level (default: %(default)s)")
+    _add(parser, "--cells", "runs of each level (default: %(default)s)", default=2, metavar="N", type=int)
     drawn = "draws the runs and the held-out seeds, in 0..2^63-1 (default: a random one, which is printed)"
-    parser.add_argument("--number", type=int, help=drawn)
-    parser.add_argument("--code", type=Path, metavar="DIR", help="folder of modules that are not installed")
-    parser.add_argument(
-        "--hours", type=float, help=f"time limit of a process (default: {LIMIT_TIMES} times the submitted run's)"
-    )
-    parser.add_argument(
-        "--memory", type=float, default=8.0, metavar="GB", help="memory limit of a process (default: %(default)g)"
-    )
-    parser.add_argument(
-        "--disk", type=float, default=4.0, metavar="GB", help="disk limit of a process (default: %(default)g)"
-    )
+    _add(parser, "--number", drawn, type=int)
+    _add(parser, "--code", "folder of modules that are not installed", metavar="DIR")
+    _add(parser, "--hours", f"time limit of a process (default: {LIMIT_TIMES} times the submitted run's)", type=float)
+    _add(parser, "--memory", "memory limit of a process (default: %(default)g)", default=8.0, metavar="GB", type=float)
+    _add(parser, "--disk", "disk limit of a process (default: %(default)g)", default=4.0, metavar="GB", type=float)
     parser.add_argument("--yes", action="store_true", help="skip the prompt despite incomplete isolation")
     parser.add_argument("--not-isolated", action="store_true", help="run without bubblewrap")
-    parser.add_argument(
-        "--folder", type=Path, default=Path("verify"), metavar="DIR", help="folder of the reruns (default: %(default)s)"
-    )
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="folder with your own track, track/NAME.yaml")
+    _add(parser, "--folder", "folder of the reruns (default: %(default)s)", default=Path("verify"), metavar="DIR")
+    _add(parser, "--config-dir", "folder with your own track, track/NAME.yaml", metavar="DIR")
     return parser
 
 
 def _parser(command: Callable[[], ArgumentParser]) -> ArgumentParser:
     """Return an empty parser, whose description is what the function that fills it says."""
     return ArgumentParser(prog=f"ctgraph-rl {command.__name__}", description=command.__doc__)
+
+
+def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> None:
+    """Add an argument that is a path unless ``type`` says otherwise."""
+    parser.add_argument(name, help=help, type=type, **how)
 
 
 def _add_agent(parser: ArgumentParser) -> None:
@@ -261,18 +252,18 @@ def _add_task(parser: ArgumentParser) -> None:
     """Add the arguments that name a task and a policy."""
     about = "a configuration of the paper, such as CT-SU-B1; a configuration file of the authors (.json); a curriculum"
     parser.add_argument("name", nargs="?", help=f"{about}. Default: only numbers")
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also knows the curricula of this directory")
-    parser.add_argument("--task", type=int, default=1, metavar="N", help="number of a curriculum's task, from 1")
+    _add(parser, "--config-dir", "also knows the curricula of this directory", metavar="DIR")
+    _add(parser, "--task", "number of a curriculum's task, from 1", default=1, metavar="N", type=int)
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
-    parser.add_argument("--goal", type=decisions, metavar="1.2", help="the decisions to the goal")
+    _add(parser, "--goal", "the decisions to the goal", metavar="1.2", type=decisions)
     surjective = "with numbers only: one image for each kind of state"
     parser.add_argument("--surjective", action="store_true", help=surjective)
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--policy", choices=POLICIES, help="who acts")
-    who.add_argument("--run", type=Path, help="the trained agent of a run acts, in a task of its curriculum")
+    _add(who, "--run", "the trained agent of a run acts, in a task of its curriculum")
     parser.add_argument("--sampled", action="store_true", help="the trained agent samples and explores")
-    parser.add_argument("--seed", type=int, default=0, help="of the environment")
+    _add(parser, "--seed", "of the environment", default=0, type=int)
 
 
 def decisions(text: str) -> tuple[int, ...]:
