@@ -32,14 +32,11 @@ class GRUModel:
         learning_rate: float = 0.01,
         seed: int = 0,
     ) -> None:
-        self.num_actions = symbols.num_actions
         self.num_epochs = num_epochs
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.embedding = nn.Embedding(
-                len(symbols.images) * symbols.num_actions, hidden_size, dtype=torch.float32, device="cpu"
-            )
+            self.embedding = nn.Embedding(symbols.num_contexts, hidden_size, dtype=torch.float32, device="cpu")
             self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True, dtype=torch.float32, device="cpu")
             self.head = nn.Linear(hidden_size, symbols.num_pairs, dtype=torch.float32, device="cpu")
         layers = nn.ModuleList([self.embedding, self.gru, self.head])
@@ -60,5 +57,5 @@ class GRUModel:
         return self._nats(transitions) / math.log(2)
 
     def _nats(self, transitions: Transitions) -> Tensor:
-        memory, _ = self.gru(self.embedding(transitions.image * self.num_actions + transitions.action))
+        memory, _ = self.gru(self.embedding(transitions.context))
         return cross_entropy(self.head(memory).movedim(-1, 1), transitions.pair, reduction="none")

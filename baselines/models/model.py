@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from baselines.parts.distinct import distinct
 from ctgraph_rl.checks import require
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.learn.collect import InitialState, Policy, collect
@@ -17,12 +18,16 @@ from ctgraph_rl.tasks.observability import transition_entropy
 from ctgraph_rl.tasks.task import Task, ct_graphs
 
 
+NUM_ROWS = 64
+"""Rows side by side that a policy meets a task in."""
+
+
 class Transitions(NamedTuple):
     """Steps of rows in time order, int64 [rows, steps] each."""
 
     image: Tensor  # number of the image before the step
-    action: Tensor
-    pair: Tensor  # number of the pair of image and reward after it
+    context: Tensor  # number of the pair of image and action
+    pair: Tensor  # number of the pair of image and reward after the step
 
 
 class Symbols:
@@ -50,11 +55,8 @@ class Symbols:
         every = sorted({reward + step for reward in paid for step in steps})
         self.rewards = torch.tensor(every, dtype=torch.float32, device="cpu")
         self.num_actions = max(task.num_actions for task in tasks)
-
-    @property
-    def num_pairs(self) -> int:
-        """Pairs of an image and a reward."""
-        return len(self.images) * len(self.rewards)
+        self.num_contexts = len(self.images) * self.num_actions
+        self.num_pairs = len(self.images) * len(self.rewards)
 
     def of(self, batch: TensorDictBase) -> Transitions:
         """Return the transitions of a batch that an agent learns from, [rows, steps] in time order.
@@ -65,15 +67,15 @@ class Symbols:
         reward = (batch["next", "reward"].squeeze(-1).unsqueeze(-1) - self.rewards).abs().argmin(-1)
         seen = self._numbers(batch["observation"], batch.ndim)
         after = self._numbers(batch["next", "observation"], batch.ndim)
-        return Transitions(seen, batch["action"], after * len(self.rewards) + reward)
+        return Transitions(seen, seen * self.num_actions + batch["action"], after * len(self.rewards) + reward)
 
     def _numbers(self, observation: Tensor, num_dims: int) -> Tensor:
+        known = len(self.images)
         flat = observation.flatten(num_dims).flatten(0, num_dims - 1)
-        weights = torch.arange(1, flat.shape[1] + 1, dtype=torch.float64, device="cpu").sqrt()
-        sums, order = (self.images.double() @ weights).sort()
-        found = order[torch.searchsorted(sums - 0.5e-6, flat.double() @ weights).sub(1).clamp(min=0)]
-        require(((self.images[found] == flat).all().item(), "the data show an image that no task has"))
-        return found.view(observation.shape[:num_dims])
+        examples, groups = distinct([flat])
+        images, numbers = torch.cat([self.images, flat[examples]]).unique(dim=0, return_inverse=True)
+        require((len(images) == known, "the data show an image that no task has"))
+        return numbers[known:][groups].view(observation.shape[:num_dims])
 
 
 class Predictor(Protocol):
@@ -92,7 +94,6 @@ def experience(
     task: Task,
     symbols: Symbols,
     policy: Policy | type = NavigationPolicy,
-    num_rows: int = 64,
     num_steps: int = 256,
     seed: int = 0,
     initial_state: InitialState | None = None,
@@ -103,16 +104,15 @@ def experience(
         task: the task.
         symbols: of it and all tasks that the predictor meets.
         policy: an agent's ``policy``, which samples, or a class of `ctgraph_rl.policies`.
-        num_rows: rows side by side.
-        num_steps: steps of each; episodes follow each other.
+        num_steps: steps of each of 64 rows; episodes follow each other.
         seed: of the environment and of torch's generator, which is left as it was.
         initial_state: of an agent with memory.
     """
-    env = CTGraphEnv([task] * num_rows, seed)
+    env = CTGraphEnv([task] * NUM_ROWS, seed)
     acts = policy(env) if isinstance(policy, type) else policy
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        [batch] = collect(env, acts, num_rows * num_steps, num_steps, initial_state)
+        [batch] = collect(env, acts, NUM_ROWS * num_steps, num_steps, initial_state)
     return symbols.of(batch)
 
 
@@ -155,8 +155,9 @@ def performance_matrix(make: Callable[[Symbols], Predictor], tasks: Sequence[Tas
     symbols = Symbols(tasks)
     model = make(symbols)
     test = [experience(task, symbols, num_steps=num_steps, seed=1) for task in tasks]
-    rows = [[learned_share(model, each, task) for each, task in zip(test, tasks, strict=True)]]
-    for learned in tasks:
-        model.learn(experience(learned, symbols, num_steps=num_steps))
+    rows = []
+    for learned in (None, *tasks):
+        if learned is not None:
+            model.learn(experience(learned, symbols, num_steps=num_steps))
         rows.append([learned_share(model, each, task) for each, task in zip(test, tasks, strict=True)])
     return torch.tensor(rows, dtype=torch.float64, device="cpu")

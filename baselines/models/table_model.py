@@ -21,25 +21,20 @@ class TableModel:
     """
 
     def __init__(self, symbols: Symbols) -> None:
-        self.num_actions = symbols.num_actions
-        contexts = len(symbols.images) * symbols.num_actions
-        self.counts = torch.zeros(contexts, symbols.num_pairs, dtype=torch.float64, device="cpu")
+        self.counts = torch.zeros(symbols.num_contexts, symbols.num_pairs, dtype=torch.float64, device="cpu")
 
     def learn(self, transitions: Transitions) -> None:
         """See `Predictor`."""
-        where = (self._context(transitions).flatten(), transitions.pair.flatten())
-        self.counts.index_put_(where, torch.ones_like(where[0], dtype=torch.float64), accumulate=True)
+        one = torch.ones_like(self.counts[0, 0])
+        self.counts.index_put_((transitions.context, transitions.pair), one, accumulate=True)
 
     def bits(self, transitions: Transitions) -> Tensor:
         """See `Predictor`."""
-        context = self._context(transitions)
+        context = transitions.context
         every = self.counts.sum(0) + 1
         share = (every / every.sum())[transitions.pair]
         found = self.counts[context, transitions.pair] + share
         return -(found / (self.counts.sum(1)[context] + 1)).log2()
-
-    def _context(self, transitions: Transitions) -> Tensor:
-        return transitions.image * self.num_actions + transitions.action
 
 
 def taught_share(policy: Policy | type, task: Task, initial_state: InitialState | None = None) -> float:
