@@ -162,7 +162,7 @@ def _profile(
 
 
 class Property(NamedTuple):
-    """A property: its name in figures, and the measure of `ctgraph_rl.profile.measures` with its arguments."""
+    """A property: its name in figures, and the measure of `ctgraph_rl.profile.properties` with its arguments."""
 
     title: str
     measure: str

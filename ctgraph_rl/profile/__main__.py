@@ -13,10 +13,6 @@ from ctgraph_rl.profile.profile_page import text_table, write_profile
 from ctgraph_rl.report.style import require_packages
 
 FOLDER = "hydra.sweep.dir"
-LAUNCHER = "hydra/launcher"
-
-USUAL = {"curriculum": "glob(profile_*)", FOLDER: "runs/profile"}
-"""Settings of the sweep that the command line may replace."""
 
 
 def main() -> None:
@@ -29,7 +25,10 @@ def main() -> None:
     with refused_by(parser):
         require_packages()
     if settings:
-        given = {**USUAL, **dict(word.split("=", 1) for word in settings)}
+        given = {"curriculum": "glob(profile_*)", FOLDER: "runs/profile"}
+        if find_spec("joblib"):
+            given["hydra/launcher"] = "joblib"
+        given.update(word.split("=", 1) for word in settings)
         folders.append(given[FOLDER])
         complete = _train(given, arguments.config_dir)
     out = arguments.out or Path(folders[0], "profile")
@@ -42,9 +41,9 @@ def main() -> None:
 
 def _train(settings: dict[str, str], config_dir: Path | None) -> bool:
     """Run the sweep; return whether all cells are done, and leave where it could not begin."""
-    on_all_cores = [] if LAUNCHER in settings or not find_spec("joblib") else [f"{LAUNCHER}=joblib"]
-    own = [] if config_dir is None else [f"--config-dir={config_dir}"]
-    sys.argv = ["ctgraph-rl", "-m", *own, *on_all_cores, *(f"{key}={value}" for key, value in settings.items())]
+    sys.argv = ["ctgraph-rl", "-m", *(f"{key}={value}" for key, value in settings.items())]
+    if config_dir is not None:
+        sys.argv.append(f"--config-dir={config_dir}")
     try:
         run.main()
     except SystemExit as end:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ctgraph_rl.checks import require
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import mastered_returns, optimal_values
 from ctgraph_rl.metrics import Undefined
@@ -58,7 +58,7 @@ def above_ceiling(run: Evidence, ceiling: str) -> Measured:
         ceiling: ``open_loop``, of fixed sequences of actions, or ``memoryless``.
     """
     of = {"open_loop": open_loop_ceiling, "memoryless": memoryless_ceiling}[ceiling]
-    return Measured(_mean(run.own_returns.tolist()), _mean(map(of, run.tasks)), _optimum(run))
+    return Measured(fmean(run.own_returns.tolist()), fmean(map(of, run.tasks)), _optimum(run))
 
 
 def above_random_search(run: Evidence) -> Measured:
@@ -69,7 +69,7 @@ def above_random_search(run: Evidence) -> Measured:
     """
     frames = (block.num_frames for block in run.curriculum.blocks)
     found = [1 - math.exp(-n / random_frames_to_goal(task)) for n, task in zip(frames, run.tasks, strict=True)]
-    return Measured(_mean(run.own_returns.tolist()), _mean(found), _optimum(run))
+    return Measured(fmean(run.own_returns.tolist()), fmean(found), _optimum(run))
 
 
 def faster(run: Evidence, on: Sequence[int], than: Sequence[int], learned: bool = False) -> Measured:
@@ -90,11 +90,11 @@ def faster(run: Evidence, on: Sequence[int], than: Sequence[int], learned: bool 
     if learned and missed:
         raise Undefined(f"task {missed[0]} was not learned, so nothing can be faster than it")
     areas = stage_areas(run.log.curves(run.curriculum.trained)).tolist()
-    floor = _mean(areas[task] for task in than)
+    floor = fmean(areas[task] for task in than)
     optimum = _optimum(run)
     if floor == optimum:
         raise Undefined("the tasks to compare with were solved at their first evaluation, which leaves nothing to gain")
-    return Measured(_mean(areas[task] for task in on), floor, optimum, exact=False)
+    return Measured(fmean(areas[task] for task in on), floor, optimum, exact=False)
 
 
 def held_out(run: Evidence) -> Measured:
@@ -103,12 +103,12 @@ def held_out(run: Evidence) -> Measured:
     A policy that else is right waits with probability a = 1 / (b + 1) there. So it leaves a wait state with probability
     w = a (1 - p) / (1 - a p), and reaches the goal of d decisions with probability w^(d + 1).
     """
-    last = [m["return_mean"] for m in run.log.of_kind("evaluation") if m.get("held_out")][-1:]
+    returns = [m["return_mean"] for m in run.log.of_kind("evaluation") if m.get("held_out")]
     [task] = ct_graphs(run.curriculum.evaluation.held_out, "a profile")
     waits = 1 / task.num_actions
     p = task.graph.wait_prob
     floor = (waits * (1 - p) / (1 - waits * p)) ** (task.graph.depth + 1)
-    return Measured(_mean(last), floor, _optimum(run))
+    return Measured(returns[-1] if returns else math.nan, floor, _optimum(run))
 
 
 def searches(run: Evidence) -> Measured:
@@ -128,10 +128,7 @@ def teaches(run: Evidence) -> Measured:
 
     0 is a table of frequencies, 1 the exact model; see `baselines.models.model.learned_share`.
     """
-    try:
-        trained = load(run.folder)
-    except (ValueError, OSError) as error:
-        raise Undefined(f"its agent cannot be loaded to give data: {error}") from error
+    trained = load(run.folder)
     [task] = run.tasks
     share = taught_share(trained.policy_for(task), task, trained.agent.initial_state)
     return Measured(max(0.0, share), 0.0, 1.0)
@@ -143,15 +140,15 @@ MEASURES: Mapping[str, Callable[..., Measured]] = {
 """The measures by name, as a table of properties names them."""
 
 
-def measure(run: Evidence, name: str, arguments: Mapping[str, Any]) -> Measured:
-    """Apply a measure.
+def measure(run: Evidence, prop: Any) -> Measured:
+    """Apply the measure of a `curricula.profile.Property`.
 
     Raises:
         Undefined: where the run has no value, with the reason.
     """
     try:
-        found = MEASURES[name](run, **arguments)
-    except ValueError as error:
+        found = MEASURES[prop.measure](run, **prop.arguments)
+    except (ValueError, OSError) as error:
         raise Undefined(str(error)) from error
     if not all(map(math.isfinite, found)):
         raise Undefined("an evaluation is missing")
@@ -160,10 +157,5 @@ def measure(run: Evidence, name: str, arguments: Mapping[str, Any]) -> Measured:
 
 def _optimum(run: Evidence) -> float:
     best = optimal_values(run.tasks)
-    require((isinstance(best, Tensor), "the optimum of a task is not known"))
-    return best.mean().item()  # type: ignore[union-attr]
-
-
-def _mean(values: Any) -> float:
-    listed = list(values)
-    return math.fsum(listed) / len(listed) if listed else math.nan
+    assert isinstance(best, Tensor)
+    return best.mean().item()

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.log.files import CURRICULUM, LOG
@@ -92,17 +92,17 @@ def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> d
     for (curriculum, agent), by_seed in grouped(displayed(runs, agents)).items():
         prop = properties[curriculum.partition(" ")[0]]
         missing = {each.title: Score(None, reason="there is no run") for each in properties.values()}
-        found.setdefault(agent, missing)[prop.title] = _over_seeds(by_seed, prop.measure, prop.arguments)
+        found.setdefault(agent, missing)[prop.title] = _over_seeds(by_seed, prop)
     return found
 
 
-def _over_seeds(by_seed: BySeed, name: str, arguments: Mapping[str, object]) -> Score:
+def _over_seeds(by_seed: BySeed, prop: Any) -> Score:
     """Return the score of the seeds that have a value, with the reason of one that has none."""
     results = []
     reason = ""
     for seed, run in by_seed.items():
         try:
-            results.append(measure(_evidence(run), name, arguments))
+            results.append(measure(_evidence(run), prop))
         except Undefined as error:
             reason = f"seed {seed}: {error}"
     return score_of(results)._replace(reason=reason) if results else Score(None, reason=reason)

@@ -93,9 +93,8 @@ def of_policy(name, policy, num_episodes=1500):
 
 
 def measured(name, log, curriculum=None):
-    prop = PROPERTIES[name]
     run = Evidence(log, curriculum or curricula.load(name), Path("nowhere"))
-    return measure(run, prop.measure, prop.arguments)
+    return measure(run, PROPERTIES[name])
 
 
 RARE = pytest.param("profile_sparsity", marks=pytest.mark.slow)
