@@ -10,7 +10,7 @@ import numpy as np
 
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
-from ctgraph_rl.profile.scoring import Profiles, profile_scores
+from ctgraph_rl.profile.scoring import Profiles, Score, profile_scores
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery, left_out
 from ctgraph_rl.report.latex import PREAMBLE, Table, TableCell, latex
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
@@ -41,7 +41,7 @@ def write_profile(paths: Sequence[Path | str], folder: Path | str, agents: Seque
     titles = list(next(iter(scores.values())))
     rows = [[agent, title, *each] for agent, of_agent in scores.items() for title, each in of_agent.items()]
     write_whole(folder / "profile.csv", csv_text([COLUMNS, *rows]))
-    cells = [(agent, [TableCell(*str(each).split(" ", 1)) for each in its.values()]) for agent, its in scores.items()]
+    cells = [(agent, list(map(_cell, of_agent.values()))) for agent, of_agent in scores.items()]
     table = Table(f"Profile. {MEANING}", "profile", "agent", titles, cells)
     write_whole(folder / "profile.tex", f"{PREAMBLE}\n\n{latex(table)}\n")
     [drawn] = Gallery(folder).write((), _figures(scores, titles))  # which draws them in the report's style
@@ -62,6 +62,11 @@ def text_table(scores: Profiles) -> str:
             why = f"  ({each.reason})" if each.reason else ""
             lines.append(f"  {title:16}  {each}{why}")
     return "\n".join(lines)
+
+
+def _cell(score: Score) -> TableCell:
+    value, _, interval = str(score).partition(" ")
+    return TableCell(value, interval)
 
 
 def _figures(scores: Profiles, titles: Sequence[str]) -> Iterator[CaptionedFigure]:
