@@ -17,7 +17,6 @@ from ctgraph_rl.policies import NavigationPolicy
 from ctgraph_rl.tasks.observability import transition_entropy
 from ctgraph_rl.tasks.task import Task, ct_graphs
 
-
 NUM_ROWS = 64
 """Rows side by side that a policy meets a task in."""
 

@@ -87,11 +87,9 @@ def _figures(scores: Profiles, titles: Sequence[str]) -> Iterator[CaptionedFigur
         bars.hlines(places, low, high, color="black", linewidth=0.8)
         for place in places[np.isnan(values)]:
             bars.text(0.01, place, "no value", va="center", fontsize=5, color=look["color"])
-    radar.set_theta_zero_location("N")
-    radar.set_theta_direction(-1)
-    radar.set_xticks(angles, list(map(str, numbers)))
+    radar.set_xticks(angles, numbers)
     radar.set_rgrids((0.5, 1.0), angle=18, fontsize=6)
-    radar.set_ylim(0, 1)
+    radar.set(theta_zero_location="N", theta_direction=-1, ylim=(0, 1))
     bars.set_yticks(numbers, [f"{number} {title}" for number, title in enumerate(titles, 1)])
     bars.set(xlim=(0, 1), xlabel="score", ylim=(len(titles) + 0.5, 0.5))
     figure.legend(loc="outside upper center", ncols=3)
