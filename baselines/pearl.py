@@ -111,15 +111,10 @@ class PosteriorPolicy(TensorDictModuleBase):
         logits = self.actor(*seen, context)
         is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
         action = logits.argmax(dim=-1) if is_greedy else draw(logits.softmax(dim=-1))
-        tensordict.set("action", guided(tensordict, action))
-        tensordict.set(("next", "trial"), torch.where(fresh, 1, episode))
-        tensordict.set(("next", ACTION), tensordict["action"])
-        tensordict.set(("next", PRECISION), precision)
-        tensordict.set(("next", WEIGHTED), weighted)
-        tensordict.set(("next", CONTEXT), context)
-        for key, kept in zip(self.seen_keys, self.kept_keys, strict=True):
-            tensordict.set(("next", kept), tensordict[key])
-        return tensordict
+        action = guided(tensordict, action)
+        trial = torch.where(fresh, 1, episode)
+        written = (action, trial, action, precision, weighted, context, *seen)
+        return tensordict.update(dict(zip(self.out_keys, written, strict=True)))
 
 
 class PEARL(Learner):

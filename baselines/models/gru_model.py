@@ -11,6 +11,13 @@ from torch.nn.functional import cross_entropy
 from baselines.models.model import Symbols, Transitions
 
 
+WIDTH = 64
+"""Of the embedding and the GRU."""
+
+NUM_EPOCHS = 40
+"""Passes over the data of a call of `GRUModel.learn`."""
+
+
 class GRUModel:
     """An embedding of observation and action, a GRU over the rows, and logits of all pairs.
 
@@ -18,33 +25,22 @@ class GRUModel:
 
     Args:
         symbols: the images and rewards.
-        hidden_size: width of the embedding and the GRU.
-        num_epochs: passes over the data of a call of `learn`.
-        learning_rate: of Adam.
         seed: of the first weights and the order of rows.
     """
 
-    def __init__(
-        self,
-        symbols: Symbols,
-        hidden_size: int = 64,
-        num_epochs: int = 40,
-        learning_rate: float = 0.01,
-        seed: int = 0,
-    ) -> None:
-        self.num_epochs = num_epochs
+    def __init__(self, symbols: Symbols, seed: int = 0) -> None:
         self.generator = torch.Generator(device="cpu").manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.embedding = nn.Embedding(symbols.num_contexts, hidden_size, dtype=torch.float32, device="cpu")
-            self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True, dtype=torch.float32, device="cpu")
-            self.head = nn.Linear(hidden_size, symbols.num_pairs, dtype=torch.float32, device="cpu")
+            self.embedding = nn.Embedding(symbols.num_contexts, WIDTH, dtype=torch.float32, device="cpu")
+            self.gru = nn.GRU(WIDTH, WIDTH, batch_first=True, dtype=torch.float32, device="cpu")
+            self.head = nn.Linear(WIDTH, symbols.num_pairs, dtype=torch.float32, device="cpu")
         layers = nn.ModuleList([self.embedding, self.gru, self.head])
-        self.optimiser = torch.optim.Adam(layers.parameters(), learning_rate)
+        self.optimiser = torch.optim.Adam(layers.parameters(), lr=0.01)
 
     def learn(self, transitions: Transitions) -> None:
         """See `Predictor`; minibatches of 16 rows."""
-        for _ in range(self.num_epochs):
+        for _ in range(NUM_EPOCHS):
             for rows in torch.randperm(len(transitions.pair), generator=self.generator, device="cpu").split(16):
                 batch = Transitions(*(each[rows] for each in transitions))
                 self.optimiser.zero_grad()

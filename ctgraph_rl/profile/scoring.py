@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import require
@@ -14,12 +13,11 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Undefined
 from ctgraph_rl.packages import curriculum_named, profile_properties
 from ctgraph_rl.profile.properties import Evidence, Measured, measure
-from ctgraph_rl.report.intervals import Bounds, gaffke, student
+from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import displayed
+from ctgraph_rl.report.statistics import mean
 from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-LEVEL = 0.95
 
 
 class Score(NamedTuple):
@@ -50,23 +48,16 @@ def score_of(results: Sequence[Measured]) -> Score:
     Args:
         results: one for each seed, at least one.
     """
-    gains = [each.value - each.floor for each in results]
-    room = mean(each.optimum - each.floor for each in results)
-    n = len(results)
-    ratio = mean(gains) / room
+    room = fmean(each.optimum - each.floor for each in results)
+    ratio = fmean(each.value - each.floor for each in results) / room
+    rest = [each.value - each.floor - ratio * (each.optimum - each.floor) for each in results]
+    exact = Bounds(min(-each.floor / room for each in results), 1.0, noisy=True)
+    bounds = exact if all(each.exact for each in results) else UNBOUNDED
+    found = mean([ratio + each / room for each in rest], bounds=bounds)
     value = min(max(ratio, 0.0), 1.0)
-    if n == 1:
-        return Score(value, n=n)
-    if all(each.exact for each in results):
-        worst = min(-each.floor / room for each in results)
-        low, high = gaffke([gain / room for gain in gains], Bounds(worst, 1.0), LEVEL)
-    else:
-        rest = [gain - ratio * (each.optimum - each.floor) for gain, each in zip(gains, results, strict=True)]
-        if not any(rest):  # as where no seed learned anything: no spread to judge by
-            return Score(value, n=n)
-        half = student(LEVEL, n - 1) * stdev(rest) / math.sqrt(n) / room
-        low, high = ratio - half, ratio + half
-    return Score(value, min(max(low, 0.0), value), max(min(high, 1.0), value), n)
+    if found.low is None or found.high is None:
+        return Score(value, n=found.n)
+    return Score(value, min(max(found.low, 0.0), value), max(min(found.high, 1.0), value), found.n)
 
 
 def profile_scores(paths: Sequence[Path | str], agents: Sequence[str] = ()) -> dict[str, dict[str, Score]]:
