@@ -182,9 +182,17 @@ class PEARL(Learner):
     ) -> None:
         super().__init__(num_envs, num_steps, max_grad_norm)
         require(
-            *at_least_one(hidden_size=hidden_size, num_layers=num_layers, num_context=num_context, gate_size=gate_size),
-            *at_least_one(num_trials=num_trials, context_size=context_size, batch_size=batch_size),
-            *at_least_one(trial_episodes=trial_episodes, num_updates=num_updates),
+            *at_least_one(
+                hidden_size=hidden_size,
+                num_layers=num_layers,
+                num_context=num_context,
+                gate_size=gate_size,
+                num_trials=num_trials,
+                context_size=context_size,
+                batch_size=batch_size,
+                trial_episodes=trial_episodes,
+                num_updates=num_updates,
+            ),
             *at_most(MOST_PASSES, num_updates=num_updates),
             *positive(learning_rate=learning_rate, target_rate=target_rate, reward_scale=reward_scale),
             *fraction(gamma=gamma, target_rate=target_rate),

@@ -69,7 +69,7 @@ class Population(NamedTuple):
 
     def take(self, individuals: Tensor) -> Population:
         """Return some individuals, int64 [n]."""
-        return Population(*(value.index_select(0, individuals) for value in self))
+        return Population(*(value[individuals] for value in self))
 
     @property
     def num_inputs(self) -> int:

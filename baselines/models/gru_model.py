@@ -10,7 +10,6 @@ from torch.nn.functional import cross_entropy
 
 from baselines.models.model import Symbols, Transitions
 
-
 WIDTH = 64
 """Of the embedding and the GRU."""
 

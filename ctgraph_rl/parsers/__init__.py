@@ -98,8 +98,8 @@ def draw() -> ArgumentParser:
     """Draw a task; with a policy, what it does there."""
     parser = _parser(draw)
     _add_task(parser)
-    what = "what a figure has: observation ids in the states, their kinds, or the images"
-    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=f"{what}; default: ids")
+    what = "what a figure has: observation ids in the states, their kinds, or the images; default: ids"
+    parser.add_argument("--show", choices=("ids", "kinds", "images"), default="ids", help=what)
     _add(parser, "--figure", "write a figure (.png, .pdf, .svg)", metavar="FILE")
     _add(parser, "--dpi", f"pixels an inch of a .png; default: {DPI}", default=DPI, type=int)
     _add(parser, "--dot", "write the graph for Graphviz", metavar="FILE")
@@ -257,8 +257,7 @@ def _add_task(parser: ArgumentParser) -> None:
     for name, kind in CHANGES.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N")
     _add(parser, "--goal", "the decisions to the goal", metavar="1.2", type=decisions)
-    surjective = "with numbers only: one image for each kind of state"
-    parser.add_argument("--surjective", action="store_true", help=surjective)
+    parser.add_argument("--surjective", action="store_true", help="with numbers only: one image for each kind of state")
     who = parser.add_mutually_exclusive_group()
     who.add_argument("--policy", choices=POLICIES, help="who acts")
     _add(who, "--run", "the trained agent of a run acts, in a task of its curriculum")
