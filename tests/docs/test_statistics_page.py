@@ -38,7 +38,7 @@ def test_the_page_is_its_template_with_tables(coverage):
     assert "\n\n".join(named) == written
 
 
-@pytest.mark.parametrize("rule", ["**Gaffke**", "Student t", "Anderson", "Hoeffding", "empirical Bernstein"])
+@pytest.mark.parametrize("rule", ["**Gaffke**", "Student t"])
 def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
     assert cells("two-valued", rule) == [coverage.cell(rule, "two-valued", n) for n in coverage.SEEDS]
 
@@ -48,9 +48,7 @@ def test_two_outcomes_are_covered_as_exact_sums_say(coverage, rule):
     [
         *(pytest.param("**Gaffke**", *of, marks=pytest.mark.slow) for of in (("bounded", 3), ("skewed", 5))),
         pytest.param("BCa bootstrap", "skewed", 10, marks=pytest.mark.slow),
-        ("Hoeffding", "bounded", 10),
-        ("empirical Bernstein", "bounded", 20),
-        *(("Student t", "skewed", 5), ("Anderson", "skewed", 20)),
+        ("Student t", "skewed", 5),
     ],
 )
 def test_simulated_cells_are_computed_again(coverage, rule, shape, n):
@@ -92,14 +90,13 @@ def test_the_rules_of_the_package_cover_and_students_does_not():
     assert covered(cells("skewed", "Student t")[1]) < 80
 
 
-def test_gaffkes_is_the_narrowest_that_covers_everywhere():
-    for shape in ("bounded", "two-valued", "skewed"):
-        for n in range(4):
-            widths = {
-                rule: float(cells(shape, rule)[n].split(", ")[1])
-                for rule in ("**Gaffke**", "Anderson", "Hoeffding", "empirical Bernstein")
-            }
-            assert min(widths, key=widths.__getitem__) == "**Gaffke**"
+def test_gaffkes_is_the_only_one_that_covers_everywhere():
+    least = {
+        rule: min(covered(cell) for shape in ("bounded", "two-valued", "skewed") for cell in cells(shape, rule))
+        for rule in ("**Gaffke**", "Student t", "BCa bootstrap")
+    }
+
+    assert [rule for rule, share in least.items() if share >= 95] == ["**Gaffke**"]
 
 
 def test_what_the_text_says_of_five_seeds_is_so():

@@ -41,30 +41,6 @@ def student(values: Sequence[float]) -> Interval:
     return (found.value, found.value) if found.low is None else (found.low, found.high)  # type: ignore[return-value]
 
 
-def anderson(values: Sequence[float]) -> Interval:
-    """Anderson's interval: the band of Dvoretzky, Kiefer, Wolfowitz and Massart around the distribution."""
-    n = len(values)
-    ordered, band = np.sort(values), math.sqrt(math.log(1 / TAIL) / (2 * n))
-    steps = np.arange(1, n + 1) / n
-
-    def least(rising: np.ndarray) -> float:
-        below = np.minimum(steps + band, 1)
-        return float(rising @ np.diff(below, prepend=min(band, 1.0)))
-
-    return least(ordered), 1 - least(1 - ordered[::-1])
-
-
-def hoeffding(values: Sequence[float]) -> Interval:
-    """Hoeffding's interval."""
-    return _within(float(np.mean(values)), math.sqrt(math.log(1 / TAIL) / (2 * len(values))))
-
-
-def bernstein(values: Sequence[float]) -> Interval:
-    """The empirical Bernstein interval of Maurer and Pontil."""
-    n, log = len(values), math.log(2 / TAIL)
-    return _within(float(np.mean(values)), math.sqrt(2 * np.var(values, ddof=1) * log / n) + 7 * log / (3 * (n - 1)))
-
-
 def bca(values: Sequence[float]) -> Interval:
     """The bootstrap interval BCa, 999 samples; of no width where all seeds agree."""
     if min(values) == max(values):
@@ -74,17 +50,10 @@ def bca(values: Sequence[float]) -> Interval:
     return float(found.low), float(found.high)
 
 
-def _within(centre: float, half: float) -> Interval:
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
 RULES: dict[str, Rule] = {
     "**Gaffke**": gaffke,
     "Student t": student,
     "BCa bootstrap": bca,
-    "Anderson": anderson,
-    "Hoeffding": hoeffding,
-    "empirical Bernstein": bernstein,
 }
 SHAPES: dict[str, tuple[Callable[[np.random.Generator, tuple[int, ...]], np.ndarray], float]] = {
     "bounded": (lambda rng, size: rng.random(size), 0.5),

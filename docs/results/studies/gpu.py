@@ -144,9 +144,10 @@ def section(report: Mapping[str, Any] | None) -> str:
     environment = report.get("environment", [])
     fewest = min((row["rows"] for row in environment), default=0)
     shown = [row for row in environment if row["rows"] == fewest]
-    text += (
-        f"\n{ladder.table(shown, ladder.COPY)}\n\n{ladder.table(report.get('learning', []), learning.ENVIRONMENT)}\n"
-    )
+    learned = ladder.table(report.get("learning", []), learning.ENVIRONMENT).splitlines()
+    small = tuple(f"| {row['rows']:,} |" for row in report.get("learning", []) if row["rows"] < fewest)
+    large = [line for line in learned if "seeds" in line or not line.startswith(small)]
+    text += "\n".join(["", ladder.table(shown, ladder.COPY), "", *large, ""])
     return text + "".join(f"\n{line}\n" for line in jobs(report.get("learning", [])))
 
 
