@@ -14,7 +14,7 @@ from torchrl.data import Composite, TensorSpec
 from baselines.parts.learner import MOST_PASSES
 from baselines.parts.networks import Data
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
-from ctgraph_rl.checks import at_least_one, at_most, is_int, not_negative, positive, require
+from ctgraph_rl.checks import Rule, at_least_one, at_most, is_int, not_negative, positive, require
 
 
 class PPO(PolicyGradient):
@@ -73,7 +73,7 @@ class PPO(PolicyGradient):
             **entropy_loss(log_probs, self.entropy_coeff),
         }
 
-    def _split_rule(self, num_minibatches: int) -> tuple[bool, str]:
+    def _split_rule(self, num_minibatches: int) -> Rule:
         """Rule that minibatches split the rows, or the frames, evenly."""
         items = self.num_envs if self.memory else self.num_envs * self.num_steps
         what = f"num_envs={self.num_envs}" if self.memory else f"num_envs * num_steps = {items}"

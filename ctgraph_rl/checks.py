@@ -20,6 +20,9 @@ T = TypeVar("T")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+Rule = tuple[bool, str]
+"""Whether a rule holds, and the message if it does not."""
+
 LARGEST_INT = 2**63 - 1
 """Of an int64."""
 
@@ -27,7 +30,7 @@ LONGEST_NAME, LONGEST_PATH = 255, 4095
 """Bytes of a part of a path, and of a path, that file systems take."""
 
 
-def require(*rules: tuple[bool, str]) -> None:
+def require(*rules: Rule) -> None:
     """Raise one ``ValueError`` that lists the message of every broken rule.
 
     Args:
@@ -204,7 +207,7 @@ def _kinds(parameter: Parameter) -> list[str]:
     return [kind.partition("[")[0] for kind in kinds]
 
 
-def _kind_rule(name: str, value: object, kinds: list[str]) -> tuple[bool, str]:
+def _kind_rule(name: str, value: object, kinds: list[str]) -> Rule:
     fits = any(KINDS[kind][1](value) for kind in kinds)
     return fits, f"{name} must be {' or '.join(KINDS[kind][0] for kind in kinds)}, got {value!r}"
 
@@ -267,7 +270,7 @@ def is_shallow(value: object, levels: int) -> bool:
     return levels > 0 and all(is_shallow(item, levels - 1) for item in items)
 
 
-def at_least_one(**values: object) -> list[tuple[bool, str]]:
+def at_least_one(**values: object) -> list[Rule]:
     """Rules that each named value is an integer in 1..2**63 - 1."""
     return [
         (is_int(value, 1, LARGEST_INT), f"{name} must be an integer {_limit(value)}, got {value!r}")
@@ -279,37 +282,37 @@ def _limit(value: object) -> str:
     return "< 2**63" if is_int(value, 1) else ">= 1"
 
 
-def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]) -> list[tuple[bool, str]]:
+def _rules(holds: Callable[[Any], bool], what: str, values: Mapping[str, object]) -> list[Rule]:
     """Rules that each named value must be something."""
     return [(holds(value), f"{name} must be {what}, got {value!r}") for name, value in values.items()]
 
 
-def at_most(limit: float, **values: object) -> list[tuple[bool, str]]:
+def at_most(limit: float, **values: object) -> list[Rule]:
     """Rules that each named number is no larger than a limit; what is no number breaks other rules."""
     return _rules(lambda value: not is_real(value) or value <= limit, f"at most {limit:,}", values)
 
 
-def positive(**values: object) -> list[tuple[bool, str]]:
+def positive(**values: object) -> list[Rule]:
     """Rules that each named value is a number > 0."""
     return _rules(lambda value: is_real(value, 0) and value != 0, "a number > 0", values)
 
 
-def fraction(**values: object) -> list[tuple[bool, str]]:
+def fraction(**values: object) -> list[Rule]:
     """Rules that each named value is a number in [0, 1]."""
     return _rules(lambda value: is_real(value, 0, 1), "in [0, 1]", values)
 
 
-def not_negative(**values: object) -> list[tuple[bool, str]]:
+def not_negative(**values: object) -> list[Rule]:
     """Rules that each named value is a number >= 0."""
     return _rules(lambda value: is_real(value, 0), "a number >= 0", values)
 
 
-def one_of(choices: tuple[str, ...], **values: object) -> list[tuple[bool, str]]:
+def one_of(choices: tuple[str, ...], **values: object) -> list[Rule]:
     """Rules that each named value is one of the choices."""
     return _rules(lambda value: isinstance(value, str) and value in choices, f"one of {', '.join(choices)}", values)
 
 
-def true_or_false(**values: object) -> list[tuple[bool, str]]:
+def true_or_false(**values: object) -> list[Rule]:
     """Rules that each named value is a bool."""
     return _rules(lambda value: isinstance(value, bool), "true or false", values)
 

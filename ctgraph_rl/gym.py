@@ -25,7 +25,7 @@ from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
 from ctgraph_rl.batch.text_render import as_text
-from ctgraph_rl.checks import as_int, as_tuple, is_int, require, takes_numbers
+from ctgraph_rl.checks import Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.protocol import MOST_ROWS
@@ -372,7 +372,7 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     return AutoresetMode(mode)
 
 
-def _seed_rule(seed: object) -> tuple[bool, str]:
+def _seed_rule(seed: object) -> Rule:
     return (True, "") if seed is None else seed_rule(seed)
 
 

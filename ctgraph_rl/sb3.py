@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
-from ctgraph_rl.checks import require, takes_numbers
+from ctgraph_rl.checks import Rule, require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
 from ctgraph_rl.tasks.task import Task
 
@@ -117,7 +117,7 @@ class SB3VecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-def _batch_rule(indices: VecEnvIndices) -> tuple[bool, str]:
+def _batch_rule(indices: VecEnvIndices) -> Rule:
     return indices is None, f"the rows are one batch: indices must be None, got {indices!r}"
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from ctgraph_rl.checks import is_int, require, takes_numbers
+from ctgraph_rl.checks import Rule, is_int, require, takes_numbers
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -180,7 +180,7 @@ class FileError(ValueError):
     """The error of a file, its path in front."""
 
 
-def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
+def _key_rules(meta: dict[str, Any]) -> list[Rule]:
     known = (*REQUIRED, *OPTIONAL)
     unknown = [key for key in meta if key not in known]
     near = [f"; did you mean {match!r}?" for key in unknown for match in get_close_matches(key, known, 1)]
@@ -191,7 +191,7 @@ def _key_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
     ]
 
 
-def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
+def _value_rules(meta: dict[str, Any]) -> list[Rule]:
     paths = meta["config_paths"]
     order = meta["task_order"]
     by_place = meta.get("label_by_curriculum_index", False)
@@ -214,11 +214,11 @@ def _value_rules(meta: dict[str, Any]) -> list[tuple[bool, str]]:
     ]
 
 
-def _int_rule(key: str, value: object, most: float = float("inf")) -> tuple[bool, str]:
+def _int_rule(key: str, value: object, most: float = float("inf")) -> Rule:
     limit = "" if most == float("inf") else f" and <= {most}"
     return is_int(value, 1, most), f"{key} must be an integer >= 1{limit}, got {short(value)}"
 
 
-def _ints_rule(key: str, value: object) -> tuple[bool, str]:
+def _ints_rule(key: str, value: object) -> Rule:
     holds = isinstance(value, list) and 1 <= len(value) <= MOST_TASKS and all(is_int(number, 0) for number in value)
     return holds, f"{key} must be a list of 1 to {MOST_TASKS} integers >= 0, got {short(value)}"

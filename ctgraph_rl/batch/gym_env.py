@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from ctgraph_rl.batch.assignment import checked_num_ids
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import require, require_all
+from ctgraph_rl.checks import Rule, require, require_all
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, spaces_of
 
@@ -267,7 +267,7 @@ def _action_spec(space: Any, num_rows: int) -> Any:
     return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 
-def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:
+def _same_spaces(pool: Sequence[GymTask]) -> Rule:
     """Return the rule that tasks can be rows of one environment."""
     kinds = {}
     for task in pool:
@@ -278,7 +278,7 @@ def _same_spaces(pool: Sequence[GymTask]) -> tuple[bool, str]:
 
 
 @cache
-def _repeats_rule(task: GymTask) -> tuple[bool, str]:
+def _repeats_rule(task: GymTask) -> Rule:
     """Return the rule that an episode repeats with its seed: in one environment, and in another."""
     if not task.repeats:
         return True, ""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.batch.params import Tables
-from ctgraph_rl.checks import one_of, require
+from ctgraph_rl.checks import Rule, one_of, require
 from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown
 from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
@@ -20,7 +20,7 @@ KERNELS = ("auto", "off", "required")
 """The values of ``kernel``, see `Rows`."""
 
 
-def kernel_rule(kernel: object) -> tuple[bool, str]:
+def kernel_rule(kernel: object) -> Rule:
     """Return the rule for values of ``kernel``."""
     return one_of(KERNELS, kernel=kernel)[0]
 

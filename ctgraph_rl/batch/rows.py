@@ -12,7 +12,7 @@ from ctgraph_rl.batch.assignment import Assignment, goal_leaves, numbers_in
 from ctgraph_rl.batch.native import Native, kernel_rule, knows, require_kernel
 from ctgraph_rl.batch.params import make_tables, shared_bank
 from ctgraph_rl.batch.tensor_engine import TensorEngine
-from ctgraph_rl.checks import TakesNumbers, is_int, plain, require, require_all, takes_numbers
+from ctgraph_rl.checks import Rule, TakesNumbers, is_int, plain, require, require_all, takes_numbers
 from ctgraph_rl.core import dynamics, philox
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import RowState, Shown
@@ -406,6 +406,6 @@ _ASSIGNED = ("task", "choice", "episodes")
 """The fields of `Assignment` that are buffers."""
 
 
-def seed_rule(seed: object) -> tuple[bool, str]:
+def seed_rule(seed: object) -> Rule:
     """The rule for seeds of environments."""
     return is_int(seed, 0, 2**63 - 1), f"seed must be an integer in [0, 2**63), got {seed!r}"

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import did_you_mean, is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import Rule, did_you_mean, is_int, is_real, is_shallow, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import named, yaml_value
 from ctgraph_rl.tasks.protocol import Protocol
@@ -98,7 +98,7 @@ def check_method(method: Any) -> None:
     require(*_rules(method))
 
 
-def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str) -> list[tuple[bool, str]]:
+def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str) -> list[Rule]:
     """Return the rules that an object has the keys of another one, and so have its parts."""
     rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
     known = [*example, *(() if prefix else WRITTEN)]
@@ -111,7 +111,7 @@ def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str
     return rules
 
 
-def _rules(method: Mapping[str, Any]) -> list[tuple[bool, str]]:
+def _rules(method: Mapping[str, Any]) -> list[Rule]:
     """Return the rules for the values of an object with the right keys."""
     code, tuning, compute = (method[key] for key in ("code", "tuning", "compute"))
     authors = method["authors"]
@@ -162,12 +162,12 @@ def _matches(pattern: re.Pattern[str], value: object) -> bool:
     return isinstance(value, str) and pattern.fullmatch(value) is not None
 
 
-def _text_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, str]:
+def _text_rule(name: str, value: object, or_null: bool = False) -> Rule:
     choice = "a text or null" if or_null else "a text"
     return _is_text(value) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
 
-def _count_rule(name: str, value: object, or_null: bool = False) -> tuple[bool, str]:
+def _count_rule(name: str, value: object, or_null: bool = False) -> Rule:
     choice = "an integer >= 0 or null" if or_null else "an integer >= 0"
     return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
@@ -205,7 +205,7 @@ def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, dict[str, Any
 
 def fact_rules(
     method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]], runs: Sequence[Any], num_tasks: int
-) -> list[tuple[bool, str]]:
+) -> list[Rule]:
     """Return the rules that a method does not contradict its runs; what is null in it contradicts nothing.
 
     Args:

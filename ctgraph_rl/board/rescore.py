@@ -27,7 +27,7 @@ from ctgraph_rl.board.submission import (
     experts_of,
     log_sum,
 )
-from ctgraph_rl.checks import is_real
+from ctgraph_rl.checks import Rule, is_real
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import csv_text, listed
@@ -123,7 +123,7 @@ def _of_the_whole(submission: Submission) -> Iterator[Check]:
     yield equal(f"failed seeds of {METHOD}", sorted(method["failed"]), failed)
 
 
-def _rules(what: str, rules: Sequence[tuple[bool, str]], expected: str, found: str) -> Check:
+def _rules(what: str, rules: Sequence[Rule], expected: str, found: str) -> Check:
     """Return a check of rules, with the messages of those that are broken."""
     broken = "; ".join(message for holds, message in rules if not holds)
     return Check(what, expected, found, not broken, note=broken)

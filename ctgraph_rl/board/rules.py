@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.board.tracks import Track
+from ctgraph_rl.checks import Rule
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
@@ -20,9 +21,6 @@ from ctgraph_rl.runs.load import OURS
 from ctgraph_rl.runs.read import MODIFIED, Run
 from ctgraph_rl.runs.settings import with_added
 from ctgraph_rl.tasks.curriculum import Curriculum
-
-Rule = tuple[bool, str]
-
 
 OF_OURS = "baselines."
 """Beginning of the names of our classes."""

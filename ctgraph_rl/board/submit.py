@@ -38,7 +38,7 @@ from ctgraph_rl.board.submission import (
     versions_text,
 )
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
@@ -220,7 +220,7 @@ class _WithoutAliases(yaml.SafeDumper):
         return True
 
 
-def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> tuple[bool, str]:
+def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> Rule:
     """Return the rule that the metrics of a run are what its log gives, up to the rounding of another machine."""
     stored = {name: metric["value"] for name, metric in run.metrics.items() if name in found}
     other = [f"{name} {value} for {found[name]}" for name, value in stored.items() if not near(value, found[name])]

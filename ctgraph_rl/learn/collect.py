@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.batch.specs import Specs, specs_of
-from ctgraph_rl.checks import at_least_one, is_int, require
+from ctgraph_rl.checks import Rule, at_least_one, is_int, require
 from ctgraph_rl.core.dynamics import RowState
 from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.core.row_params import RowParams
@@ -61,7 +61,7 @@ def make_env(
     return env
 
 
-def _env_rules(env: Any, kind: str, num_rows: int, num_task_ids: int) -> Iterator[tuple[bool, str]]:
+def _env_rules(env: Any, kind: str, num_rows: int, num_task_ids: int) -> Iterator[Rule]:
     """Yield the rules of what a kind of tasks makes; see `TaskLike.make_env`."""
     made = f"{kind}.make_env must return a TorchRL EnvBase of batch_size [{num_rows}]"
     is_env = isinstance(env, EnvBase)

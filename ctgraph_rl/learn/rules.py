@@ -9,7 +9,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.rewards import KERNEL_REWARDS
 from ctgraph_rl.env import CTGraphEnv
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -25,7 +25,7 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     """
     evaluation = curriculum.evaluation
     evaluation.check((*curriculum.tasks, *evaluation.held_out))
-    rules: dict[Any, tuple[bool, str]] = {"every": evaluation.every_rule(num_envs)}
+    rules: dict[Any, Rule] = {"every": evaluation.every_rule(num_envs)}
     alike: dict[int, list[str]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         block.rows(num_envs)

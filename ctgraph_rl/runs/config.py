@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import Function, did_you_mean, is_int, nearest, positive, require
+from ctgraph_rl.checks import Function, Rule, did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
 from ctgraph_rl.portable import check_portable
@@ -210,7 +210,7 @@ def check_values(cfg: DictConfig) -> None:
         )
 
 
-def check_overwrite(given: Any) -> tuple[bool, str]:
+def check_overwrite(given: Any) -> Rule:
     """Return the rule of ``overwrite`` with its message."""
     return isinstance(given, bool) or given == STALE, f"overwrite must be true, false or {STALE}, got {given!r}"
 

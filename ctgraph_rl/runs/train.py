@@ -17,7 +17,7 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import as_path, is_json_object, require, require_memory, takes_numbers
+from ctgraph_rl.checks import Rule, as_path, is_json_object, require, require_memory, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
@@ -77,11 +77,11 @@ def new_agent(curriculum: Curriculum, make_agent: MakeAgent, seed: int, device: 
     return agent
 
 
-def _curriculum_rule(curriculum: object) -> tuple[bool, str]:
+def _curriculum_rule(curriculum: object) -> Rule:
     return isinstance(curriculum, Curriculum), f"curriculum must be a Curriculum, got {curriculum!r:.80}"
 
 
-def _agent_rule(agent: object) -> tuple[bool, str]:
+def _agent_rule(agent: object) -> Rule:
     missing = [name for name in MEMBERS if not hasattr(agent, name)]
     built = not missing and not isinstance(agent, type)
     fix = "see ctgraph_rl.agent.Agent, and build it by new_agent(curriculum, make_agent, seed)"
@@ -89,7 +89,7 @@ def _agent_rule(agent: object) -> tuple[bool, str]:
     return built, f"{name} is no agent, it lacks {', '.join(missing)}: {fix}"
 
 
-def _takes_specs(make_agent: Callable[..., object]) -> tuple[bool, str]:
+def _takes_specs(make_agent: Callable[..., object]) -> Rule:
     """The rule that a function can be called with the two specs."""
     try:
         signature(make_agent).bind(None, None)
@@ -310,7 +310,7 @@ def execute(
     return failed
 
 
-def _same_group(run_dir: Path, together: Sequence[int]) -> tuple[bool, str]:
+def _same_group(run_dir: Path, together: Sequence[int]) -> Rule:
     """The rule that a run is resumed with the seeds beside it with which it was begun, if there were any."""
     before = (RunLog.begun(run_dir / LOG) or {}).get("together", [])
     how = "together=true and seed=" + ",".join(map(str, before)) if before else "together=false"

@@ -14,7 +14,7 @@ from itertools import accumulate
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import LARGEST_INT, as_path, as_tuple, is_int, make_fields_plain, require
+from ctgraph_rl.checks import LARGEST_INT, Rule, as_path, as_tuple, is_int, make_fields_plain, require
 from ctgraph_rl.tasks.curriculum_json import read_curriculum, type_name, write_curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, are_tasks
 from ctgraph_rl.tasks.protocol import Block, Evaluation, Protocol
@@ -93,7 +93,7 @@ class Curriculum:
         sizes = f"tasks: {len(self.tasks):,}, blocks: {len(self.blocks):,}, frames: {self.num_frames:,}"
         return f"{self.name!r}, version {self.version}, {sizes}"
 
-    def _task_rules(self) -> list[tuple[bool, str]]:
+    def _task_rules(self) -> list[Rule]:
         everything = (*self.tasks, *self.evaluation.held_out)
         shapes = list(dict.fromkeys(task.observation_shape for task in everything))
         actions = list(dict.fromkeys(task.num_actions for task in everything))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import Rule, require
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.core.rewards import Needle
 from ctgraph_rl.tasks.task import Task
@@ -162,7 +162,7 @@ def _bits(by_level: dict[int, float], branches: int) -> float:
     return sum(v * (level * math.log2(branches) - math.log2(v / total)) for level, v in by_level.items() if v > 0)
 
 
-def _index_rule(task: Task) -> tuple[bool, str]:
+def _index_rule(task: Task) -> Rule:
     b = task.graph.branching_factor
     x = task.observations
     own = not (x.legacy_index and b > 2 and any(map(x.is_unique, PLACED)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from itertools import combinations
 
-from ctgraph_rl.checks import as_tuple, is_int, make_fields_plain, require, true_or_false
+from ctgraph_rl.checks import Rule, as_tuple, is_int, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.graph import CTGraph, StateType
 
 Ids = tuple[int, int]
@@ -106,7 +106,7 @@ class Observations:
             return graph.branching_factor**level - 1
         return 0 if kind == StateType.END else graph.first_node(level)
 
-    def rules(self, graph: CTGraph) -> list[tuple[bool, str]]:
+    def rules(self, graph: CTGraph) -> list[Rule]:
         """Return the rules on a graph: unique ids need as many ids as there are states."""
         found = []
         for kind in filter(self.is_unique, StateType):
@@ -122,7 +122,7 @@ def _is_range(value: object) -> bool:
     return isinstance(value, tuple) and len(value) == 2 and is_int(value[0], 0) and is_int(value[1], value[0])
 
 
-def _overlap_rules(ranges: dict[str, Ids]) -> list[tuple[bool, str]]:
+def _overlap_rules(ranges: dict[str, Ids]) -> list[Rule]:
     ordered = sorted(ranges.items(), key=lambda item: item[1])
     return [
         (high[0] > low[1], f"{high_name}={high} overlaps {low_name}={low}; let it start at {low[1] + 1} or later")

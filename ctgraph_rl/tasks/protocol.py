@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from ctgraph_rl.checks import (
+    Rule,
     as_tuple,
     at_least_one,
     did_you_mean,
@@ -84,7 +85,7 @@ class Block:
         require((num_envs % count == 0, f"num_envs={num_envs} must be a multiple of the block's {count} tasks"))
         return list(self.tasks) * (num_envs // count)
 
-    def frame_rule(self, num_envs: int, name: str) -> tuple[bool, str]:
+    def frame_rule(self, num_envs: int, name: str) -> Rule:
         """Return the rule for ``num_envs`` rows: whole steps only. ``name`` says which block it is."""
         below = self.num_frames - self.num_frames % num_envs
         near = f"{below} or {below + num_envs}" if below else f"{num_envs}"
@@ -145,7 +146,7 @@ class Evaluation:
         """All episodes that a row plays one after the other."""
         return self.adapt_episodes + self.episodes_per_row
 
-    def every_rule(self, num_envs: int) -> tuple[bool, str]:
+    def every_rule(self, num_envs: int) -> Rule:
         """Return the rule for ``num_envs`` rows: evaluations fall between steps of all rows."""
         near = max(self.every - self.every % num_envs, num_envs)
         message = f"evaluation.every={self.every} must be a multiple of num_envs={num_envs}, such as {near}"

@@ -12,7 +12,7 @@ from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING, Any
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import Rule, is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.disk import write_whole
@@ -131,7 +131,7 @@ def _surplus(section: str, key: str, dialect: str) -> str:
     return f"unknown key {section}.{key}{suggested(key, keys)}"
 
 
-def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[tuple[bool, str]]:
+def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[Rule]:
     """Return the rules for a file's values that the parts of a task do not check themselves."""
 
     def said(name: str) -> str:
@@ -206,7 +206,7 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
     return content
 
 
-def _expressible(task: Task) -> list[tuple[bool, str]]:
+def _expressible(task: Task) -> list[Rule]:
     """Return the rules for tasks that a file of the 2023 dialect can express."""
     x = task.observations
     images = task.images

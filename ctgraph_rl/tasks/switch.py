@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, true_or_false
+from ctgraph_rl.checks import Rule, is_int, is_real, make_fields_plain, require, true_or_false
 from ctgraph_rl.core.philox import randint
 
 MOST_EPISODES = 2**31
@@ -115,11 +115,11 @@ SWITCHES = (ByEpisode, AtRandom, Drift)
 """Every switch of this package; JSON names them by their classes."""
 
 
-def switch_rule(switch: object) -> tuple[bool, str]:
+def switch_rule(switch: object) -> Rule:
     """The rule for switches, a user's own among them."""
     holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)
     return holds, f"switch must be one such as Drift(100), got {switch!r}"
 
 
-def _episodes_rule(episodes: object) -> tuple[bool, str]:
+def _episodes_rule(episodes: object) -> Rule:
     return is_int(episodes, 1, MOST_EPISODES), f"episodes must be an integer in 1..2**31, got {episodes!r}"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeGuard
 from torch import Tensor
 
 from ctgraph_rl.checks import (
+    Rule,
     as_path,
     as_tuple,
     is_int,
@@ -204,7 +205,7 @@ class Task:
             (pays, f"reward_fn must be a reward such as Needle(), got {reward_fn!r}"),
         )
 
-    def _reward_rules(self) -> list[tuple[bool, str]]:
+    def _reward_rules(self) -> list[Rule]:
         cue = self.observations.reward_cue
         change = self.goal_change
         pair = isinstance(change, tuple) and len(change) == 2 and is_int(change[0], 1, MAX_EPISODES)
@@ -226,7 +227,7 @@ class Task:
             return True
         return abs(self.goal_reward * self.reward_std) <= LARGEST_REWARD
 
-    def _goal_rule(self) -> tuple[bool, str]:
+    def _goal_rule(self) -> Rule:
         b = self.graph.branching_factor
         d = self.graph.depth
         goal = self.goal
@@ -237,7 +238,7 @@ class Task:
             message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
 
-    def _swap_rule(self) -> tuple[bool, str]:
+    def _swap_rule(self) -> Rule:
         b = self.graph.branching_factor
         d = self.graph.depth
         swap = self.swapped_branches
@@ -358,6 +359,6 @@ def ct_graphs(tasks: Sequence[TaskLike], what: str) -> Sequence[Task]:
     return tasks  # type: ignore[return-value]
 
 
-def _reward_rule(name: str, value: object) -> tuple[bool, str]:
+def _reward_rule(name: str, value: object) -> Rule:
     holds = is_real(value, -LARGEST_REWARD, LARGEST_REWARD)
     return holds, f"{name} must be a finite number, got {value!r}; at most 1e30 in size"

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import fraction, require
+from ctgraph_rl.checks import Rule, fraction, require
 from ctgraph_rl.core.graph import WAIT_ACTION, StateType
 from ctgraph_rl.core.rewards import Arrival, Needle
 
@@ -371,7 +371,7 @@ def is_needle(task: Task) -> bool:
     return task.reward_fn == Needle()
 
 
-def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
+def _policy_rules(task: Task, policy: Tensor) -> list[Rule]:
     b = task.graph.branching_factor
     images = task.images.num_images
     is_table = isinstance(policy, Tensor) and policy.dim() == 2 and policy.is_floating_point()
@@ -385,7 +385,7 @@ def _policy_rules(task: Task, policy: Tensor) -> list[tuple[bool, str]]:
     return [(not rows, f"rows of policy must be >= 0 and sum to 1, not so rows {rows}")]
 
 
-def _needle_rules(task: Task, ceiling: str) -> list[tuple[bool, str]]:
+def _needle_rules(task: Task, ceiling: str) -> list[Rule]:
     """Return the rules on rewards for which a ceiling is exact."""
     name = type(task.reward_fn).__name__
     goal = task.goal_reward

@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, is_real, make_fields_plain, require, require_memory
+from ctgraph_rl.checks import Rule, as_tuple, at_least_one, is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
 from ctgraph_rl.core.rotation import rotate
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
@@ -117,7 +117,7 @@ class GroupedImages(SquareImages):
         object.__setattr__(self, "within", float(self.within))
         object.__setattr__(self, "between", float(self.between))
 
-    def _distance_rules(self) -> list[tuple[bool, str]]:
+    def _distance_rules(self) -> list[Rule]:
         """Return the rules for reachable distances, up to that of unrelated images while cells are in question."""
         lowest = UNRELATED * (1 - (1 - 1 / self.cells**2) ** 2) if is_int(self.cells, 1) else 0.0
         within_ok = is_real(self.within, lowest, UNRELATED)
@@ -228,9 +228,9 @@ def _redraw(levels: Tensor, share: float, words: Tensor) -> Tensor:
     return torch.where(rank < count, randint(words[..., n : 2 * n], WHITE + 1), levels)
 
 
-def _seed_rule(seed: object) -> tuple[bool, str]:
+def _seed_rule(seed: object) -> Rule:
     return is_int(seed, 0, 2**63 - 1), f"image seed must be in [0, 2**63), got {seed!r}"
 
 
-def _size_rule(size: int, cells: int) -> tuple[bool, str]:
+def _size_rule(size: int, cells: int) -> Rule:
     return is_int(size, cells) and size % cells == 0, f"size must be a positive multiple of {cells}, got {size!r}"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, make_fields_plain, require
+from ctgraph_rl.checks import Rule, is_int, make_fields_plain, require
 from ctgraph_rl.core.rotation import rotations
 from ctgraph_rl.tasks.images.image_set import resize
 
@@ -59,7 +59,7 @@ class ImageFile:
         _read(str(path))
         return cls(str(path), _sha256(str(path)), size)
 
-    def _hash_rule(self) -> tuple[bool, str]:
+    def _hash_rule(self) -> Rule:
         found = _sha256(self.path)
         fix = f"if that is the content you mean, ImageFile.of({self.path!r}) fills it in"
         return found == self.sha256, f"sha256 of {self.path} must be {self.sha256!r}, but the file has {found!r}; {fix}"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import is_int, is_real, make_fields_plain, require, require_memory
+from ctgraph_rl.checks import Rule, is_int, is_real, make_fields_plain, require, require_memory
 from ctgraph_rl.tasks.images.generated import BLUEPRINT_SIZE
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages
 
@@ -110,7 +110,7 @@ class ReferenceOneHot:
         return WHITE * torch.eye(self.num_images, self.num_images + 1, dtype=torch.uint8, device="cpu")
 
 
-def _num_images_rule(value: object) -> tuple[bool, str]:
+def _num_images_rule(value: object) -> Rule:
     return is_int(value, 1), f"num_images must be an integer >= 1, got {value!r}"
 
 

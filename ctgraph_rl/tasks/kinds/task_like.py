@@ -6,7 +6,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
-from ctgraph_rl.checks import as_tuple, require
+from ctgraph_rl.checks import Rule, as_tuple, require
 
 
 class TaskLike(Hashable, Protocol):
@@ -73,7 +73,7 @@ MEMBERS = ("label_parts", "observation_shape", "num_actions", "make_env")
 """What a task needs beside being a frozen dataclass."""
 
 
-def are_tasks(name: str, values: object) -> list[tuple[bool, str]]:
+def are_tasks(name: str, values: object) -> list[Rule]:
     """Return the rules that values are tasks of one kind, without asking a task for anything.
 
     Args:
@@ -106,7 +106,7 @@ def is_kind(kind: type) -> bool:
     return is_dataclass(kind) and _task_rule(kind)[0]
 
 
-def _task_rule(kind: type) -> tuple[bool, str]:
+def _task_rule(kind: type) -> Rule:
     """Return the rule that a class has the members of `TaskLike`."""
     known = {field.name for field in fields(kind)}
     missing = [name for name in MEMBERS if name not in known and not hasattr(kind, name)]
@@ -116,7 +116,7 @@ def _task_rule(kind: type) -> tuple[bool, str]:
     return not missing, f"{kind.__name__} is no task, it lacks {', '.join(missing)}: {fix}"
 
 
-def _kinds_rule(tasks: Sequence[object]) -> tuple[bool, str]:
+def _kinds_rule(tasks: Sequence[object]) -> Rule:
     """Return the rule that tasks are of one kind."""
     kinds = list(dict.fromkeys(type(task).__name__ for task in tasks))
     return len(
