@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
 from ctgraph_rl.checks import not_negative, require
 
@@ -42,7 +41,7 @@ class A2C(PolicyGradient):
         self.entropy_coeff = entropy_coeff
         self.critic_coeff = critic_coeff
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of policy, critic and entropy, as TorchRL's `A2CLoss` does."""
         log_probs, taken, values = self.evaluate_actions(batch)
         return {

@@ -18,7 +18,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, num_actions_of, require_weights
+from baselines.parts.networks import Data, TensorsByName, num_actions_of, require_weights
 from baselines.parts.networks import encoder as make_encoder
 from baselines.parts.prioritized import LARGEST_ALPHA
 from baselines.parts.q_learning import QLearner, require_replay
@@ -91,7 +91,7 @@ class DQN(QLearner):
         after = [("next", key) for key in (*seen, "reward", "done", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
-    def loss(self, batch: Data, others: Data | None = None) -> dict[str, Tensor]:
+    def loss(self, batch: Data, others: Data | None = None) -> TensorsByName:
         """Compute the loss of transitions, as TorchRL's `DQNLoss` does, and their squared errors, ``td_error``.
 
         The prediction is the value of the action taken; the target is the multi-step reward plus the discounted value
@@ -123,14 +123,14 @@ class DQN(QLearner):
     def _target_values(self, data: Data, weights: Data) -> Tensor:
         """Compute the target network's action values."""
         trunk, head = self.greedy.module[0].module
-        parts: list[dict[str, Tensor]] = [{}, {}]
+        parts: list[TensorsByName] = [{}, {}]
         for name, value in weights.items():
             part, _, name = name.partition(".")
             parts[int(part)][name] = value
         features = functional_call(trunk.module, parts[0], tuple(data[key] for key in trunk.in_keys))
         return functional_call(head.module, parts[1], (features,))
 
-    def other_weights(self) -> dict[str, Tensor]:
+    def other_weights(self) -> TensorsByName:
         """Return the target network's weights: those of its trunk as ``0.*``, those of its head as ``1.*``."""
         found = {}
         for place in ("0", "1"):

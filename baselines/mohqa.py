@@ -36,7 +36,7 @@ from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, EncoderModule, guided, num_actions_of, require_weights
+from baselines.parts.networks import Data, EncoderModule, Items, TensorsByName, guided, num_actions_of, require_weights
 from baselines.parts.networks import encoder as make_encoder
 from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
@@ -333,13 +333,13 @@ class MOHQA(QLearner):
         features = self.policy.features(data)
         return self.policy.head(features) + self.hebbian((features - data["average"]).tanh()).detach()
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Change W_h by the rewards of a batch; store it, and yield minibatches of replayed items."""
         self.hebbian.modulate(batch["next", "eligibility"], batch["next", "reward"])
         self.average.copy_(batch["next", "average"][:, -1].mean(dim=0))
         yield from super().minibatches(batch)
 
-    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+    def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Copy all weights to the target network if it is time."""
         if self.needs_weights:
             self.target_weights.copy_(self.hebbian.weights)
@@ -358,7 +358,7 @@ class MOHQA(QLearner):
         after = [("next", key) for key in (*seen, "reward", "terminated")]
         return batch.select(*seen, "action", *after, "steps_to_next_obs").reshape(-1)
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the mean squared error of the value of the action taken; the targets are those of q' + u'."""
         values = self.values(batch) if self.predict_sum else self.policy.head(self.policy.features(batch))
         predicted = values.gather(-1, batch["action"].unsqueeze(-1))

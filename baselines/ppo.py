@@ -8,11 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 from baselines.parts.learner import MOST_PASSES
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss, entropy_loss
 from ctgraph_rl.checks import Rule, at_least_one, at_most, is_int, not_negative, positive, require
 
@@ -61,7 +60,7 @@ class PPO(PolicyGradient):
             torch.tensor([-clip_epsilon, clip_epsilon], dtype=torch.float32, device="cpu").log1p().tolist()
         )
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the clipped surrogate, eq. (7), critic's and entropy losses, as TorchRL's `ClipPPOLoss` does."""
         log_probs, taken, values = self.evaluate_actions(batch)
         change = taken - batch["action_log_prob"].unsqueeze(-1)

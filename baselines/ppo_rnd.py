@@ -31,11 +31,11 @@ from torchrl.data import Composite, TensorSpec
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.learner import reset_layer
-from baselines.parts.networks import Data, critic, encoder, highest
+from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
 from baselines.parts.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
 from baselines.update.optimiser import make_optimiser
-from ctgraph_rl.checks import at_least_one, fraction, not_negative, positive, require, require_memory
+from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0
 """Standard deviations from the mean to which observations are limited."""
@@ -208,7 +208,7 @@ class PPORND(PPO):
         features, head = self.bonus_critic
         return head.module(features.over_time(data))
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of all epochs; predictor and critic of the bonus learn from each before PPO does."""
         for minibatch in super().minibatches(batch):
             self._bonus_step(minibatch, minibatch.pop("next_observation"), minibatch.pop("bonus_target"))
@@ -223,7 +223,7 @@ class PPORND(PPO):
         self.bonus_optimiser.step()
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
         """Add the observations that the predictor learns from, and the targets of the bonus's critic."""
         advantage, target = self.bonus_advantages(batch)
         given = super()._with_advantage(batch.copy().set("bonus_advantage", advantage))
@@ -247,11 +247,11 @@ class PPORND(PPO):
         given = (values, following, bonus, never, never)
         return generalized_advantages(self.bonus_gamma, self.gae_lambda, *given)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the states of both optimisers."""
         return {**super().get_extra_state(), "bonus_optimiser": self.bonus_optimiser.state_dict()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.bonus_optimiser.load_state_dict(state["bonus_optimiser"])

@@ -6,9 +6,7 @@ a batch cuts off is bootstrapped with the baseline's value. There is no bonus fo
 
 from __future__ import annotations
 
-from torch import Tensor
-
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, TensorsByName
 from baselines.parts.policy_gradient import PolicyGradient, critic_loss
 
 
@@ -17,7 +15,7 @@ class Reinforce(PolicyGradient):
 
     solves = "fully observable tasks (CT-FO)"
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of policy and baseline, as TorchRL's `ReinforceLoss` does."""
         _, taken, values = self.evaluate_actions(batch)
         return {

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 
-from baselines.parts.networks import GROUP, Data, RecurrentModule, num_actions_of, recurrent
+from baselines.parts.networks import GROUP, Data, Items, RecurrentModule, TensorsByName, num_actions_of, recurrent
 from baselines.ppo import PPO
 from ctgraph_rl.checks import at_least_one, require
 
@@ -48,7 +48,7 @@ class TrialTrunk(TensorDictModuleBase):
         """Write ``memory``, the LSTM's next state and the number of the episode in its trial, from 1."""
         return tensordict.update(self.act(tensordict))
 
-    def act(self, data: Data) -> dict[Any, Tensor]:
+    def act(self, data: Data) -> Items:
         """Compute ``memory`` and the next state for one step of all rows."""
         inputs, episode = self._inputs(data)
         return {**self.trunk.act(inputs), ("next", "trial"): torch.where(inputs["is_init"], 1, episode)}
@@ -65,7 +65,7 @@ class TrialTrunk(TensorDictModuleBase):
         """Compute ``memory`` of different histories, and which of them each frame has; see `RecurrentModule`."""
         return self.trunk.of_distinct(self._inputs(data)[0])
 
-    def _inputs(self, data: Data) -> tuple[dict[str, Tensor], Tensor]:
+    def _inputs(self, data: Data) -> tuple[TensorsByName, Tensor]:
         """Return the inputs of the inner trunk, and the number of the episode in its trial, from 1."""
         episode = data["trial"] + data["is_init"]
         fresh = data["is_init"] & ((episode == 1) | (episode > self.trial_episodes))
@@ -149,7 +149,7 @@ class RL2(PPO):
         return batch[:, :-1].numel()
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
         """Return all steps but the last; only the end of a trial ends the return."""
         after = batch["next"]
         ends = (after["done"] & (after["trial"] == self.trial_episodes))[:, :-1]

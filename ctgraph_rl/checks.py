@@ -23,6 +23,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Rule = tuple[bool, str]
 """Whether a rule holds, and the message if it does not."""
 
+NamedValues = dict[str, Any]
+"""Values by name, such as settings, a saved state or a line of a log."""
+
+ReadOnlyValues = Mapping[str, Any]
+"""The same, which nobody changes."""
+
 LARGEST_INT = 2**63 - 1
 """Of an int64."""
 

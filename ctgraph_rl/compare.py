@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ctgraph_rl import parsers
-from ctgraph_rl.checks import is_real, positive, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_real, positive, require
 from ctgraph_rl.log.escape import listed, terminal_lines, terminal_text
 from ctgraph_rl.log.files import AGENT, LOG
 from ctgraph_rl.log.measurement import without_time
@@ -34,7 +34,7 @@ PARTS = {
 }
 """Keys of a log's first line by what they say; all others, but for the settings, say what the code was."""
 
-LogLine = Mapping[str, Any]
+LogLine = ReadOnlyValues
 
 
 class Compared(NamedTuple):
@@ -86,7 +86,7 @@ def _groups_of_experts(*logs: RunLog) -> list[str]:
     return [_compared(EXPERTS_TOGETHER, one, other, 3)]
 
 
-def _seeds_of_experts(log: RunLog) -> dict[str, Any]:
+def _seeds_of_experts(log: RunLog) -> NamedValues:
     """Return the seeds that the expert of each task was trained with."""
     found = {}
     for line in log.of_kind("experts"):
@@ -96,7 +96,7 @@ def _seeds_of_experts(log: RunLog) -> dict[str, Any]:
     return found
 
 
-def _compared(name: str, one: Mapping[str, Any], other: Mapping[str, Any], most: int) -> str:
+def _compared(name: str, one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
     """Return whether two sets of values are equal, in a line."""
     return f"{name}: {'equal' if one == other else 'different, ' + _changes(one, other, most)}"
 
@@ -161,7 +161,7 @@ def _where(line: LogLine) -> str:
     return terminal_text(f"{line['kind']}{label}{block}{frames}")
 
 
-def _changes(one: Mapping[str, Any], other: Mapping[str, Any], most: int) -> str:
+def _changes(one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
     """Return in words which values differ."""
     pairs = [f"{key} {a!r} and {b!r}" for key, a, b in _fields(one, other) if a != b]
     return terminal_text(listed(pairs, most))
@@ -182,7 +182,7 @@ def _weights(one: Path, other: Path) -> str:
     return f"different in {len(unequal)} of {len(state)} parts: {terminal_text(listed(unequal))}"
 
 
-def _state(path: Path) -> Mapping[str, Any]:
+def _state(path: Path) -> ReadOnlyValues:
     """Return what an agent saved."""
     content = content_of(path)
     try:
@@ -214,7 +214,7 @@ def _origins(one: LogLine, other: LogLine) -> list[str]:
     return [_compared(name, part, of_other[name], 10) for name, part in of_one.items()]
 
 
-def _parts(line: LogLine) -> dict[str, dict[str, Any]]:
+def _parts(line: LogLine) -> dict[str, NamedValues]:
     """Return what a log's first line says of settings, curriculum, code and machine, by name."""
     left = dict(line)
     for key in ("kind", "seconds", "config"):

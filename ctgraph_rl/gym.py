@@ -25,7 +25,7 @@ from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows, seed_rule
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
 from ctgraph_rl.batch.text_render import as_text
-from ctgraph_rl.checks import Rule, as_int, as_tuple, is_int, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, Rule, as_int, as_tuple, is_int, require, takes_numbers
 from ctgraph_rl.core.dynamics import NO_LEAF, OUTCOME_RUNNING, Shown, choose
 from ctgraph_rl.tasks.configurations import CONFIGURATIONS, Json, make_task
 from ctgraph_rl.tasks.protocol import MOST_ROWS
@@ -34,7 +34,7 @@ from ctgraph_rl.tasks.task import Task
 Frame = NDArray[np.uint8] | str
 NumpyArray = NDArray[Any]
 
-_RENDERING: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
+_RENDERING: NamedValues = {"render_modes": ["rgb_array", "ansi"], "render_fps": 2}
 
 
 class CTGraphGymEnv(gymnasium.Env[Any, int]):
@@ -95,7 +95,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
 
     @torch.inference_mode()
     @takes_numbers
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: NamedValues | None = None) -> tuple[Any, NamedValues]:
         """Start an episode.
 
         Args:
@@ -116,7 +116,7 @@ class CTGraphGymEnv(gymnasium.Env[Any, int]):
         return with_id(self.rows.restart().numpy()[0], self._ids, self._number), info
 
     @torch.inference_mode()
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Any, float, bool, bool, NamedValues]:
         """One step with an action in 0..b.
 
         Raises:
@@ -216,8 +216,8 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
     @torch.inference_mode()
     @takes_numbers
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: NamedValues | None = None
+    ) -> tuple[Any, NamedValues]:
         """Start an episode in all rows, or in those of a mask.
 
         Args:
@@ -235,7 +235,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         return with_id(shown.observation.numpy(), self._ids, self._numbers), self._infos(shown, mask)
 
     @torch.inference_mode()
-    def step(self, actions: NDArray[np.int64]) -> tuple[Any, NumpyArray, NumpyArray, NumpyArray, dict[str, Any]]:
+    def step(self, actions: NDArray[np.int64]) -> tuple[Any, NumpyArray, NumpyArray, NumpyArray, NamedValues]:
         """One step of all rows with actions, integers [N] in 0..b.
 
         Raises:
@@ -258,21 +258,21 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
         observation = with_id(shown.observation.numpy(), self._ids, self._numbers)
         return observation, rewards, done.copy(), np.zeros_like(done), infos
 
-    def _restart(self, done: NDArray[np.bool_], final: Shown) -> tuple[Shown, dict[str, Any]]:
+    def _restart(self, done: NDArray[np.bool_], final: Shown) -> tuple[Shown, NamedValues]:
         """Start an episode in rows that are done; what is shown then, and the infos with what was shown last."""
         last = np.full(self.num_envs, None, dtype=object)
         for i, observation in zip(done.nonzero()[0], final.observation.numpy()[done], strict=True):
             last[i] = with_id(observation, self._ids, self._numbers[i])
-        infos: dict[str, Any] = {"final_obs": last, "_final_obs": done.copy()}
+        infos: NamedValues = {"final_obs": last, "_final_obs": done.copy()}
         infos |= {"final_info": self._infos(final, done), "_final_info": done.copy()}
         self._change_tasks(done)
         shown = self.rows.reset(final.done)
         return shown, infos | self._infos(shown)
 
-    def _infos(self, shown: Shown, mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+    def _infos(self, shown: Shown, mask: NDArray[np.bool_] | None = None) -> NamedValues:
         """Return what `CTGraphGymEnv` gives in ``info``, for the rows of a mask or for all, as Gymnasium batches it."""
         values = {"task": self._numbers, "outcome": shown.outcome.numpy(), "leaf": shown.leaf.numpy()}
-        infos: dict[str, Any] = {}
+        infos: NamedValues = {}
         for key, value in values.items():
             infos[key] = value.astype(np.int64) if mask is None else np.where(mask, value, 0).astype(np.int64)
             infos[f"_{key}"] = np.ones(self.num_envs, np.bool_) if mask is None else mask.copy()
@@ -292,7 +292,7 @@ class CTGraphVectorEnv(VectorEnv[Any, NDArray[np.int64], NumpyArray]):
             raise ValueError(f"no episode is running in the rows {rows}: reset them first")
         return torch.from_numpy(action.astype(np.int64))
 
-    def _mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
+    def _mask(self, options: NamedValues | None) -> NDArray[np.bool_]:
         """The rows that a reset is for."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from ctgraph_rl.batch.shown_ids import with_id, with_task_ids
-from ctgraph_rl.checks import Rule, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, Rule, require, takes_numbers
 from ctgraph_rl.gym import CTGraphVectorEnv
 from ctgraph_rl.tasks.task import Task
 
@@ -121,7 +121,7 @@ def _batch_rule(indices: VecEnvIndices) -> Rule:
     return indices is None, f"the rows are one batch: indices must be None, got {indices!r}"
 
 
-def _by_row(infos: dict[str, Any], **more: Any) -> list[dict[str, Any]]:
+def _by_row(infos: NamedValues, **more: Any) -> list[NamedValues]:
     """Gymnasium's batch of infos as a dictionary for every row."""
     rows = zip(*(infos[key].tolist() for key in ("task", "outcome", "leaf")), strict=True)
     return [{"task": task, "outcome": outcome, "leaf": leaf, **more} for task, outcome, leaf in rows]

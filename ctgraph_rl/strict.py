@@ -24,7 +24,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import is_shallow, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_shallow, require
 from ctgraph_rl.disk import read_regular
 
 MAX_NESTING = 32
@@ -88,8 +88,8 @@ def json_value(content: bytes, finite: bool = True, nesting: int = MAX_NESTING) 
 
 
 def json_object(
-    path_or_dict: str | os.PathLike[str] | Mapping[str, Any], name: str, most: int, nesting: int = MAX_NESTING
-) -> tuple[str, Mapping[str, Any]]:
+    path_or_dict: str | os.PathLike[str] | ReadOnlyValues, name: str, most: int, nesting: int = MAX_NESTING
+) -> tuple[str, ReadOnlyValues]:
     """Return the name of a source for errors, and the object of JSON that it holds.
 
     Args:
@@ -117,7 +117,7 @@ def json_object(
     return str(path_or_dict), content
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> NamedValues:
     """Return an object; refuse one that has a key twice."""
     found = dict(pairs)
     if len(found) != len(pairs):
@@ -263,7 +263,7 @@ def unpacked(content: bytes, most: int) -> bytes:
     return found
 
 
-def parquet_rows(content: bytes, like: bytes) -> list[dict[str, Any]]:
+def parquet_rows(content: bytes, like: bytes) -> list[NamedValues]:
     """Return the rows of a Parquet file that should be as another one; nothing is unpacked before its form is known.
 
     Args:

@@ -18,9 +18,8 @@ from itertools import accumulate
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
-from typing import Any
 
-from ctgraph_rl.checks import Rule, is_int, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, Rule, is_int, require, takes_numbers
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -106,14 +105,14 @@ class Pool:
         return active[number % len(active)], done + number // len(active)
 
 
-def read_environment(path: Path) -> dict[str, Any]:
+def read_environment(path: Path) -> NamedValues:
     """The arguments of `Task` for an environment file, its goal still missing."""
     content = _read(path)
     with _named(path):
         return read_task(content, ())
 
 
-def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
+def _chosen(meta: NamedValues, pool_size: int) -> list[int]:
     """The numbers of the tasks in the order of the curriculum."""
     listed = meta.get("filter_tasks")
     count = pool_size if listed is None else len(listed)
@@ -126,7 +125,7 @@ def _chosen(meta: dict[str, Any], pool_size: int) -> list[int]:
     return numbers
 
 
-def _labels(meta: dict[str, Any], tasks: Sequence[Task], numbers: list[int]) -> Protocol:
+def _labels(meta: NamedValues, tasks: Sequence[Task], numbers: list[int]) -> Protocol:
     by_place = meta.get("label_by_curriculum_index", meta.get("task_label_mode") == "curriculum_index")
     labels = meta.get("task_label_ids", list(range(len(numbers))) if by_place else numbers)
     length = meta["label_dim"]
@@ -138,7 +137,7 @@ def _labels(meta: dict[str, Any], tasks: Sequence[Task], numbers: list[int]) -> 
     return Protocol("one_hot", num_task_ids=length, task_ids=ids)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> NamedValues:
     """The object that a JSON file holds.
 
     Raises:
@@ -180,7 +179,7 @@ class FileError(ValueError):
     """The error of a file, its path in front."""
 
 
-def _key_rules(meta: dict[str, Any]) -> list[Rule]:
+def _key_rules(meta: NamedValues) -> list[Rule]:
     known = (*REQUIRED, *OPTIONAL)
     unknown = [key for key in meta if key not in known]
     near = [f"; did you mean {match!r}?" for key in unknown for match in get_close_matches(key, known, 1)]
@@ -191,7 +190,7 @@ def _key_rules(meta: dict[str, Any]) -> list[Rule]:
     ]
 
 
-def _value_rules(meta: dict[str, Any]) -> list[Rule]:
+def _value_rules(meta: NamedValues) -> list[Rule]:
     paths = meta["config_paths"]
     order = meta["task_order"]
     by_place = meta.get("label_by_curriculum_index", False)

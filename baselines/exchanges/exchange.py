@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from baselines.methods.parts.masks import Masks
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, TakesNumbers, at_least_one, fraction, require
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import Fields, Message
 
@@ -40,7 +40,7 @@ class Exchange(TakesNumbers):
         self.delay_prob = delay_prob
         self.kinds: Mapping[str, Fields] = {}
 
-    def settings_of(self, member: int) -> Mapping[str, Any]:
+    def settings_of(self, member: int) -> ReadOnlyValues:
         """Return none; see `ctgraph_rl.learn.collective.ExchangeLike`, as for all methods."""
         return {}
 
@@ -58,11 +58,11 @@ class Exchange(TakesNumbers):
         """Take over nothing."""
         return []
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return nothing."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore nothing."""
 
 
@@ -117,10 +117,10 @@ class MaskExchange(Exchange):
         """Return a member's last mean return in a task; 0 where it has none."""
         return self.returns[member].get(task, 0.0)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return the returns."""
         return {"returns": [dict(each) for each in self.returns]}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         self.returns = [dict(each) for each in state["returns"]]

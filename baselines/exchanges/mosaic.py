@@ -21,7 +21,7 @@ from baselines.methods.parts.masks import Masks
 from baselines.methods.parts.weights import flat
 from baselines.parts.embedding import linear_wasserstein, reference_points, transitions
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import LARGEST_INT, at_least_one, is_int, is_real, require, true_or_false
+from ctgraph_rl.checks import LARGEST_INT, NamedValues, at_least_one, is_int, is_real, require, true_or_false
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
 
@@ -192,7 +192,7 @@ class Mosaic(MaskExchange):
         newest = {each.sender: each for each in received if each.content["task"] == task}
         return sorted(newest.values(), key=lambda each: (-each.content["similarity"], each.sender))[: self.top_n]
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return returns, embeddings, transitions and the random stream."""
         known = [dict(vars(each)) for each in self.known]
         return {**super().state_dict(), "known": known, "random": self.generator.get_state()}
@@ -226,5 +226,5 @@ class KnownMask:
         return transitions(observation, action, reward.squeeze(-1), num_actions)
 
 
-def _of(message: Message, *names: str) -> dict[str, Any]:
+def _of(message: Message, *names: str) -> NamedValues:
     return {name: message.content[name] for name in names}

@@ -16,8 +16,8 @@ from torch import Tensor
 from baselines.methods.method import Method
 from baselines.methods.parts.weights import Weights
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, sequences_of
-from ctgraph_rl.checks import at_least_one, not_negative, require, require_memory
+from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
+from ctgraph_rl.checks import NamedValues, at_least_one, not_negative, require, require_memory
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -33,7 +33,7 @@ class Reservoir:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.offered = 0
-        self.items: dict[Any, Tensor] = {}
+        self.items: Items = {}
 
     def __len__(self) -> int:
         return min(self.offered, self.capacity)
@@ -55,7 +55,7 @@ class Reservoir:
             self.items[key][places.to(value.device)] = value.index_select(0, last[places].to(value.device))
         self.offered += number
 
-    def sample(self, number: int) -> dict[Any, Tensor]:
+    def sample(self, number: int) -> Items:
         """Draw items with replacement."""
         places = torch.randint(len(self), [number], device="cpu")
         return {key: value.index_select(0, places.to(value.device)) for key, value in self.items.items()}
@@ -121,7 +121,7 @@ class CLEAR(Method):
         replayed = self.reservoir.sample(len(batch["action"]))
         return {**batch, **{("replay", key): value for key, value in replayed.items()}}
 
-    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
         """Compute the cloning losses."""
         replayed = {key[1]: value for key, value in batch.items() if key[0] == "replay"}
         if not replayed:
@@ -137,12 +137,12 @@ class CLEAR(Method):
                 losses["loss_value_cloning"] = self.value_coeff * (replayed[key] - now[key]).square().mean()
         return losses
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the contents of the reservoir."""
         items = {key: value[: len(self.reservoir)].clone() for key, value in self.reservoir.items.items()}
         return {"offered": self.reservoir.offered, "items": items}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.reservoir = Reservoir(self.reservoir.capacity)
         self.reservoir.offered = state["offered"]

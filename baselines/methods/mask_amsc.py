@@ -16,7 +16,7 @@ from torch import Tensor
 from baselines.methods.parts.selection import STREAM, SelectedMasks, own_generator
 from baselines.methods.parts.weights import Weights
 from baselines.parts.learner import Learner
-from ctgraph_rl.checks import at_least_one, one_of, positive, require, true_or_false
+from ctgraph_rl.checks import NamedValues, at_least_one, one_of, positive, require, true_or_false
 from ctgraph_rl.learn.evaluate import evaluate
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -137,12 +137,12 @@ class MaskAMSC(SelectedMasks):
             support = candidates[torch.randperm(len(candidates), generator=self.shuffle, device="cpu")[: len(support)]]
         return support.tolist()
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return competences, returns and the state of the stream that shuffles."""
         own = {"competence": dict(self.competence), "returns": list(self.returns), "shuffle": self.shuffle.get_state()}
         return {**super().get_extra_state(), **own}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.competence = dict(state["competence"])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from baselines.methods.parts.masks import Masks
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
-from ctgraph_rl.checks import at_least_one, require
+from ctgraph_rl.checks import NamedValues, at_least_one, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions
 
@@ -101,11 +100,11 @@ class MaskShared(Masks):
         self.received = torch.cat([scores, scores.new_zeros(excluded, scores.shape[1])]) if excluded else scores
         self.set_places([*range(count), *[0] * excluded, count], excluded, scores.device)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return what `Masks` does, and the received scores."""
         return {**super().get_extra_state(), "received": self.received[: self.num_received].clone()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self._keep(state["received"].to(self.constant))

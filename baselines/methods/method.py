@@ -19,7 +19,7 @@ from baselines.methods.parts.weights import Weights
 from baselines.parts.hooks import Hooks
 from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import TakesNumbers, require
+from ctgraph_rl.checks import NamedValues, TakesNumbers, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -196,12 +196,12 @@ class TaskMethod(Method):
         weights[inside.to(weights.device)] = kept[slot]
         return weights
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the slots of the tasks, and `counts`."""
         counts = {name: getattr(self, name) for name in self.counts}
         return {"begun": list(self.started), "place": self.slot, **counts}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.started = list(state["begun"])
         self.slot = state["place"]

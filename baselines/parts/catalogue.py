@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.packages import class_named, conf_dir
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,7 +20,7 @@ class CatalogueEntry(NamedTuple):
 
     name: str
     target: str  # dotted name of the class
-    settings: dict[str, Any]
+    settings: NamedValues
     comment: str  # its first line, but for that which says where its settings go
 
     @property
@@ -29,7 +30,7 @@ class CatalogueEntry(NamedTuple):
         return class_named(module, name)
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> NamedValues:
         """The constants among the attributes of the class, read from its source without importing it."""
         return constants(self.target)
 
@@ -46,13 +47,13 @@ def catalogue(group: str) -> Iterator[CatalogueEntry]:
             yield CatalogueEntry(path.stem, target, settings, comments[0].removeprefix("# "))
 
 
-def constants(target: str) -> dict[str, Any]:
+def constants(target: str) -> NamedValues:
     """Return what the body of a class of `baselines`, or of one of its bases there, sets to constants."""
     module, _, name = target.rpartition(".")
     tree = _tree_of(module)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     homes = dict(_imported(tree)) | dict.fromkeys(classes, module)
-    found: dict[str, Any] = {}
+    found: NamedValues = {}
     for base in map(ast.unparse, reversed(classes[name].bases)):
         home = homes.get(base, "")
         if home.startswith("baselines."):

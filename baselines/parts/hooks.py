@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, TensorsByName
 
 
 class Hooks(nn.Module):
@@ -24,7 +24,7 @@ class Hooks(nn.Module):
         """Return the minibatch to learn from in place of the given one."""
         return batch
 
-    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
         """Return what is added to the agent's losses, as scalars named ``loss_*``."""
         return {}
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -33,7 +33,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, draw, guided, num_actions_of
+from baselines.parts.networks import Data, Items, TensorsByName, draw, guided, num_actions_of
 from baselines.update.optimiser import make_optimiser
 from baselines.update.trust_region import trust_region_step
 from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
@@ -50,7 +50,7 @@ RIDGE = 1e-5
 SMALLEST_STD = 1e-4
 """Added to the standard deviation of A, which is 0 where the baseline fits all returns."""
 
-NamedWeights = dict[str, Tensor]
+NamedWeights = TensorsByName
 NetInputs = tuple[Tensor, ...]
 
 
@@ -341,14 +341,14 @@ class InnerLoop(Learner):
         steps = [self.gradient_step(minibatch) for minibatch in self.minibatches(batch)]
         return self.mean_measurements(steps) if steps else {}
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the trials of a batch as often as the outer loop takes a step on them."""
         trials = self.trials(batch)
         if trials is not None:
             yield from [trials] * (1 if self.outer == "trpo" else self.num_epochs)
 
     @torch.no_grad()
-    def trials(self, batch: TensorDictBase) -> dict[Any, Tensor] | None:
+    def trials(self, batch: TensorDictBase) -> Items | None:
         """Return what the losses read of the trials that begin and end in a batch; None without one.
 
         Keys are those of `Episodes`, what was ``seen`` under its own ones, those of steps before the adaptation under
@@ -387,7 +387,7 @@ class InnerLoop(Learner):
         seen = tuple(batch[key][at] for key in self.specs)
         return Played(seen, batch["action"][at], batch["next", "reward"].squeeze(-1)[at], number)
 
-    def _as_data(self, episodes: Episodes, *labels: str) -> dict[Any, Tensor]:
+    def _as_data(self, episodes: Episodes, *labels: str) -> Items:
         """Return episodes by key."""
         named = {**dict(zip(self.specs, episodes.seen, strict=True)), **episodes._asdict()}
         del named["seen"]
@@ -400,7 +400,7 @@ class InnerLoop(Learner):
         after = tuple(batch[key] for key in self.specs)
         return vmap(self.model.adapted_logits, in_dims=(None, 0, 0))(theta or self.model.theta, before, after)
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the outer loss of what `trials` returned."""
         return {"loss_policy": self._outer_loss(batch, self._adapted_logits(batch))}
 
@@ -412,7 +412,7 @@ class InnerLoop(Learner):
             gain = torch.minimum(gain, clipped)
         return -(batch["weight"] * gain).sum(dim=1).mean()
 
-    def gradient_step(self, batch: Data) -> dict[str, Tensor]:
+    def gradient_step(self, batch: Data) -> TensorsByName:
         """Take a step of the outer loop; return what was measured."""
         if self.outer == "ppo":
             measured = super().gradient_step(batch)

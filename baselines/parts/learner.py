@@ -13,11 +13,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from baselines.parts.hooks import Hooks
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiled
 from baselines.update.optimiser import parts_of
 from baselines.update.update import Update, UpdateState, update
-from ctgraph_rl.checks import TakesNumbers, at_least_one, positive, require, true_or_false
+from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
 MOST_PASSES = 10**6
@@ -86,7 +86,7 @@ class Learner(TakesNumbers, nn.Module):
     def end_task(self) -> None:
         """Do nothing."""
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of a batch; see `ctgraph_rl.agent.Agent`."""
         raise NotImplementedError
 
@@ -95,11 +95,11 @@ class Learner(TakesNumbers, nn.Module):
         steps = [self.after_update(self.gradient_step(minibatch)) for minibatch in self.minibatches(batch)]
         return self.after_batch(self.mean_measurements(steps))
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of a batch, each for one gradient step, which is taken before the next is made."""
         raise NotImplementedError
 
-    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+    def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Called after a gradient step with what was measured in it; return what is worth logging of that."""
         return measured
 
@@ -112,7 +112,7 @@ class Learner(TakesNumbers, nn.Module):
         """Whether `after_update` reads the weights after the next gradient step."""
         return False
 
-    def other_weights(self) -> dict[str, Tensor]:
+    def other_weights(self) -> TensorsByName:
         """Return the tensors beside parameters and buffers that the losses read, such as those of a target network."""
         return {}
 
@@ -120,14 +120,14 @@ class Learner(TakesNumbers, nn.Module):
         """Return how many frames of a batch one pass learns from."""
         return batch.numel()
 
-    def outputs(self, data: Data) -> dict[str, Tensor]:
+    def outputs(self, data: Data) -> TensorsByName:
         """Compute the network's outputs at any number of steps, [..., n] each.
 
         These are ``log_probs`` of all actions, and those of `output_keys`: ``state_value`` or ``action_value``.
         """
         raise NotImplementedError
 
-    def one_step(self, data: Data) -> dict[Any, Tensor]:
+    def one_step(self, data: Data) -> Items:
         """Compute `outputs` for one step of all rows, and with memory the next state under ``("next", key)``."""
         return dict(self.outputs(data))
 
@@ -159,7 +159,7 @@ class Learner(TakesNumbers, nn.Module):
     def weights_changed(self) -> None:
         """Called after weights were changed other than by learning; nothing else depends on them."""
 
-    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data | None = None) -> dict[str, Tensor]:
+    def losses(self, batch: Data, weights: Sequence[Tensor], others: Data | None = None) -> TensorsByName:
         """Compute the agent's losses and the method's penalties.
 
         Args:
@@ -174,7 +174,7 @@ class Learner(TakesNumbers, nn.Module):
         """Return a function of this learner: with the tensors that `torch.func.functional_call` gives it."""
         return function(self, *given)
 
-    def gradient_step(self, batch: Data) -> dict[str, Tensor]:
+    def gradient_step(self, batch: Data) -> TensorsByName:
         """Minimise the sum of the losses of a batch by one step; return losses and gradient norm."""
         batch = self.method.transform_minibatch(batch)
         if len(batch["action"]) != self.minibatch_size or not self.optimiser.state:
@@ -186,7 +186,7 @@ class Learner(TakesNumbers, nn.Module):
             return update(self, self.update_state, batch)
         return self._region.copies(batch)
 
-    def _usual_update(self, batch: Data) -> dict[str, Tensor]:
+    def _usual_update(self, batch: Data) -> TensorsByName:
         """Take the step, compiled where the agent is."""
         return (self.compiled_step or update)(self, self.update_state, batch)
 
@@ -200,7 +200,7 @@ class Learner(TakesNumbers, nn.Module):
         """Whether gradient steps of the usual size are captured as a CUDA graph: on GPUs, without a method."""
         return self.capturable and type(self.method) is Hooks and captures(next(self.parameters()).device)
 
-    def mean_measurements(self, steps: list[dict[str, Tensor]]) -> dict[str, float]:
+    def mean_measurements(self, steps: list[TensorsByName]) -> dict[str, float]:
         """Return the mean of each measurement over gradient steps.
 
         Raises:
@@ -212,14 +212,14 @@ class Learner(TakesNumbers, nn.Module):
         """Return the means of a table of measurements, [names, gradient steps]; see `mean_measurements`."""
         return finite_means(names, table, torch.stack(torch._foreach_norm(list(self.parameters()), torch.inf)).max())
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state, so that `state_dict` is complete."""
         saved = self.optimiser.state_dict()
         states = saved["state"].items()  # detached, tensors lack the marks of ``torch.compile``, which are not plain
         saved["state"] = {place: {key: value.detach() for key, value in state.items()} for place, state in states}
         return {"optimiser": saved}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.optimiser.load_state_dict(state["optimiser"])
         self._region = None
@@ -231,7 +231,7 @@ def reset_layer(module: nn.Module) -> None:
         module.reset_parameters()  # type: ignore[operator]
 
 
-def table_of(steps: Sequence[dict[str, Tensor]]) -> Tensor:
+def table_of(steps: Sequence[TensorsByName]) -> Tensor:
     """Return what was measured in gradient steps, [...] each, as a table, [names, gradient steps, ...]."""
     return torch.stack([torch.stack(list(step.values())) for step in steps], dim=1)
 

@@ -25,6 +25,12 @@ from ctgraph_rl.learn.guide import GUIDED_ACTION
 Data = Mapping[Any, Tensor]
 """Tensors by key, in a dictionary or a TensorDict."""
 
+Items = dict[Any, Tensor]
+"""Tensors by key, whose first dimension is that of a batch."""
+
+TensorsByName = dict[str, Tensor]
+"""Such as losses, outputs and weights."""
+
 GROUP = "group"
 """The key of numbers of frames, int64, the same for frames with the same inputs; see `EncoderModule.groups`."""
 
@@ -108,7 +114,7 @@ class Encoder(nn.Module):
 class EncoderModule(TensorDictModule):
     """A trunk without memory: an `Encoder` and the keys that it reads; writes ``features``."""
 
-    def act(self, data: Data) -> dict[Any, Tensor]:
+    def act(self, data: Data) -> Items:
         """Compute ``features`` for one step of all rows."""
         return {"features": self.over_time(data)}
 
@@ -158,7 +164,7 @@ class RecurrentModule(TensorDictModuleBase):
         """Write ``memory`` and the next state of a step; in TorchRL's ``recurrent_mode``, ``memory`` of sequences."""
         return tensordict.update({"memory": self.over_time(tensordict)} if recurrent_mode() else self.act(tensordict))
 
-    def act(self, data: Data) -> dict[Any, Tensor]:
+    def act(self, data: Data) -> Items:
         """Compute ``memory`` and the next state for one step of all rows."""
         encoder, cell = self.encoder, self.cell
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
@@ -238,7 +244,7 @@ def copied_action(keys: Sequence[str]) -> list[TensorDictModule]:
     return [copy] * (PREVIOUS_ACTION in keys)
 
 
-def sequences_of(batch: Data, keys: Sequence[str]) -> dict[str, Tensor]:
+def sequences_of(batch: Data, keys: Sequence[str]) -> TensorsByName:
     """Return inputs of a batch, [rows, steps, ...] each; of states that are not stored for each step the first one."""
     return {key: batch[key][:, :1] if key.startswith(UNSTORED) else batch[key] for key in keys}
 
@@ -359,7 +365,7 @@ class ActorCritic(TensorDictSequential):
             tensordict.set(key, value)
         return tensordict
 
-    def act_on_tensors(self, data: Data) -> dict[Any, Tensor]:
+    def act_on_tensors(self, data: Data) -> Items:
         """Return what `forward` writes; see `ctgraph_rl.learn.collect.act`."""
         trunk, key, logits, value, others = self._parts
         written = trunk.act(data)

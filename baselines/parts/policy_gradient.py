@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,6 +18,8 @@ from baselines.parts.networks import (
     GROUP,
     ActorCritic,
     Data,
+    Items,
+    TensorsByName,
     actor,
     copied_action,
     critic,
@@ -172,25 +173,25 @@ class PolicyGradient(Learner):
         log_probs = outputs["log_probs"]
         return log_probs, log_probs.gather(-1, batch["action"].unsqueeze(-1)), outputs["state_value"]
 
-    def outputs(self, data: Data) -> dict[str, Tensor]:
+    def outputs(self, data: Data) -> TensorsByName:
         """Compute log-probabilities of all actions and the value; see `Learner`."""
         return self._heads(self.trunk.over_time(data))
 
-    def _distinct_outputs(self, data: Data) -> dict[str, Tensor]:
+    def _distinct_outputs(self, data: Data) -> TensorsByName:
         """Compute `outputs` once for frames with the same inputs, or with memory the same history."""
         features, which = self.trunk.of_distinct(data)
         return {key: value[which] for key, value in self._heads(features).items()}
 
-    def _heads(self, features: Tensor) -> dict[str, Tensor]:
+    def _heads(self, features: Tensor) -> TensorsByName:
         return {"log_probs": log_probabilities(self.actor, features), "state_value": self.critic.module(features)}
 
-    def one_step(self, data: Data) -> dict[Any, Tensor]:
+    def one_step(self, data: Data) -> Items:
         """Compute `outputs` for one step of all rows, and with memory the next state; see `Learner`."""
         written = self.trunk.act(data)
         features = written.pop(self.features)
         return {**written, **self._heads(features)}
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Yield the minibatches of all epochs, with advantages from the values that were computed while acting."""
         given = self._with_advantage(batch)
         items = {key: value if self.memory else value.flatten(0, 1) for key, value in given.items()}
@@ -201,21 +202,21 @@ class PolicyGradient(Learner):
         """Return the reward to maximise, float32 [num_envs, num_steps, 1]: the environment's."""
         return batch["next", "reward"]
 
-    def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
+    def _minibatches(self, items: TensorsByName) -> Iterator[TensorsByName]:
         """Iterate over the minibatches of one epoch."""
         order = torch.randperm(len(items["action"]), device=items["action"].device)
         shuffled = [value.index_select(0, order).chunk(self.num_minibatches) for value in items.values()]
         return (dict(zip(items, parts, strict=True)) for parts in zip(*shuffled, strict=True))
 
     @torch.no_grad()
-    def _with_advantage(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _with_advantage(self, batch: TensorDictBase) -> TensorsByName:
         """Add ``advantage`` and ``value_target`` to a batch, from the values that were computed while acting."""
         after = batch["next"]
         return self._with_estimates(batch, self._next_values(batch), after["done"], after["terminated"])
 
     def _with_estimates(
         self, batch: TensorDictBase, next_values: Tensor, done: Tensor, terminated: Tensor
-    ) -> dict[str, Tensor]:
+    ) -> TensorsByName:
         """Return inputs, actions, advantages and value targets; each argument is [num_envs, num_steps, 1]."""
         advantage, target = self.advantages(batch, next_values, done, terminated)
         if self.normalize_advantage:
@@ -264,7 +265,7 @@ def critic_loss(values: Tensor, batch: Data, weight: float) -> Tensor:
     return (weight * (values - batch["value_target"]).square()).mean()
 
 
-def entropy_loss(log_probs: Tensor, weight: float) -> dict[str, Tensor]:
+def entropy_loss(log_probs: Tensor, weight: float) -> TensorsByName:
     """Return the negative weighted entropy of the policy as a loss, and the entropy."""
     entropies = entropy(log_probs)
     return {"loss_entropy": (-weight * entropies).mean(), "entropy": entropies.detach().mean()}

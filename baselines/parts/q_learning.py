@@ -19,10 +19,10 @@ from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
 from baselines.parts.learner import MOST_PASSES, Learner
-from baselines.parts.networks import Data, guided
+from baselines.parts.networks import Data, Items, TensorsByName, guided
 from baselines.parts.prioritized import PrioritySampler
 from baselines.update.optimiser import make_optimiser
-from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, require_memory
+from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, one_of, positive, require, require_memory
 from ctgraph_rl.core.device import torchs_defaults
 
 LONGEST_TARGET = 10**4
@@ -224,7 +224,7 @@ class QLearner(Learner):
         """Compute the network's action values, [..., num_actions]."""
         raise NotImplementedError
 
-    def outputs(self, data: Data) -> dict[str, Tensor]:
+    def outputs(self, data: Data) -> TensorsByName:
         """Compute the action values, and the log-probabilities of their softmax; see `Learner`."""
         values = self.values(data)
         return {"log_probs": values.log_softmax(dim=-1), "action_value": values}
@@ -238,14 +238,14 @@ class QLearner(Learner):
         """Return what the replay buffer stores of a batch with multi-step rewards, [items]."""
         raise NotImplementedError
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Store a batch, and yield minibatches of replayed items."""
         self.replay.extend(self.experience(self.with_targets(batch)))
         for _ in range(self.num_updates):
             self.replayed, items = self._sample()
             yield items
 
-    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+    def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Set the priorities of the replayed items, and copy the weights to the target network if it is time."""
         squared = measured.pop("td_error", None)
         if self.prioritized and squared is not None:
@@ -264,7 +264,7 @@ class QLearner(Learner):
         """Whether the target network gets the weights after the next gradient step."""
         return self.prioritized or self.target_update.counter == self.target_update.value_network_update_interval
 
-    def _sample(self) -> tuple[Tensor, dict[Any, Tensor]]:
+    def _sample(self) -> tuple[Tensor, Items]:
         """Return indices of replayed items and the items, as ``replay.sample()`` does, in plain tensors."""
         storage = self.replay.storage
         device = next(self.parameters()).device
@@ -273,7 +273,7 @@ class QLearner(Learner):
         items = {key: value.index_select(0, index).to(device) for key, value in stored}  # the buffer stays on the CPU
         return index, {**items, **{key: value.to(device) for key, value in more.items()}}
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state, the replay buffer and the age of the target network in gradient steps."""
         replay = self.replay.state_dict()
         for items in replay["_storage"]["_storage"].values():
@@ -281,7 +281,7 @@ class QLearner(Learner):
                 items[replay["_storage"]["_len"] :] = 0
         return {**super().get_extra_state(), "replay": replay, "target_age": self.target_update.counter}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay.load_state_dict(state["replay"])

@@ -19,7 +19,7 @@ from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
-from baselines.parts.networks import Data, copied_action, num_actions_of, recurrent, require_weights
+from baselines.parts.networks import Data, TensorsByName, copied_action, num_actions_of, recurrent, require_weights
 from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
@@ -178,7 +178,7 @@ class RecurrentQ(QLearner):
         """Compute the loss of every step, [B, L], from quantiles [B, L, K]."""
         raise NotImplementedError
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the mean loss of the steps of sequences."""
         distance = self.distance(*self.targets(batch))
         learnt = batch["learnt"]

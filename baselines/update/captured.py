@@ -7,7 +7,7 @@ two batches, and each agent gets its own after each batch. Each seed draws by co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from torch import Tensor
 from baselines.cells.cell import PREVIOUS_ACTION
 from baselines.methods.method import AgentWithMethod
 from baselines.parts.learner import finite_means, table_of
-from baselines.parts.networks import Data, sequences_of
+from baselines.parts.networks import Data, Items, TensorsByName, sequences_of
 from baselines.parts.policy_gradient import PolicyGradient
 from baselines.update.seeds import SeedGroup, or_error, sampled, why_not_optimiser
 from baselines.update.stack import Stack
@@ -124,7 +124,7 @@ class CapturedGroup(SeedGroup):
 
     policy.capturable = True  # type: ignore[attr-defined]
 
-    def acted(self, data: TensorDictBase) -> dict[Any, Tensor]:
+    def acted(self, data: TensorDictBase) -> Items:
         """See `SeedGroup`."""
         keys = self.first.trunk.in_keys
         written = self.stack.one_step({key: self.by_seed(data[key]) for key in keys})
@@ -160,7 +160,7 @@ class CapturedGroup(SeedGroup):
         return torch.stack([each.abs().amax(dim=1) for each in weights]).amax(dim=0)
 
     @torch.no_grad()
-    def _items(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _items(self, batch: TensorDictBase) -> TensorsByName:
         """Return what the seeds learn from, [seeds, items, ...] each: frames, or with memory rows."""
         after = batch["next"]
         advantage, target = self.first.advantages(batch, self._next_values(batch), after["done"], after["terminated"])
@@ -188,20 +188,20 @@ class CapturedGroup(SeedGroup):
         deviation = of_seeds.std(dim=(1, 2, 3), correction=0, keepdim=True)
         return ((of_seeds - mean) / (deviation + 1e-8)).flatten(0, 1)
 
-    def _minibatches(self, items: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
+    def _minibatches(self, items: TensorsByName) -> Iterator[TensorsByName]:
         """Iterate over the minibatches of one epoch, [seeds, items, ...] each."""
         order = self.draws.orders(items["action"].shape[1])
         for part in order.chunk(self.first.num_minibatches, dim=1):
             yield {key: _taken(value, part) for key, value in items.items()}
 
-    def gradient_step(self, minibatch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def gradient_step(self, minibatch: TensorsByName) -> TensorsByName:
         """Take a gradient step of all seeds; return losses and norms, [seeds] each."""
         is_usual = minibatch["action"].shape[1] == self.first.minibatch_size
         if not is_usual or not self._region.takes(minibatch):
             return update(self.first, self.stack.state, minibatch)
         return self._region.copies(minibatch)
 
-    def _usual_update(self, minibatch: Data) -> dict[str, Tensor]:
+    def _usual_update(self, minibatch: Data) -> TensorsByName:
         """Take the step, compiled where the agents are."""
         return (self.first.compiled_step or update)(self.first, self.stack.state, minibatch)
 

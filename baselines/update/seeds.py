@@ -20,7 +20,7 @@ from torch.fx import GraphModule
 from baselines.methods.method import AgentWithMethod
 from baselines.parts.hooks import Hooks
 from baselines.parts.learner import Learner, table_of
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiler_options
 from baselines.update.optimiser import has_parts
 from baselines.update.stack import Stack
@@ -126,7 +126,7 @@ class SeedGroup:
             data.set(key, value.flatten(0, 1))
         return data
 
-    def acted(self, data: TensorDictBase) -> dict[Any, Tensor]:
+    def acted(self, data: TensorDictBase) -> Items:
         """Return what the policies write, [seeds, num_envs, ...] each."""
         if self._acting is None:
             self._acting = Stack(self.learners)
@@ -134,7 +134,7 @@ class SeedGroup:
         outputs = self._act(self._acting, {key: self.by_seed(data[key]) for key in keys})
         return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
 
-    def _act(self, stack: Stack, data: dict[Any, Tensor]) -> dict[str, Tensor]:
+    def _act(self, stack: Stack, data: Items) -> TensorsByName:
         """Compute `Stack.outputs` by a graph of its operations, compiled where the agents say so.
 
         Without it most of the time is spent on binding tensors and between operations.
@@ -151,14 +151,14 @@ class SeedGroup:
             self._compiled[graph.code] = compile(graph, [*inputs], compiler_options())
         return self._compiled[graph.code]
 
-    def _sampled(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _sampled(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
         """Return random actions, each agent's drawn from its generator."""
         noise = torch.empty_like(outputs["log_probs"], memory_format=torch.contiguous_format)
         for row, generator in zip(noise, self.generators, strict=True):
             row.exponential_(generator=generator)
         return sampled(outputs, noise)
 
-    def _explored(self, outputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _explored(self, outputs: Mapping[str, Tensor]) -> TensorsByName:
         """Return the best actions, and where an agent explores random ones."""
         actions = outputs["action_value"].argmax(dim=-1)
         for number, (learner, action) in enumerate(zip(self.learners, actions, strict=True)):
@@ -226,7 +226,7 @@ class SeedGroup:
 
         return [or_error(measured, *pair) for pair in zip(stack.learners, table, strict=True)]
 
-    def _next(self, minibatches: Mapping[int, Iterator[dict[Any, Tensor]]]) -> list[Data]:
+    def _next(self, minibatches: Mapping[int, Iterator[Items]]) -> list[Data]:
         """Return the next minibatch of each of these agents; none after the last."""
         given = []
         for number, iterator in minibatches.items():
@@ -237,7 +237,7 @@ class SeedGroup:
 
     def _update(
         self, stack: Stack, minibatches: Sequence[Data], errors: dict[Learner, FloatingPointError]
-    ) -> dict[str, Tensor]:
+    ) -> TensorsByName:
         """Take a gradient step of a stack; return what was measured, [seeds] each, and add to the learners' errors."""
         needs_weights = stack.learners[0].needs_weights
         batch = {key: torch.stack([each[key] for each in minibatches]) for key in minibatches[0]}
@@ -256,7 +256,7 @@ class SeedGroup:
             stack.read_others()
         return {key: value for key, value in measured.items() if value.ndim == 1}
 
-    def _step(self, stack: Stack, batch: dict[Any, Tensor]) -> dict[str, Tensor]:
+    def _step(self, stack: Stack, batch: Items) -> TensorsByName:
         """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents say so."""
         first = stack.learners[0]
         usual = batch["action"].shape[1] == first.minibatch_size
@@ -264,7 +264,7 @@ class SeedGroup:
         return function(first, stack.state, batch)
 
 
-Outputs = Callable[..., dict[str, Tensor]]
+Outputs = Callable[..., TensorsByName]
 """A graph of operations on the tensors of a `Stack`, compiled or not, that acts."""
 
 CACHED_BYTES = 2**23
@@ -307,7 +307,7 @@ def clear(learner: Learner) -> None:
         parameter.zero_()
 
 
-def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
+def sampled(outputs: Mapping[str, Tensor], noise: Tensor) -> TensorsByName:
     """Draw actions from categorical distributions, as `torch.multinomial` draws one of each row.
 
     Args:

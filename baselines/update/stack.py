@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict.nn import TensorDictParams
@@ -12,12 +12,12 @@ from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.optimiser import Parts, parts_of
 from baselines.update.update import UpdateState, over_seeds, stacked, unstacked
 
 
-def named_tensors(learner: Learner) -> dict[str, Tensor]:
+def named_tensors(learner: Learner) -> TensorsByName:
     """Return a learner's parameters and buffers by name, in an order that depends only on its structure."""
     found = {}
     for path, module in learner.named_modules():
@@ -51,9 +51,9 @@ class Stack:
         self.weights = [names[id(tensor)] for tensor in first.weights]
         self.trained = [names[id(tensor)] for tensor in first.trainable]
         self.learned = {*self.weights, *self.trained}
-        self.kept: dict[str, Tensor] = {}
-        self.moments: list[dict[str, Tensor]] = [{} for _ in self.trained]
-        self.others: dict[str, Tensor] = {}
+        self.kept: TensorsByName = {}
+        self.moments: list[TensorsByName] = [{} for _ in self.trained]
+        self.others: TensorsByName = {}
         self.read()
         for name in self.learned:
             self.kept[name].requires_grad_()
@@ -90,7 +90,7 @@ class Stack:
                 values = [value] * len(states) if key == "step" else list(unstacked(value).unbind())
                 torch._foreach_copy_([state[key] for state in states], values)
 
-    def _states(self) -> list[list[dict[str, Tensor]]]:
+    def _states(self) -> list[list[TensorsByName]]:
         """Return the optimisers' states of each trained parameter, one of each learner."""
         parts = [cast(Parts, parts_of(learner.optimiser)) for learner in self.learners]
         return [list(states) for states in zip(*(each.state for each in parts), strict=True)]
@@ -110,26 +110,26 @@ class Stack:
             others=self.others,
         )
 
-    def _named(self, kept: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _named(self, kept: TensorsByName) -> TensorsByName:
         return {name: kept[first] for name, first in self.first_name.items()}
 
-    def outputs(self, data: dict[Any, Tensor]) -> dict[str, Tensor]:
+    def outputs(self, data: Items) -> TensorsByName:
         """Compute the outputs of all networks for one step of all rows, [seeds, num_envs, n] each."""
         return over_seeds(self.learners[0], _outputs, self.state, data)
 
-    def one_step(self, data: dict[Any, Tensor]) -> dict[Any, Tensor]:
+    def one_step(self, data: Items) -> Items:
         """Compute `Learner.one_step` of all learners, [seeds, num_envs, ...] each."""
         return over_seeds(self.learners[0], _one_step, self.state, data)
 
-    def acting_inputs(self, data: dict[Any, Tensor]) -> list[Tensor]:
+    def acting_inputs(self, data: Items) -> list[Tensor]:
         """Return the tensors that `outputs` reads, in one order."""
         return [*(tensor.detach() for tensor in self.kept.values()), *data.values()]
 
-    def traced_outputs(self, data: dict[Any, Tensor]) -> GraphModule:
+    def traced_outputs(self, data: Items) -> GraphModule:
         """Return `outputs` as a graph of operations, a function of `acting_inputs`."""
         state = self.state
 
-        def outputs(*given: Tensor) -> dict[str, Tensor]:
+        def outputs(*given: Tensor) -> TensorsByName:
             left = iter(given)
             kept = {name: next(left) for name in self.kept}
             its = {key: next(left) for key in data}
@@ -138,7 +138,7 @@ class Stack:
         return make_fx(outputs, tracing_mode="fake")(*self.acting_inputs(data))
 
 
-def _keep(kept: dict[str, Tensor], name: str, value: Tensor) -> None:
+def _keep(kept: TensorsByName, name: str, value: Tensor) -> None:
     """Write a value into the tensor of a name, which the first call makes."""
     if name in kept:
         kept[name].copy_(value)
@@ -146,9 +146,9 @@ def _keep(kept: dict[str, Tensor], name: str, value: Tensor) -> None:
         kept[name] = value
 
 
-def _outputs(learner: Learner, weights: Sequence[Tensor], data: Data) -> dict[str, Tensor]:
+def _outputs(learner: Learner, weights: Sequence[Tensor], data: Data) -> TensorsByName:
     return learner.outputs(data)
 
 
-def _one_step(learner: Learner, weights: Sequence[Tensor], data: Data) -> dict[Any, Tensor]:
+def _one_step(learner: Learner, weights: Sequence[Tensor], data: Data) -> Items:
     return learner.one_step(data)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, vmap
 
-from baselines.parts.networks import Data
+from baselines.parts.networks import Data, TensorsByName
 from baselines.update.optimiser import Parts, step
 
 if TYPE_CHECKING:
@@ -38,10 +38,10 @@ class UpdateState(NamedTuple):
     """Of several seeds what `Learner.other_weights` returns, [seeds, ...] each."""
 
 
-Update = Callable[["Learner", UpdateState, Data], dict[str, Tensor]]
+Update = Callable[["Learner", UpdateState, Data], TensorsByName]
 
 
-def update(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
+def update(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Minimise the sum of the losses of a batch by one step; return losses and gradient norm.
 
     It has no branch on data and depends only on its arguments. With several seeds these are minibatches [seeds, items,
@@ -59,7 +59,7 @@ def update(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tenso
     return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm}
 
 
-def losses_of(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Tensor]:
+def losses_of(learner: Learner, state: UpdateState, batch: Data) -> TensorsByName:
     """Compute the agent's losses and the method's penalties, of each seed where there are several."""
     if state.tensors is None:
         return learner.losses(batch, state.weights)
@@ -69,7 +69,7 @@ def losses_of(learner: Learner, state: UpdateState, batch: Data) -> dict[str, Te
 def over_seeds(learner: Learner, function: Callable[..., Any], state: UpdateState, *given: Any) -> Any:
     """Compute a function of a learner, its weights and further tensors for each seed."""
 
-    def of_one(tensors: dict[str, Tensor], *its: Any) -> Any:
+    def of_one(tensors: TensorsByName, *its: Any) -> Any:
         return _with(learner, tensors, function, state, *its)
 
     return vmap(of_one)(_seen(state), *given)
@@ -83,17 +83,17 @@ def with_tensors(learner: Learner, state: UpdateState, function: Callable[..., A
 
 
 def _with(
-    learner: Learner, tensors: dict[str, Tensor], function: Callable[..., Any], state: UpdateState, *given: Any
+    learner: Learner, tensors: TensorsByName, function: Callable[..., Any], state: UpdateState, *given: Any
 ) -> Any:
     weights = [tensors[name] for name in state.names]
     return functional_call(learner, tensors, (function, weights, *given), tie_weights=False)
 
 
-def _losses(learner: Learner, weights: Sequence[Tensor], batch: Data, others: Data) -> dict[str, Tensor]:
+def _losses(learner: Learner, weights: Sequence[Tensor], batch: Data, others: Data) -> TensorsByName:
     return learner.losses(batch, weights, others)
 
 
-def _seen(state: UpdateState) -> dict[str, Tensor]:
+def _seen(state: UpdateState) -> TensorsByName:
     """Return the tensors of several seeds as the networks see them."""
     tensors = state.tensors or {}
     return {name: value.mT if name in state.turned else value for name, value in tensors.items()}

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import Rule, did_you_mean, is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, did_you_mean, is_int, is_real, is_shallow, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import named, yaml_value
 from ctgraph_rl.tasks.protocol import Protocol
@@ -51,7 +51,7 @@ MOST_BYTES = 2**16
 
 MAX_NESTING = 4
 
-EXAMPLE: Mapping[str, Any] = yaml.safe_load(TEMPLATE)
+EXAMPLE: ReadOnlyValues = yaml.safe_load(TEMPLATE)
 
 ENTRY_POINT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 COMMIT = re.compile(r"[0-9a-f]{7,40}")
@@ -64,7 +64,7 @@ OURS = "ctgraph_rl"
 ADDRESS = re.compile(r"https?://\S+")
 
 
-def read_method(path: Path) -> dict[str, Any]:
+def read_method(path: Path) -> NamedValues:
     """Read a ``method.yaml``.
 
     Raises:
@@ -80,7 +80,7 @@ def read_method(path: Path) -> dict[str, Any]:
     return dict(method)
 
 
-def track_version(method: Mapping[str, Any]) -> Any:
+def track_version(method: ReadOnlyValues) -> Any:
     """Return the version of the track that a method was submitted to."""
     return method.get("track_version", 1)
 
@@ -98,7 +98,7 @@ def check_method(method: Any) -> None:
     require(*_rules(method))
 
 
-def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str) -> list[Rule]:
+def _key_rules(given: ReadOnlyValues, example: ReadOnlyValues, prefix: str) -> list[Rule]:
     """Return the rules that an object has the keys of another one, and so have its parts."""
     rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
     known = [*example, *(() if prefix else WRITTEN)]
@@ -111,7 +111,7 @@ def _key_rules(given: Mapping[str, Any], example: Mapping[str, Any], prefix: str
     return rules
 
 
-def _rules(method: Mapping[str, Any]) -> list[Rule]:
+def _rules(method: ReadOnlyValues) -> list[Rule]:
     """Return the rules for the values of an object with the right keys."""
     code, tuning, compute = (method[key] for key in ("code", "tuning", "compute"))
     authors = method["authors"]
@@ -172,7 +172,7 @@ def _count_rule(name: str, value: object, or_null: bool = False) -> Rule:
     return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
 
-def completed(method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> NamedValues:
     """Return a method with what is null in it as the runs say it.
 
     Args:
@@ -186,7 +186,7 @@ def completed(method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]])
     return {**method, **filled}
 
 
-def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, dict[str, Any]]:
+def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
     """Return what the runs of a submission say of the method themselves.
 
     Args:
@@ -204,7 +204,7 @@ def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, dict[str, Any
 
 
 def fact_rules(
-    method: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]], runs: Sequence[Any], num_tasks: int
+    method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues], runs: Sequence[Any], num_tasks: int
 ) -> list[Rule]:
     """Return the rules that a method does not contradict its runs; what is null in it contradicts nothing.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl.board.method import fact_rules, facts_of, track_version
 from ctgraph_rl.board.rules import curriculum_rule, entry_rule, one_line, oracle_rule, seed_rules
@@ -27,7 +27,7 @@ from ctgraph_rl.board.submission import (
     experts_of,
     log_sum,
 )
-from ctgraph_rl.checks import Rule, is_real
+from ctgraph_rl.checks import ReadOnlyValues, Rule, is_real
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.log.escape import csv_text, listed
@@ -50,7 +50,7 @@ ROUNDING = 1e-9
 """Largest difference, as a share of the value, between what two kinds of machines compute from one log."""
 
 
-NO_ROW: Mapping[str, Any] = {}
+NO_ROW: ReadOnlyValues = {}
 
 
 class Check(NamedTuple):
@@ -275,7 +275,7 @@ def _of_evaluations(submission: Submission, logs: Sequence[RunLog]) -> list[Chec
     return wrong or [equal(EVALUATIONS, f"{len(expected)} rows", f"{len(expected)} rows")]
 
 
-def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str]:
+def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> tuple[str, str]:
     """Return in words what two rows have where they differ."""
     if not one or not other:
         return ("a row" if one else "no row"), ("a row" if other else "no row")

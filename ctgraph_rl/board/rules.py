@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from ctgraph_rl.board.tracks import Track
-from ctgraph_rl.checks import Rule
+from ctgraph_rl.checks import ReadOnlyValues, Rule
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.log.provenance import NUMBERS, code_changes
@@ -122,7 +122,7 @@ def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
     yield not changed, f"the code has changed since the runs, {listed(changed)}: run again, or submit with that code"
 
 
-def _code_now(about: Mapping[str, Any]) -> dict[str, Any]:
+def _code_now(about: ReadOnlyValues) -> dict[str, Any]:
     """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
     stored = about.get("sources") or {}
     found = sources_of(name for name in stored if name not in SCRIPTS)
@@ -150,7 +150,7 @@ def failure_rules(runs: Sequence[Run], reasons: Mapping[int, str]) -> Iterator[R
     yield not without, f"failed has seeds {listed(without)}, of which there is no run: give their directories, too"
 
 
-def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
+def entry_rule(config: ReadOnlyValues, entry_point: str | None) -> Rule:
     """Return the rule that there is a way to run a configuration again."""
     agent = config.get("agent")
     is_built = isinstance(agent, Mapping) and "_target_" in agent
@@ -158,7 +158,7 @@ def entry_rule(config: Mapping[str, Any], entry_point: str | None) -> Rule:
     return is_built or entry_point is not None, f"no agent can be built from the configuration of the runs: {fix}"
 
 
-def oracle_rule(config: Mapping[str, Any]) -> Rule:
+def oracle_rule(config: ReadOnlyValues) -> Rule:
     """Return the rule that a method or detector of ours reads no more of the tasks than the learner is given.
 
     A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.

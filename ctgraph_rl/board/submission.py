@@ -25,7 +25,7 @@ from typing import Any
 
 from ctgraph_rl.board.method import read_method
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import is_int, is_shallow, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_shallow, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import csv_text, from_csv
 from ctgraph_rl.log.files import CURRICULUM
@@ -149,8 +149,8 @@ class Submission:
     """
 
     path: Path
-    method: Mapping[str, Any]
-    config: Mapping[str, Any]
+    method: ReadOnlyValues
+    config: ReadOnlyValues
     versions: Mapping[str, str]
     scored_on: str
     curriculum: Curriculum
@@ -294,7 +294,7 @@ def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
         ),
         (is_time, f"{place}: seconds must be a number in 0..{MOST_SECONDS:,.0f}, got {row['seconds']!r:.80}"),
     )
-    values: dict[str, Any] = {**row, "agent_bytes": None}
+    values: NamedValues = {**row, "agent_bytes": None}
     values |= {key: int(value) for key, value in whole.items() if key in row}
     return SubmittedRun(**values | {"group": tuple(map(int, group)), "seconds": float(row["seconds"])})
 
@@ -305,7 +305,7 @@ def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str], most: int)
         return csv_rows(read_regular(path, MOST_BYTES_OF_A_TABLE), list(columns), key, most, from_csv)
 
 
-def _config(path: Path) -> dict[str, Any]:
+def _config(path: Path) -> NamedValues:
     """Return the configuration of all runs."""
     with named(path):
         config = yaml_value(read_regular(path, MOST_BYTES_OF_A_CONFIGURATION))
@@ -346,7 +346,7 @@ def log_name(run: str, expert: int | None = None) -> str:
     return f"{LOGS}/{run}{'' if expert is None else f'.expert_{expert}'}.jsonl.gz"
 
 
-def experts_of(log: RunLog) -> list[dict[str, Any]]:
+def experts_of(log: RunLog) -> list[NamedValues]:
     """Return what a log says of single-task experts, in the order of tasks; empty without any."""
     said = [each for line in log.of_kind("experts") for each in line.get("experts", ())]
     numbered = all(isinstance(each, dict) and is_int(each.get("task"), 1) for each in said)
@@ -383,7 +383,7 @@ def log_sum(log: RunLog) -> str:
     return found.hexdigest()
 
 
-def counted(measurement: Mapping[str, Any]) -> dict[str, Any]:
+def counted(measurement: ReadOnlyValues) -> NamedValues:
     """Return what of a measurement counts in the sum of a log."""
     kept = without_time(measurement)
     if kept["kind"] != "run":

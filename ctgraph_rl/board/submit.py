@@ -38,7 +38,7 @@ from ctgraph_rl.board.submission import (
     versions_text,
 )
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import Rule, require
+from ctgraph_rl.checks import ReadOnlyValues, Rule, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
@@ -57,9 +57,9 @@ from ctgraph_rl.tasks.curriculum_json import file_text
 def submit(
     paths: Sequence[Path],
     to: Path,
-    method: Mapping[str, Any],
+    method: ReadOnlyValues,
     of_track: Track | None = None,
-    only: Mapping[str, Any] | None = None,
+    only: ReadOnlyValues | None = None,
 ) -> Submission:
     """Make a submission of runs.
 
@@ -97,7 +97,7 @@ def submit(
     return read_submission(to, of_track)
 
 
-def _found(paths: Sequence[Path], only: Mapping[str, Any]) -> list[Run]:
+def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     """Return the runs that have some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
     require(*((False, problem.reason) for problem in problems))
@@ -108,7 +108,7 @@ def _found(paths: Sequence[Path], only: Mapping[str, Any]) -> list[Run]:
     return sorted(chosen, key=lambda run: run.seed)
 
 
-def _checked(runs: list[Run], method: Mapping[str, Any], of_track: Track | None) -> tuple[list[Run], Curriculum]:
+def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) -> tuple[list[Run], Curriculum]:
     """Return the runs, and what they learned; refuse what cannot be submitted."""
     seeds = [run.seed for run in runs]
     rules = [*same_rules(runs), *code_rules(runs), *failure_rules(runs, method["failed"])]
@@ -181,7 +181,7 @@ def _write(
     folder: Path,
     runs: Sequence[Run],
     lines: Sequence[SubmittedRun],
-    method: Mapping[str, Any],
+    method: ReadOnlyValues,
     *,
     curriculum: Curriculum,
 ) -> None:
@@ -207,7 +207,7 @@ def _write(
     write_whole(folder / files.METRICS, metrics_text(found))
 
 
-def _yaml(content: Mapping[str, Any]) -> str:
+def _yaml(content: ReadOnlyValues) -> str:
     """Return plain values as YAML."""
     return yaml.dump(dict(content), Dumper=_WithoutAliases, sort_keys=False, allow_unicode=True, width=120)
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.disk import write_whole
 from ctgraph_rl.learn.messages import DELAYED, DELIVERED, DROPPED, REFUSED, SENT
 from ctgraph_rl.log.escape import csv_text
@@ -63,11 +63,11 @@ class Collective:
     """
 
     path: Path
-    about: Mapping[str, Any]
-    config: Mapping[str, Any]
+    about: ReadOnlyValues
+    config: ReadOnlyValues
     learned: Sequence[Learned]
-    messages: Sequence[Mapping[str, Any]]
-    helps: Sequence[Mapping[str, Any]]
+    messages: Sequence[ReadOnlyValues]
+    helps: Sequence[ReadOnlyValues]
 
     @property
     def learning_time(self) -> float:
@@ -122,7 +122,7 @@ def read_collective(path: Path | str) -> Collective:
     return Collective(path, run, config, learned, messages=log.of_kind("exchange"), helps=log.of_kind("help"))
 
 
-def _learned(path: Path, number: int, about: Mapping[str, Any]) -> Iterator[Learned]:
+def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned]:
     """Yield what a member learned in each of its blocks."""
     log = RunLog.read(member_folder(path, number) / LOG)
     trained = log.of_kind("run")[0]["trained"]

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import at_least_one, require, require_all, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, at_least_one, require, require_all, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.lifelong import OfferCheckpoint
 from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, SavedState, run_loop, saved_state_fits
@@ -48,7 +48,7 @@ class ExchangeLike(Protocol):
     kinds: Mapping[str, Fields]
     """The kinds of messages in the order in which they are sent within an exchange, each with its fields."""
 
-    def settings_of(self, member: int) -> Mapping[str, Any]:
+    def settings_of(self, member: int) -> ReadOnlyValues:
         """Return settings that only this member has, such as ``{"agent.learning_rate": 0.01}``; none: those of all."""
         ...
 
@@ -72,11 +72,11 @@ class ExchangeLike(Protocol):
         """Let a member use the messages of the last kind; return what it has taken over."""
         ...
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return what a resumed run needs, as tensors and plain Python values."""
         ...
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         ...
 
@@ -110,7 +110,7 @@ def learn_collective(
     progress: Progress | None = None,
     *,
     device: torch.device | str = "cpu",
-    saved: Mapping[str, Any] | None = None,
+    saved: ReadOnlyValues | None = None,
     checkpoint: OfferCheckpoint | None = None,
 ) -> RunLog:
     """Let the members of a collective learn in lock-step, a batch each in turn, with messages between batches.
@@ -220,7 +220,7 @@ class _Learner:
         self.has_learned = self.has_learned or not self.is_done
         return not self.is_done
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> NamedValues:
         """Return all that the rest of this member's run depends on; only a collective can resume it."""
         if self.has_learned:
             with self.drawing():
@@ -247,7 +247,7 @@ class _Collective:
         self.advanced: list[_Learner] = []
         """Those that have learned in this round."""
 
-    def start(self, device: torch.device, saved: Mapping[str, Any] | None) -> None:
+    def start(self, device: torch.device, saved: ReadOnlyValues | None) -> None:
         """Let all members begin, or go back to a saved state."""
         states: Sequence[Any] = [None] * len(self.members) if saved is None else saved["members"]
         count = f"the saved state has {len(states)} members, there are {len(self.members)}; start again"
@@ -340,7 +340,7 @@ class _Collective:
         frames = self.learners[number].steps.frames
         return {"block": self.members[number].curriculum.block_at(frames), "frames": frames}
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> NamedValues:
         """Return all that the rest of the run depends on, as tensors and plain values."""
         return {
             "frames": self.frames,

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import require, takes_numbers
+from ctgraph_rl.checks import NamedValues, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.core.dynamics import OUTCOME_FAIL, OUTCOME_GOAL
 from ctgraph_rl.env import CTGraphEnv
@@ -223,7 +223,7 @@ EPISODE_KEYS = ("episode_reward", "outcome", "step_count")
 """What `episode_means` reads."""
 
 
-def episode_means(ends: TensorDictBase) -> dict[str, Any]:
+def episode_means(ends: TensorDictBase) -> NamedValues:
     """Return the number of finished episodes, their mean return and length, and the shares at the goal and at any end.
 
     Means are NaN without an episode. Shares are NaN for tasks other than CT-graphs.
@@ -241,7 +241,7 @@ def episode_means(ends: TensorDictBase) -> dict[str, Any]:
     }
 
 
-def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[dict[str, Any]]:
+def adaptation(rows: TensorDictBase, task: TaskLike) -> Iterator[NamedValues]:
     """Yield the means over rows of their first episodes, of their second ones, and so on.
 
     ``found_rate`` is the share of rows that have reached the goal by then, and ``exact_rate`` the success rate of the

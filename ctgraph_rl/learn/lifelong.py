@@ -9,14 +9,14 @@ from typing import Any
 import torch
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import takes_numbers
+from ctgraph_rl.checks import NamedValues, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-OfferCheckpoint = Callable[[Callable[[], dict[str, Any]], bool], object]
+OfferCheckpoint = Callable[[Callable[[], NamedValues], bool], object]
 """Takes a function that makes the run's state, and whether a block ends here; saves the state if it is time."""
 
 
@@ -70,7 +70,7 @@ def learn_curriculum(
     states = None if saved is None else [saved]
     members = Lockstep(curriculum, Alone(agent), [seed], [log], device=device, saved=states)
 
-    def offer(make_states: Callable[[], list[dict[str, Any]]], at_block_end: bool) -> None:
+    def offer(make_states: Callable[[], list[NamedValues]], at_block_end: bool) -> None:
         if checkpoint is not None:
             checkpoint(lambda: make_states()[0], at_block_end)
 

@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.learn.collect import Policy, make_env
 from ctgraph_rl.learn.evaluate import Evaluator
 from ctgraph_rl.learn.rules import check_adaptation, check_env, check_ids, check_rows, resumes
@@ -293,7 +294,7 @@ class Lockstep:
                 continue
             self.returns.append(log_training(self.logs[number], self.curriculum, parts[number], start, measurements))
 
-    def state(self) -> list[dict[str, Any]]:
+    def state(self) -> list[NamedValues]:
         """Return all that the rest of each member's run depends on, as tensors and plain values."""
         assert self._carried is not None, "nothing was learned yet"
         count = len(self.logs)
@@ -331,7 +332,7 @@ class Lockstep:
         for number, state in enumerate(saved):
             self._set_random_state(number, state)
 
-    def _random_state(self, number: int) -> dict[str, Any]:
+    def _random_state(self, number: int) -> NamedValues:
         """Return the state of what an agent draws from."""
         device = self.env.device
         if self.group.generators is not None:
@@ -382,18 +383,18 @@ def _finite(measured: dict[str, float] | FloatingPointError) -> dict[str, float]
     return measured
 
 
-def _divided(state: dict[str, Any], count: int) -> list[dict[str, Any]]:
+def _divided(state: NamedValues, count: int) -> list[NamedValues]:
     """Return the state of an environment's rows for each member."""
     if count == 1:
         return [state]
-    parts: list[dict[str, Any]] = [{} for _ in range(count)]
+    parts: list[NamedValues] = [{} for _ in range(count)]
     for key, value in state.items():
         for part, of_part in zip(parts, value.chunk(count), strict=True):
             part[key] = of_part.clone()
     return parts
 
 
-def _joined(states: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _joined(states: Sequence[NamedValues]) -> NamedValues:
     """Return the state of an environment with the rows of all members."""
     if len(states) == 1:
         return states[0]

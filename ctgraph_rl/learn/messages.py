@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import LARGEST_INT, fraction, is_int, is_real, require
+from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, fraction, is_int, is_real, require
 
 BYTES_OF_A_NUMBER = 8
 
@@ -37,7 +37,7 @@ class Message:
     kind: str
     sender: int
     receiver: int
-    content: Mapping[str, Any]
+    content: ReadOnlyValues
 
     @property
     def num_bytes(self) -> int:
@@ -176,20 +176,20 @@ class Mail:
         self.here = others
         return good, refused
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return the random stream and the late messages, as tensors and plain values."""
         return {"random": self.generator.get_state(), "late": list(map(_as_plain, self.late))}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state["random"])
         self.late = [Message(**message) for message in state["late"]]
 
 
-def _as_plain(message: Message) -> dict[str, Any]:
+def _as_plain(message: Message) -> NamedValues:
     return {**vars(message), "content": dict(message.content)}
 
 
-def to_all(kind: str, sender: int, num_members: int, content: Mapping[str, Any]) -> list[Message]:
+def to_all(kind: str, sender: int, num_members: int, content: ReadOnlyValues) -> list[Message]:
     """Return a message to every other learner."""
     return [Message(kind, sender, other, content) for other in range(num_members) if other != sender]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from ctgraph_rl.checks import LARGEST_INT, is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, is_int, is_real, is_shallow, require
 from ctgraph_rl.strict import MAX_NESTING, json_value
 
 MOST = 10**6
@@ -96,7 +96,7 @@ NEEDED = {
 """Fields of the kinds that tables are made of."""
 
 
-def parsed(line: bytes) -> dict[str, Any]:
+def parsed(line: bytes) -> NamedValues:
     """The object of a line.
 
     Raises:
@@ -108,7 +108,7 @@ def parsed(line: bytes) -> dict[str, Any]:
     return measurement
 
 
-def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
+def check(measurement: ReadOnlyValues, most: int = MOST) -> None:
     """Refuse a measurement that this package did not write.
 
     Args:
@@ -140,7 +140,7 @@ def check(measurement: Mapping[str, Any], most: int = MOST) -> None:
     require((highest <= most, rule))
 
 
-def without_time(measurement: Mapping[str, Any]) -> dict[str, Any]:
+def without_time(measurement: ReadOnlyValues) -> NamedValues:
     """Return a measurement without its time, and without the directories of experts: equal in equal runs."""
     kept = {key: value for key, value in measurement.items() if key != "seconds"}
     if isinstance(kept.get("experts"), list):
@@ -153,7 +153,7 @@ def _without_place(expert: Any) -> Any:
     return {key: value for key, value in expert.items() if key != "run"} if isinstance(expert, dict) else expert
 
 
-def _numbers(measurement: Mapping[str, Any]) -> Iterator[int]:
+def _numbers(measurement: ReadOnlyValues) -> Iterator[int]:
     """Yield the numbers of blocks, tasks and episodes of a row."""
     yield from (measurement[name] for name in ("block", "task", "step") if name in measurement)
     for block in measurement.get("trained", ()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch
 import torchrl
 
 from ctgraph_rl import __version__
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.log.run_log import SCHEMA
 from ctgraph_rl.log.sources import full_name, is_ours, sources_of, targets
 from ctgraph_rl.packages import is_published
@@ -45,7 +46,7 @@ def named(curriculum: Curriculum) -> Curriculum:
     return replace(curriculum, name=f"{curriculum.name} (modified)") if modified else curriculum
 
 
-def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict[str, Any]:
+def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
     """Return curriculum, code, versions and machine as plain values for JSON. Tasks are counted from 1.
 
     Args:
@@ -65,7 +66,7 @@ def provenance(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict
     }
 
 
-def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict[str, Any]:
+def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> NamedValues:
     """Return what decides the numbers of a run beside its configuration, as plain values for JSON.
 
     Args:
@@ -77,7 +78,7 @@ def code(curriculum: Curriculum, names: Iterable[str] | None = ()) -> dict[str, 
     return {"fingerprint": curriculum.fingerprint, "numbers": NUMBERS, "sources": known}
 
 
-def learners(config: Mapping[str, Any] | None, agent: object) -> list[str]:
+def learners(config: ReadOnlyValues | None, agent: object) -> list[str]:
     """Return the classes and functions that learn in a run: those of its configuration, or else the agent's parts.
 
     The curriculum of a configuration is left out: what it is says its fingerprint, however it was made.
@@ -102,7 +103,7 @@ def _parts(value: Any) -> Iterator[str]:
             yield from _parts(item)
 
 
-def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def code_changes(before: ReadOnlyValues, now: ReadOnlyValues) -> list[str]:
     """Return in words what differs in the `code` of two runs; what one of them does not know does not differ.
 
     Args:
@@ -125,18 +126,18 @@ def code_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     return changed
 
 
-def is_unknown(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+def is_unknown(before: ReadOnlyValues, now: ReadOnlyValues) -> bool:
     """Return whether a run does not say of which source it is where that counts now."""
     stored = before.get("sources")
     return bool(now["sources"]) and (stored is None or None in stored.values())
 
 
-def numbers_of(about: Mapping[str, Any]) -> int:
+def numbers_of(about: ReadOnlyValues) -> int:
     """Return the numbers version that this package gives a run, by the first line of its log."""
     return NUMBERS_TOGETHER if about.get("together") else NUMBERS
 
 
-def machine() -> dict[str, Any]:
+def machine() -> NamedValues:
     """Return what besides versions decides the bits of a run on a CPU: its kind and the number of threads.
 
     The kind is such as ``x86_64 AVX512``, or ``x86_64 portable`` for any CPU of `ctgraph_rl.portable`.

@@ -37,7 +37,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_path, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_path, require
 from ctgraph_rl.disk import cannot_write, open_own, read_regular, write_whole
 from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.measurement import check, parsed
@@ -76,10 +76,10 @@ class RunLog:
     """
 
     def __init__(self, path: Path | str | None = None) -> None:
-        self.measurements: list[dict[str, Any]] = []
+        self.measurements: list[NamedValues] = []
         self.torn_lines = 0
         self._num_bytes = MOST_BYTES  # of the file that was read
-        self.listeners: list[Callable[[dict[str, Any]], object]] = []
+        self.listeners: list[Callable[[NamedValues], object]] = []
         self._start = time.perf_counter()
         self._path = None if path is None else as_path("path", path)
         self._place = None if self._path is None else self._path.absolute()  # a program may change its directory
@@ -93,7 +93,7 @@ class RunLog:
         counts = f"{len(self.of_kind('training'))} training intervals, {len(self.of_kind('evaluation'))} evaluations"
         return f"<RunLog {run['curriculum']!s:.80}, seed {run['seed']}: {counts}>"
 
-    def _run(self) -> dict[str, Any]:
+    def _run(self) -> NamedValues:
         """Return curriculum, fingerprint and seed, None where the log does not say them."""
         about = (self.of_kind("run") or [{}])[0]
         seed = (about.get("config") or {}).get("seed")
@@ -227,7 +227,7 @@ class RunLog:
             require((schema <= SCHEMA, newer))
 
     @classmethod
-    def begun(cls, path: Path | str) -> dict[str, Any] | None:
+    def begun(cls, path: Path | str) -> NamedValues | None:
         """Return the first line of a run's log, None where it has none; what follows it may be anything."""
         try:
             first = parsed(read_regular(path, MOST_BYTES).partition(b"\n")[0])
@@ -245,11 +245,11 @@ class RunLog:
             return False
         return b"\n" not in content and BEGINNING.startswith(content[: len(BEGINNING)])
 
-    def of_kind(self, kind: str) -> list[dict[str, Any]]:
+    def of_kind(self, kind: str) -> list[NamedValues]:
         """Measurements of one kind, in order."""
         return [measurement for measurement in self.measurements if measurement["kind"] == kind]
 
-    def rows(self, kind: str) -> Iterator[dict[str, Any]]:
+    def rows(self, kind: str) -> Iterator[NamedValues]:
         """Yield the measurements of a kind, after the curriculum, the fingerprint and the seed of the run."""
         run = self._run()
         for measurement in self.of_kind(kind):
@@ -324,7 +324,7 @@ class RunLog:
         Raises:
             ValueError: if tasks differ in the number of episodes.
         """
-        rows: dict[tuple[int, int], list[dict[str, Any]]] = {}
+        rows: dict[tuple[int, int], list[NamedValues]] = {}
         for m in self.of_kind("adaptation"):
             if bool(m.get("held_out")) == held_out:
                 rows.setdefault((m["frames"], m["task"]), []).append(m)
@@ -392,7 +392,7 @@ class RunLog:
 
     def _stays(self, tasks: Sequence[int]) -> Iterator[tuple[int, bool, list[float | None]]]:
         """Yield the number of the task, whether it is trained and the returns of each regime of a run."""
-        at_end: dict[int, list[dict[str, Any]]] = {}
+        at_end: dict[int, list[NamedValues]] = {}
         for m in self._evaluations(during=False):
             at_end.setdefault(m["block"], []).append(m)
         returns = self.training_by_block("return_mean")
@@ -416,7 +416,7 @@ class RunLog:
                 return [[number - 1 for number in block] for block in run["trained"]]
         return []
 
-    def _evaluations(self, during: bool) -> list[dict[str, Any]]:
+    def _evaluations(self, during: bool) -> list[NamedValues]:
         """Evaluations of the curriculum's own tasks."""
         own = [m for m in self.of_kind("evaluation") if not m.get("held_out")]
         return own if during else [m for m in own if m.get("moment") != "during"]
@@ -433,7 +433,7 @@ class RunLog:
         return torch.stack([_row([row.get(task) for task in tasks]) for row in rows])
 
 
-def label_of(evaluation: Mapping[str, Any]) -> str:
+def label_of(evaluation: ReadOnlyValues) -> str:
     """Return the name of the task of an evaluation: its label, or its number where it has none."""
     return str(evaluation.get("label", f"task {evaluation['task']}"))
 
@@ -460,7 +460,7 @@ def write_performance(path: Path | str, log: RunLog, labels: Iterable[str]) -> N
     write_whole(path, csv_text(lines, "\r\n"))
 
 
-def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
+def write_metrics(path: Path | str, metrics: ReadOnlyValues) -> None:
     """Write metrics as JSON: for each name the value, its definition, formula and source, or why it is undefined.
 
     One run is one seed, and has no interval; `ctgraph_rl.report.results` has those of several.
@@ -468,7 +468,7 @@ def write_metrics(path: Path | str, metrics: Mapping[str, Any]) -> None:
     write_whole(path, metrics_text(metrics))
 
 
-def metrics_text(metrics: Mapping[str, Any]) -> bytes:
+def metrics_text(metrics: ReadOnlyValues) -> bytes:
     """Return the content of a file of metrics."""
     content = {name: {**vars(metric), "n_seeds": 1, "interval": None} for name, metric in metrics.items()}
     return (json.dumps(content, indent=2) + "\n").encode()

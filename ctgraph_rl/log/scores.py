@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl import metrics
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.metrics import Curves, Metric, Undefined
 from ctgraph_rl.metrics.adaptation import Adaptation
@@ -61,7 +61,7 @@ def scores(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None
     return metrics.of_inputs(inputs_of(log, curriculum, experts))
 
 
-def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> dict[str, Any]:
+def inputs_of(log: RunLog, curriculum: Curriculum, experts: Sequence[RunLog] | None) -> NamedValues:
     """Return all of `ctgraph_rl.metrics.inputs.INPUTS`, `Undefined` in place of what this run does not give."""
     tasks = curriculum.tasks
     count, best = len(tasks), optimal_values(tasks)
@@ -95,7 +95,7 @@ OF_GRAPHS = (
 """Inputs that only CT-graphs have."""
 
 
-def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> dict[str, Any]:
+def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> NamedValues:
     """Return the inputs that only CT-graphs have, all but those of first blocks."""
     if not are_graphs(tasks):
         return dict.fromkeys(OF_GRAPHS, Undefined(f"it is known of CT-graphs alone, and tasks are of {_kind(tasks)}"))
@@ -245,7 +245,7 @@ def _labelling(log: RunLog, curriculum: Curriculum) -> Labelling | Undefined:
     )
 
 
-def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
+def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
     """Return the intervals of each task in the block that trains it first, which must train no other."""
     blocks = curriculum.trained
     firsts: dict[int, int] = {}
@@ -274,7 +274,7 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> dict[str, Any]:
 
 def _regimes(
     log: RunLog, curriculum: Curriculum, best: Tensor | Undefined, experts: Sequence[RunLog] | None
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return the run and its experts as the lifelong metrics see them."""
     lowest = lowest_returns(curriculum.tasks)
     for each in (best, lowest):
@@ -300,9 +300,7 @@ def _returns(expert: RunLog) -> Tensor:
     return returns[~returns.isnan()]
 
 
-def _areas(
-    curves: Curves, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool
-) -> dict[str, Any]:
+def _areas(curves: Curves, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool) -> NamedValues:
     """Return areas under curves for forward transfer; its definitions are of performance whose best is 1."""
     kind = "trapezoid_areas" if trapezoids else "areas"
     try:

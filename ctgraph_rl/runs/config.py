@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.basecontainer import BaseContainer
 from omegaconf.errors import OmegaConfBaseException
 
-from ctgraph_rl.checks import Function, Rule, did_you_mean, is_int, nearest, positive, require
+from ctgraph_rl.checks import Function, NamedValues, Rule, did_you_mean, is_int, nearest, positive, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.packages import check_packages, conf_dir, curriculum_named, importing_from_here
 from ctgraph_rl.portable import check_portable
@@ -86,7 +86,7 @@ _NO_SETTINGS = {"_target_", "hydra"}
 _PACKAGE = re.compile(r"(?:_target_|path): ['\"]?(\w+)")  # of a target, or of a class that hydra.utils.get_class gets
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
+def plain(cfg: DictConfig) -> NamedValues:
     """Return the configuration as plain values, without Hydra's own and what does not change results."""
     kept = [str(key) for key in cfg if key != "hydra" and key not in NOT_HASHED]
     return OmegaConf.to_container(OmegaConf.masked_copy(cfg, kept), resolve=True)  # type: ignore[return-value]
@@ -215,7 +215,7 @@ def check_overwrite(given: Any) -> Rule:
     return isinstance(given, bool) or given == STALE, f"overwrite must be true, false or {STALE}, got {given!r}"
 
 
-def changes_of(cfg: DictConfig, part: str) -> dict[str, Any]:
+def changes_of(cfg: DictConfig, part: str) -> NamedValues:
     """Return what ``evaluation`` or ``protocol`` of a configuration changes; null changes nothing.
 
     Raises:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.disk import made_folder
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.files import CHECKPOINTS, LOG, METRICS, locked
@@ -92,7 +92,7 @@ def find_or_train(
     curriculum: Curriculum,
     learn: Learn,
     folder: Path,
-    settings: Mapping[int, Mapping[str, Any]],
+    settings: Mapping[int, ReadOnlyValues],
     tell: Callable[[str], object],
     *,
     waiting: Callable[[], object] = lambda: None,
@@ -191,7 +191,7 @@ def _is_trained(run_dir: Path) -> bool:
     return (run_dir / METRICS).exists() and not damaged(run_dir)
 
 
-def directory_name(curriculum: Curriculum, settings: Mapping[str, Any]) -> str:
+def directory_name(curriculum: Curriculum, settings: ReadOnlyValues) -> str:
     """Return the hash of all that an expert's numbers depend on: 16 hexadecimal digits."""
     text = json.dumps([curriculum.fingerprint, settings], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

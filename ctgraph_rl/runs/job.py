@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import plain, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
 from ctgraph_rl.learn.rules import notes
@@ -128,12 +128,12 @@ class Job:
         return Console(quiet=True) if config.in_sweep() else None
 
     @property
-    def _of_experts(self) -> dict[str, Any]:
+    def _of_experts(self) -> NamedValues:
         """The settings that the run shares with its experts."""
         return {key: value for key, value in config.plain(self.cfg).items() if key in OF_AN_EXPERT}
 
     @property
-    def decides_experts(self) -> dict[str, Any]:
+    def decides_experts(self) -> NamedValues:
         """All that the numbers of the run's experts depend on, beside their curriculum."""
         settings = self._of_experts
         now = _code(self.curriculum, settings)
@@ -197,7 +197,7 @@ def make_agent(
     seed: int | None = None,
     *,
     method: str | None = None,
-    method_settings: Mapping[str, Any] | None = None,
+    method_settings: ReadOnlyValues | None = None,
     detector: str | None = None,
     device: torch.device | str | None = None,
     config_dir: Path | str | None = None,
@@ -330,7 +330,7 @@ def is_finished(cfg: DictConfig, run_dir: Path) -> bool:
     return finished
 
 
-def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]]) -> tuple[list[str], bool]:
+def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, NamedValues]) -> tuple[list[str], bool]:
     """Return in words what code has changed since a configuration was run in a directory, and whether some is unknown.
 
     A run that was stopped before its first checkpoint has nothing that a change could concern.
@@ -347,7 +347,7 @@ def changed_code(cfg: DictConfig, run_dir: Path, known: dict[str, dict[str, Any]
     return code_changes(about, now), is_unknown(about, now)
 
 
-def code_of(cfg: DictConfig, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def code_of(cfg: DictConfig, known: dict[str, NamedValues]) -> NamedValues:
     """Return what a run of a configuration would store of its code; see `ctgraph_rl.log.provenance.code`."""
     settings = config.plain(cfg)
     deciding = {key: settings.get(key) for key in ("curriculum", "method", "detector", *config.PARTS)}
@@ -359,11 +359,11 @@ def code_of(cfg: DictConfig, known: dict[str, dict[str, Any]]) -> dict[str, Any]
     return known[key]
 
 
-def _code(curriculum: Curriculum, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _code(curriculum: Curriculum, settings: ReadOnlyValues) -> NamedValues:
     return code(curriculum, learners(settings, None))
 
 
-def first_line(run_dir: Path) -> Mapping[str, Any] | None:
+def first_line(run_dir: Path) -> ReadOnlyValues | None:
     """Return the first line of the log of the run that a directory holds; None without a run.
 
     Raises:

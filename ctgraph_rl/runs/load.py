@@ -15,7 +15,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import as_path, is_int, require
+from ctgraph_rl.checks import ReadOnlyValues, as_path, is_int, require
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.labels import policies_by_label
 from ctgraph_rl.log.escape import terminal_text
@@ -123,7 +123,7 @@ def _curriculum(run_dir: Path, given: Curriculum | None, fingerprint: Any) -> Cu
 
 def _builder(
     run_dir: Path,
-    config: Mapping[str, Any],
+    config: ReadOnlyValues,
     make_agent: MakeAgent | None,
     make_method: Callable[[], MethodLike] | None,
     curriculum: Curriculum,
@@ -175,14 +175,14 @@ def _ours(run_dir: Path, part: str, settings: Any) -> Callable[..., Any]:
     return partial(kind, **_settings(run_dir, with_added(settings)))
 
 
-def _settings(run_dir: Path, stored: Mapping[str, Any]) -> dict[str, Any]:
+def _settings(run_dir: Path, stored: ReadOnlyValues) -> dict[str, Any]:
     """Return the settings of a class, with what builds its cell in place of the cell's settings."""
     given = {key: value for key, value in stored.items() if key not in ("_target_", "_partial_")}
     has_cell = isinstance(given.get("cell"), Mapping)
     return given | ({"cell": _ours(run_dir, "cell", given["cell"])} if has_cell else {})
 
 
-def _weights(run_dir: Path, log: RunLog) -> tuple[Mapping[str, Any], int]:
+def _weights(run_dir: Path, log: RunLog) -> tuple[ReadOnlyValues, int]:
     """Return the agent's state at the end of the run, or at its last checkpoint, and the frames by then."""
     if (run_dir / AGENT).exists():
         return _checked(run_dir / AGENT), log.ends()[-1]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.log.damage import metrics_of
@@ -82,12 +82,12 @@ class Run:
     """
 
     path: Path
-    about: Mapping[str, Any]
+    about: ReadOnlyValues
     agent: str | None
-    settings: Mapping[str, Any]
+    settings: ReadOnlyValues
     seed: int
     reason: str | None = None
-    metrics: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    metrics: Mapping[str, ReadOnlyValues] = field(default_factory=dict)
     success: Mapping[str, float | None] = field(default_factory=dict)
     returns: Mapping[str, float | None] = field(default_factory=dict)
     tasks: Sequence[str] = ()
@@ -106,7 +106,7 @@ class Run:
         return name.removesuffix(MODIFIED), fingerprint
 
     @property
-    def code(self) -> dict[str, Any]:
+    def code(self) -> NamedValues:
         """The numbers version of the package, and the digest of each module of the user; None where it is not known."""
         sources, learners = self.about.get("sources"), targets({**self.about["config"], "curriculum": None})
         unknown = {name.rpartition(".")[0]: None for name in learners if not is_ours(name)}
@@ -205,7 +205,7 @@ def read_run(path: Path) -> Run:
     )
 
 
-def _about(file: Path) -> dict[str, Any]:
+def _about(file: Path) -> NamedValues:
     """Return the first line of a log, which says what was run."""
     first, _, _ = read_regular(file, MOST_BYTES).partition(b"\n")
     try:
@@ -226,7 +226,7 @@ def _about(file: Path) -> dict[str, Any]:
     return {**about, "curriculum": str(about["curriculum"]), "fingerprint": str(about["fingerprint"])}
 
 
-def _agent(config: Mapping[str, Any]) -> str | None:
+def _agent(config: ReadOnlyValues) -> str | None:
     """Return agent, cell if not the usual one, method and detector, by their classes or the recorder's names."""
     learner = config.get("agent")
     agent = _called(learner) or _called(config.get("learner"))
@@ -242,7 +242,7 @@ def _called(part: Any) -> str | None:
     return part if isinstance(part, str) and part else None
 
 
-def _metrics(path: Path, log: RunLog) -> tuple[dict[str, Any], str | None]:
+def _metrics(path: Path, log: RunLog) -> tuple[NamedValues, str | None]:
     """Return the metrics of a finished run, or why there are none."""
     file = path / METRICS
     if not file.exists():

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FunctionType, TracebackType
 from typing import Any
 
 from torchrl.record.loggers.common import Logger
 
-from ctgraph_rl.checks import as_path, is_int, is_json_object, plain, require, takes_numbers, true_or_false
+from ctgraph_rl.checks import (
+    NamedValues,
+    ReadOnlyValues,
+    as_path,
+    is_int,
+    is_json_object,
+    plain,
+    require,
+    takes_numbers,
+    true_or_false,
+)
 from ctgraph_rl.disk import made_folder, sync_folders
 from ctgraph_rl.learn.adapt import adapt
 from ctgraph_rl.learn.collect import Policy, agent_specs
@@ -104,7 +114,7 @@ class Recorder:
         curriculum: Curriculum,
         run_dir: Path | str | None = None,
         seed: int = 0,
-        about: Mapping[str, Any] | None = None,
+        about: ReadOnlyValues | None = None,
         code: Sequence[type | FunctionType] | None = None,
         *,
         overwrite: bool = False,
@@ -130,7 +140,7 @@ class Recorder:
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum = curriculum
         self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)
-        self.saved: Mapping[str, Any] | None = None
+        self.saved: ReadOnlyValues | None = None
         self.frames = 0
         self.finished = False
         self._evaluated = -1
@@ -185,7 +195,7 @@ class Recorder:
         sync_folders(run_dir)
         return log
 
-    def _check_same(self, begun: Mapping[str, Any]) -> None:
+    def _check_same(self, begun: ReadOnlyValues) -> None:
         """Refuse to resume a run of another curriculum or of other settings; `resumed_log` knows of code."""
         before, now = (each.get("fingerprint") for each in (begun, self._about))
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
@@ -208,7 +218,7 @@ class Recorder:
         return log
 
     @takes_numbers
-    def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
+    def checkpoint(self, state: Callable[[], ReadOnlyValues], frames: int) -> None:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
 
         A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
@@ -234,7 +244,7 @@ class Recorder:
             (is_int(frames, least, last), f"frames must be an integer in {least}..{last}, got {frames!r}"),
         )
 
-        def make() -> dict[str, Any]:
+        def make() -> NamedValues:
             reached = {"frames": frames, "evaluated": self._evaluated, "trained": self._trained}
             return {**reached, "learner": dict(state()), "log": self.log.position()}
 
@@ -315,7 +325,7 @@ class Recorder:
         self.log.append("training", block=self.curriculum.block_at(frames), frames=frames, **{**common, **numbers})
 
     @property
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> NamedValues:
         """The metrics of the evaluations so far; what is missing makes them undefined, with the reason."""
         return dict(scores(self.log, self.curriculum))
 
@@ -333,7 +343,7 @@ class Recorder:
         if self._tracker is not None:
             self._tracker.close()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> NamedValues:
         """Return what a copy has; two recorders cannot write into one directory."""
         if self.run_dir is not None and not self.finished:
             raise TypeError(f"a Recorder that writes into {self.run_dir} has no copies; copy one without a run_dir")

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import LARGEST_INT, did_you_mean, require
+from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, did_you_mean, require
 from ctgraph_rl.packages import conf_dir
 
 SPECS = ("observation_spec", "action_spec", "folder")
@@ -34,7 +34,7 @@ WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
 
 POLICY_GRADIENT = ("a2c.A2C", "reinforce.Reinforce", "ppo.PPO", "ppo_count.PPOCount", "ppo_rnd.PPORND", *WITH_CELL[:2])
 
-ADDED: dict[str, dict[str, Any]] = {
+ADDED: dict[str, NamedValues] = {
     "run": {"portable": False, "protocol.guide_frames": None, "evaluation.adapt_episodes": None},
     **{f"baselines.{agent}": {"encoder": "mlp"} for agent in ("dqn.DQN", "mohqa.MOHQA")},
     **{f"baselines.{agent}": {"deduplicate": False, "encoder": "mlp"} for agent in POLICY_GRADIENT},
@@ -72,7 +72,7 @@ entry here, and then no earlier run is lost.
 _WITH_EXPONENT = re.compile(r"(?<![\w.])\d+(?:\.\d+)?[eE]\+?\d{1,2}(?![\w.])")
 
 
-def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat(settings: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested settings by dotted names."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
@@ -81,7 +81,7 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-def as_before(settings: Mapping[str, Any]) -> dict[str, Any]:
+def as_before(settings: ReadOnlyValues) -> NamedValues:
     """Return the settings of a run without those of `ADDED` that have the value for "as before"."""
     kept = _without(settings, ADDED.get("run", {}))
     return {
@@ -89,9 +89,9 @@ def as_before(settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _without(settings: Mapping[str, Any], added: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") -> NamedValues:
     """Return nested settings without added ones of this value, and without groups that then are empty."""
-    kept: dict[str, Any] = {}
+    kept: NamedValues = {}
     for key, value in settings.items():
         name = f"{prefix}{key}"
         inner = _without(value, added, f"{name}.") if isinstance(value, Mapping) else value
@@ -101,12 +101,12 @@ def _without(settings: Mapping[str, Any], added: Mapping[str, Any], prefix: str 
     return kept
 
 
-def _added_to(group: Any) -> dict[str, Any]:
+def _added_to(group: Any) -> NamedValues:
     """Return the settings that were added to the target of a group."""
     return ADDED.get(str(group.get("_target_")), {}) if isinstance(group, Mapping) else {}
 
 
-def with_added(settings: Mapping[str, Any]) -> dict[str, Any]:
+def with_added(settings: ReadOnlyValues) -> NamedValues:
     """Return the settings of a stored group, such as ``agent``, with those that were added to its target since."""
     return {**_added_to(settings), **settings}
 
@@ -153,13 +153,13 @@ def curriculum_names(config_dir: Path | None) -> list[str]:
     return names_in(config_dir, "curriculum")
 
 
-def digest(settings: Mapping[str, Any]) -> str:
+def digest(settings: ReadOnlyValues) -> str:
     """Return the hash of settings that a run's name ends with: 12 hexadecimal digits."""
     text = json.dumps(as_before(settings), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]:
+def differences(stored: ReadOnlyValues, given: ReadOnlyValues) -> list[str]:
     """Return in words which settings of a stored run differ from those that are given."""
     before = dict(flat(as_before(stored)))
     now = dict(flat(as_before(given)))
@@ -173,7 +173,7 @@ def differences(stored: Mapping[str, Any], given: Mapping[str, Any]) -> list[str
     return found
 
 
-def _value_before(key: str, given: Mapping[str, Any]) -> Any:
+def _value_before(key: str, given: ReadOnlyValues) -> Any:
     """Return the value that stands for a setting that was added later."""
     group, _, name = key.partition(".")
     return dict(flat(_added_to(given.get(group)))).get(name, ADDED.get("run", {}).get(key))
@@ -210,7 +210,7 @@ def _defaults(name: str) -> Iterator[Any]:
             yield settings[key]
 
 
-def as_typed(message: str, settings: Mapping[str, Any], typed: Iterable[str]) -> str:
+def as_typed(message: str, settings: ReadOnlyValues, typed: Iterable[str]) -> str:
     """Return a message about values with the names of settings that are typed: ``curriculum.depth`` for ``depth``.
 
     A word that is no name elsewhere is one only where a rule begins, as in ``depth must be``, and before a ``=``.

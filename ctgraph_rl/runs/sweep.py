@@ -21,7 +21,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import ReadOnlyValues, require
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import CHECKPOINTS, member_folder
 from ctgraph_rl.packages import check_packages, conf_dir
@@ -56,7 +56,7 @@ SUBDIR = "${run_name:}"
 """Names a directory after the configuration; a cell can then be found before it is run."""
 
 
-def swept(params: Mapping[str, Any]) -> dict[str, list[str]]:
+def swept(params: ReadOnlyValues) -> dict[str, list[str]]:
     """Return the choices of each swept setting as on a command line: ``seed=0``, ``seed=1`` of ``range(2)``."""
     parser = OverridesParser.create()
     parsed = {key: parser.parse_override(f"{key}={value}") for key, value in params.items()}
@@ -81,7 +81,7 @@ class Sweeper(Base):
         max_batch_size: int | None,
         params: dict[str, str] | None,
         status: bool,
-        variants: Sequence[Mapping[str, Any]] | None = None,
+        variants: Sequence[ReadOnlyValues] | None = None,
     ) -> None:
         super().__init__(max_batch_size, params)
         self.status = status
@@ -147,7 +147,7 @@ class Sweeper(Base):
         if not self.status:
             Sweeper.done = list(cells)
 
-    def _combined(self, variant: Mapping[str, Any], arguments: Sequence[str]) -> list[list[str]]:
+    def _combined(self, variant: ReadOnlyValues, arguments: Sequence[str]) -> list[list[str]]:
         """Return all combinations of a variant with what is swept; the last value of a setting counts."""
         own = [f"{key}={value}" for key, value in variant.items()]
         assert self.hydra_context is not None

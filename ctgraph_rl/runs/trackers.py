@@ -11,7 +11,7 @@ import re
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from torchrl.record.loggers import CSVLogger, MLFlowLogger, TensorboardLogger, W
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.trackio import TrackioLogger
 
-from ctgraph_rl.checks import is_real, require
+from ctgraph_rl.checks import ReadOnlyValues, is_real, require
 from ctgraph_rl.disk import require_no_link
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.run_log import RunLog
@@ -59,9 +59,7 @@ class Tracker:
         ValueError: for a value that the logger does not take.
     """
 
-    def __init__(
-        self, make_logger: Callable[[Path], Logger], run_dir: Path, hyperparameters: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, make_logger: Callable[[Path], Logger], run_dir: Path, hyperparameters: ReadOnlyValues) -> None:
         folder = run_dir.resolve() / FOLDER
         require_no_link(folder)
         shutil.rmtree(folder, ignore_errors=True)
@@ -80,7 +78,7 @@ class Tracker:
         given = {name: each if isinstance(each, kinds) else str(each) for name, each in hyperparameters.items()}
         self._send("log_hparams", given)
 
-    def __call__(self, measurement: Mapping[str, Any]) -> None:
+    def __call__(self, measurement: ReadOnlyValues) -> None:
         """Send one measurement, with the run's frames as the step; before the first, those of a resumed run's log."""
         log = self._log
         self._log = None
@@ -124,7 +122,7 @@ def logger_of(given: Any) -> Callable[..., Any] | None:
     return config.target(config.with_names({"logger": given}), "logger") if isinstance(given, str) else given
 
 
-def scalars(measurement: Mapping[str, Any]) -> dict[str, float]:
+def scalars(measurement: ReadOnlyValues) -> dict[str, float]:
     """Return the numbers of a measurement of training or evaluation, named as ``train/return_mean``; none of another.
 
     Those of a task have its label in the name, with ``_`` for what is no letter, digit or hyphen: W&B takes what is

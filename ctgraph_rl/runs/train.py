@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from rich.console import Console
@@ -17,7 +17,16 @@ from torchrl.data import Composite, TensorSpec
 
 from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import Rule, as_path, is_json_object, require, require_memory, takes_numbers
+from ctgraph_rl.checks import (
+    NamedValues,
+    ReadOnlyValues,
+    Rule,
+    as_path,
+    is_json_object,
+    require,
+    require_memory,
+    takes_numbers,
+)
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import append_line, sync_folder, sync_folders, write_whole
 from ctgraph_rl.learn.collect import agent_specs
@@ -116,10 +125,10 @@ def train(
     seed: int,
     device: torch.device | str = "cpu",
     *,
-    config: Mapping[str, Any] | None = None,
+    config: ReadOnlyValues | None = None,
     experts: Sequence[Expert] | None = None,
     checkpoints: Checkpoints | None = None,
-    listeners: Sequence[Callable[[dict[str, Any]], object]] = (),
+    listeners: Sequence[Callable[[NamedValues], object]] = (),
     console: Console | None = None,
 ) -> None:
     """Let a new agent learn a curriculum, with a progress bar, and write `RESULTS` to a directory.
@@ -188,11 +197,11 @@ class RunDirectory:
     """Where a run is written, and with what beside its measurements; see `train`."""
 
     run_dir: Path
-    config: Mapping[str, Any]
+    config: ReadOnlyValues
     checkpoints: Checkpoints
     together: Sequence[int] = ()  # the seeds of the group that the run is trained in; none for a single run
     experts: Sequence[Expert] | None = None
-    listeners: Sequence[Callable[[dict[str, Any]], object]] = ()
+    listeners: Sequence[Callable[[NamedValues], object]] = ()
     console: Console | None = None
 
     def begin(self, curriculum: Curriculum, agent: Agent, saved: RunState | None) -> RunLog:
@@ -349,7 +358,7 @@ def _reopen(run_dir: Path) -> None:
         sync_folder(run_dir)
 
 
-def resumed_log(run_dir: Path, saved: RunState, about: Mapping[str, Any], strict: bool) -> RunLog:
+def resumed_log(run_dir: Path, saved: RunState, about: ReadOnlyValues, strict: bool) -> RunLog:
     """Return the log as it was at a checkpoint; warn of another machine or versions, or refuse them if ``strict``.
 
     Raises:

@@ -12,7 +12,7 @@ from inspect import signature
 from os import PathLike
 from typing import Any
 
-from ctgraph_rl.checks import did_you_mean, is_int, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, did_you_mean, is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -69,7 +69,7 @@ def observations_of(graph: CTGraph, kind: str, num_wait_images: int = 100) -> Ob
         (kind in OBSERVABILITY, f"kinds must be some of {', '.join(OBSERVABILITY)}, got {kind!r}"),
         (is_int(num_wait_images, 1), f"num_wait_images must be an integer >= 1, got {num_wait_images!r}"),
     )
-    found: dict[str, Any] = {"unique_waits": kind == "full", "unique_decisions": kind in ("full", "decisions")}
+    found: NamedValues = {"unique_waits": kind == "full", "unique_decisions": kind in ("full", "decisions")}
     if kind == "confounding":
         found |= {"decision_ids": (2, 2), "wait_ids": (3, 2 + num_wait_images)}
     return shown_ids(graph, found)
@@ -187,7 +187,7 @@ def make_task(task: Task | str | None = None, config: Json | None = None, **chan
     return _changed(task, changes)
 
 
-def _changed(task: Task, changes: dict[str, Any]) -> Task:
+def _changed(task: Task, changes: NamedValues) -> Task:
     """A task with other values of its fields, those of its graph and its observations among them."""
     if "image_seed" in changes:
         require((task.image_seed is not None, f"image_seed needs generated images, got {task.images!r}"))

@@ -22,7 +22,7 @@ from os.path import lexists
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl import __version__
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
@@ -64,7 +64,7 @@ TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 """Kinds of tasks of this package by name, beside `Task`, whose JSON names none."""
 
 
-def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> dict[str, Any]:
+def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> NamedValues:
     """Return a curriculum as JSON; see `Curriculum.to_json`."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
     places: dict[TaskLike, int] = {
@@ -92,9 +92,7 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
     return content
 
 
-def read_curriculum(
-    path_or_dict: str | PathLike[str] | Mapping[str, Any], make: Callable[..., Curriculum]
-) -> Curriculum:
+def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Callable[..., Curriculum]) -> Curriculum:
     """Return the curriculum of a JSON file or of its content, which ``make`` makes; see `Curriculum.from_json`."""
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
     with _within(source):
@@ -125,7 +123,7 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
     return {**kind, **{name: _plain(getattr(value, name), places) for name in _names(type(value))}}
 
 
-def _plain_task(task: TaskLike) -> dict[str, Any]:
+def _plain_task(task: TaskLike) -> NamedValues:
     """Return a task as JSON; a kind beside `Task` is named."""
     kind = type(task)
     if kind is Task:
@@ -143,7 +141,7 @@ def _names(kind: type) -> list[str]:
     return [field.name for field in fields(kind) if field.init]
 
 
-def _of_graph(task: TaskLike) -> dict[str, Any]:
+def _of_graph(task: TaskLike) -> NamedValues:
     """Return numbers that follow from a CT-graph."""
     if not isinstance(task, Task):
         return {}
@@ -151,7 +149,7 @@ def _of_graph(task: TaskLike) -> dict[str, Any]:
     return {"goal_leaf": task.goal_leaf} | {name: getattr(task.graph, name) for name in numbers}
 
 
-def file_text(content: Mapping[str, Any]) -> str:
+def file_text(content: ReadOnlyValues) -> str:
     """Return the text of the file of a curriculum that is given as JSON."""
     return _text(content) + "\n"
 
@@ -204,7 +202,7 @@ def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()
     )
 
 
-def _parts(content: Mapping[str, Any]) -> dict[str, Any]:
+def _parts(content: ReadOnlyValues) -> NamedValues:
     """Return the arguments of a curriculum."""
     require((isinstance(content["source"], str), f"source must be a text, got {content['source']!r:.80}"))
     tasks = _each("tasks", content["tasks"], _task)

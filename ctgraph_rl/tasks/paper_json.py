@@ -12,7 +12,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, as_tuple, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.images import OneHot, PaperImages
 from ctgraph_rl.tasks.observations import Observations
@@ -41,7 +41,7 @@ SECTIONS: dict[str, dict[str, str]] = {
 SEED = "Seed"
 """Seed of the environment's random numbers, which is no part of a task."""
 
-DEFAULTS: dict[str, Any] = {
+DEFAULTS: NamedValues = {
     "wait_prob": 0.0,
     "unique_decisions": False,
     "unique_waits": False,
@@ -52,13 +52,13 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-def is_paper_json(content: Mapping[str, Any]) -> bool:
+def is_paper_json(content: ReadOnlyValues) -> bool:
     """Return whether a file is one of Table 3, and not one of the authors' implementation."""
     shape = content.get("graph_shape")
     return "image_dataset" not in content and isinstance(shape, Mapping) and bool({"d", "b"} & shape.keys())
 
 
-def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
+def read_paper_json(source: str, content: ReadOnlyValues, goal: Sequence[int] | None) -> NamedValues:
     """Return the arguments of `Task` for the parameters of Table 3.
 
     Ids that are left out are the next free ones after those of the home state, 0, and the fail state, 1: decision
@@ -88,7 +88,7 @@ def read_paper_json(source: str, content: Mapping[str, Any], goal: Sequence[int]
     return {"graph": graph, "goal": goal, "observations": observations, "images": images, **rewards}
 
 
-def _found(source: str, content: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _found(source: str, content: ReadOnlyValues) -> Iterator[tuple[str, Any]]:
     """Yield what a file says, in our words."""
     for written, section in content.items():
         name = written.replace(" ", "_")
@@ -110,7 +110,7 @@ def suggested(name: object, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else f"; the choices are {', '.join(known)}"
 
 
-def shown_ids(graph: CTGraph, found: Mapping[str, Any]) -> Observations:
+def shown_ids(graph: CTGraph, found: ReadOnlyValues) -> Observations:
     """Return the ids of wait, decision and end states: given ones, else the next that are free.
 
     Args:
@@ -132,12 +132,12 @@ def shown_ids(graph: CTGraph, found: Mapping[str, Any]) -> Observations:
     return Observations(**ids, **_kept(found, "unique_waits", "unique_decisions"))
 
 
-def _next(ids: Mapping[str, Any]) -> int:
+def _next(ids: ReadOnlyValues) -> int:
     """Return the id after all that are in use; 2 after the home and the fail state."""
     ranges = [as_tuple(each) for each in ids.values()]
     lasts = [last for each in ranges if isinstance(each, tuple) for last in each[-1:] if is_int(last)]
     return max([1, *lasts]) + 1
 
 
-def _kept(found: Mapping[str, Any], *names: str) -> dict[str, Any]:
+def _kept(found: ReadOnlyValues, *names: str) -> NamedValues:
     return {name: found[name] for name in names if name in found}

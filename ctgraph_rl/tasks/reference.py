@@ -10,9 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from os.path import lexists
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ctgraph_rl.checks import Rule, is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, is_int, is_real, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, ReferenceLinear, RewardFn
 from ctgraph_rl.disk import write_whole
@@ -65,11 +65,11 @@ _SECTIONS = tuple(dict.fromkeys(section for section, *_ in _KEYS.values()))
 
 _DISTRIBUTIONS: dict[str, RewardFn] = {"needle_in_haystack": Needle(), "linear": ReferenceLinear()}
 
-_LEGACY: dict[str, Any] = {"reward_cue": True, "cue_wraps": True, "legacy_index": True, "noise_before_rotation": True}
+_LEGACY: NamedValues = {"reward_cue": True, "cue_wraps": True, "legacy_index": True, "noise_before_rotation": True}
 """How the authors' implementation shows states, whatever a file says."""
 
 
-def read_task(path_or_dict: str | PathLike[str] | Mapping[str, Any], goal: Sequence[int] | None) -> dict[str, Any]:
+def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence[int] | None) -> NamedValues:
     """The arguments of `Task` for a configuration file; see `Task.from_json`."""
     source, content = json_object(path_or_dict, "configuration", MAX_BYTES)
     if is_paper_json(content):
@@ -92,14 +92,14 @@ def _places(dialect: str) -> dict[str, tuple[str, str]]:
     return {name: (row[0], key) for name, row in _KEYS.items() if (key := row[column]) is not None}
 
 
-def _dialect(content: Mapping[str, Any]) -> str:
+def _dialect(content: ReadOnlyValues) -> str:
     """The dialect that has most of the keys, the newest of several."""
     sections = {name: section for name, section in content.items() if isinstance(section, Mapping)}
     keys = {(name, key) for name, section in sections.items() for key in section}
     return max(reversed(_DIALECTS), key=lambda dialect: len(keys & set(_places(dialect).values())))
 
 
-def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
+def _faults(content: ReadOnlyValues, dialect: str) -> list[str]:
     """Return the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
     wanted = _places(dialect).values()
     names = (*_SECTIONS, "general_seed")
@@ -114,7 +114,7 @@ def _faults(content: Mapping[str, Any], dialect: str) -> list[str]:
     return [*unknown, *no_section, *faults, *(f"{section}.{key} is missing" for section, key in missing)]
 
 
-def _says_nothing(section: str, key: str, content: Mapping[str, Any]) -> bool:
+def _says_nothing(section: str, key: str, content: ReadOnlyValues) -> bool:
     """Files of 2023 may keep the older switch of reward noise; without noise it has no meaning."""
     return (section, key) == ("reward", "stochastic_sampling") and content["reward"].get("std_r") == 0
 
@@ -131,7 +131,7 @@ def _surplus(section: str, key: str, dialect: str) -> str:
     return f"unknown key {section}.{key}{suggested(key, keys)}"
 
 
-def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> list[Rule]:
+def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list[Rule]:
     """Return the rules for a file's values that the parts of a task do not check themselves."""
 
     def said(name: str) -> str:
@@ -166,7 +166,7 @@ def _value_rules(found: dict[str, Any], places: dict[str, tuple[str, str]]) -> l
     ]
 
 
-def _arguments(found: dict[str, Any]) -> dict[str, Any]:
+def _arguments(found: NamedValues) -> NamedValues:
     """Values in our words as arguments of `Task`, all but the goal."""
     changes = found["min_episodes"] > 0
     noise = 0 if found["one_hot"] else found["noise"]
@@ -190,7 +190,7 @@ def _arguments(found: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> dict[str, Any]:
+def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) -> NamedValues:
     """A task as a configuration file of the 2023 dialect; see `Task.to_json`."""
     require(
         (path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"),
@@ -198,7 +198,7 @@ def write_task(task: Task, path: str | PathLike[str] | None, general_seed: int) 
         *((holds, f"the file cannot express {what}") for holds, what in _expressible(task)),
     )
     values = _values(task)
-    content: dict[str, Any] = {"general_seed": general_seed, **{section: {} for section in _SECTIONS}}
+    content: NamedValues = {"general_seed": general_seed, **{section: {} for section in _SECTIONS}}
     for name, (section, key) in _places("2023").items():
         content[section][key] = values[name]
     if path is not None:
@@ -235,7 +235,7 @@ def _expressible(task: Task) -> list[Rule]:
     ]
 
 
-def _values(task: Task) -> dict[str, Any]:
+def _values(task: Task) -> NamedValues:
     """A task in the words of `_KEYS`."""
     x = task.observations
     images = task.images

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.batch.render import GOAL, PALETTE
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.parsers import DPI
@@ -81,14 +82,14 @@ def colour(number: int) -> str:
     return "#" + "".join(f"{channel:02x}" for channel in PALETTE[number])
 
 
-def mark(kind: StateType, size: float) -> dict[str, Any]:
+def mark(kind: StateType, size: float) -> NamedValues:
     """Return the style of a state for matplotlib; sizes in points."""
     edge = {"markeredgecolor": "0", "markeredgewidth": min(0.8, size / 10)}
     size *= 0.85 if kind == StateType.DECISION else 1  # a square on its corner is wide
     return {"marker": MARKERS[kind], "markersize": size, "markerfacecolor": colour(kind), "linestyle": "none"} | edge
 
 
-def goal_mark(size: float) -> dict[str, Any]:
+def goal_mark(size: float) -> NamedValues:
     """Return the style of a goal, the star of `ctgraph_rl.batch.render`."""
     edge = {"markeredgecolor": "0", "markeredgewidth": 0.8}
     return {"marker": "*", "markersize": size, "markerfacecolor": colour(GOAL), "linestyle": "none"} | edge
@@ -98,7 +99,7 @@ def draw_lines(axes: Any, lines: Sequence[Sequence[PlanePoint]], **style: Any) -
     """Draw straight lines behind the states."""
     from matplotlib.collections import LineCollection
 
-    look: dict[str, Any] = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
+    look: NamedValues = {"zorder": 1, "colors": "0", "capstyle": "round"} | style
     axes.add_collection(LineCollection(list(lines), **look))
 
 

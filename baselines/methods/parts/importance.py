@@ -16,8 +16,8 @@ from baselines.methods.method import Method, multi_task_blocks
 from baselines.methods.parts.heads import Heads
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data
-from ctgraph_rl.checks import at_least_one, one_of, positive, require
+from baselines.parts.networks import Data, Items, TensorsByName
+from ctgraph_rl.checks import NamedValues, at_least_one, one_of, positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -86,7 +86,7 @@ class Importance(Method):
         self.importance += new
         self.anchor.copy_(weights)
 
-    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> dict[str, Tensor]:
+    def penalties(self, batch: Data, weights: Sequence[Tensor]) -> TensorsByName:
         """Compute the penalty for distance."""
         gap = flat(weights) - self.anchor
         return {"loss_method": self.coeff * (self.importance * gap.square()).sum()}
@@ -120,7 +120,7 @@ class Samples:
         self.remaining = math.inf
         """Frames of the present batch's first pass that are still to come."""
 
-        self.minibatches: deque[dict[Any, Tensor]] = deque()
+        self.minibatches: deque[Items] = deque()
 
     def add(self, minibatch: Data) -> None:
         """Add a minibatch of the first pass, and drop those that are no longer needed."""
@@ -139,7 +139,7 @@ class Samples:
         self.minibatches.clear()
         self.num_held = 0
 
-    def items(self) -> Iterator[dict[Any, Tensor]]:
+    def items(self) -> Iterator[Items]:
         """Yield the items of the minibatches one by one, [1, ...], the latest first, until there are enough frames."""
         frames = 0
         for minibatch in reversed(self.minibatches):
@@ -150,7 +150,7 @@ class Samples:
                 frames += num_learnt(item)
                 yield item
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> NamedValues:
         """Return plain values for a state dict."""
         alike = groupby(self.minibatches, lambda minibatch: minibatch["action"].shape[1:])  # steps of a sequence
         return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
@@ -164,7 +164,7 @@ class Samples:
         self.num_held = sum(map(num_learnt, self.minibatches))
 
 
-def _joined(minibatches: Sequence[dict[Any, Tensor]]) -> dict[str, Any]:
+def _joined(minibatches: Sequence[Items]) -> NamedValues:
     """Concatenate minibatches of items of one shape, and return them with their sizes."""
     items = {key: torch.cat([minibatch[key] for minibatch in minibatches]) for key in minibatches[0]}
     return {"sizes": [len(minibatch["action"]) for minibatch in minibatches], "items": items}
@@ -200,7 +200,7 @@ class SampledImportance(Importance):
         super().end_task()
         self.samples.clear()
 
-    def mean(self, terms: Callable[[dict[Any, Tensor]], Iterator[Tensor]]) -> Tensor:
+    def mean(self, terms: Callable[[Items], Iterator[Tensor]]) -> Tensor:
         """Return the sum of the terms of all samples, [P] each, divided by the number of frames."""
         total = torch.zeros_like(self.importance)
         frames = 0
@@ -214,10 +214,10 @@ class SampledImportance(Importance):
         """Compute the gradient of a scalar by the weights, [P]; its graph is retained."""
         return flat(torch.autograd.grad(value, self.weights.parameters, retain_graph=True, materialize_grads=True))
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the samples."""
         return {"samples": self.samples.state()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         self.samples.restore(state["samples"], self.weights.device)

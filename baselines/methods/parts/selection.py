@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -20,7 +19,7 @@ from baselines.parts.embedding import (
     unit_directions,
 )
 from baselines.parts.learner import Learner
-from ctgraph_rl.checks import at_least_one, one_of, require
+from ctgraph_rl.checks import NamedValues, at_least_one, one_of, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import TaskLike, most_actions
 
@@ -106,11 +105,11 @@ class TaskEmbeddings:
             return linear_wasserstein(points, reference_points(self.num_references, width))
         return sliced_wasserstein(points, unit_directions(self.num_directions, width), self.num_quantiles)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> NamedValues:
         """Return embeddings and buffer."""
         return {"of_slot": dict(self.of_slot), "recent": dict(self.recent)}
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: NamedValues) -> None:
         """Restore what `state` returned."""
         self.of_slot = {slot: value.cpu() for slot, value in state["of_slot"].items()}
         self.recent = {key: value.cpu() for key, value in state["recent"].items()}
@@ -232,12 +231,12 @@ class SelectedMasks(MaskLC):
         self.community = self.scores[filled]
         self.set_places([*filled, self.slot], len(filled) - len(slots), self.scores.device)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return what is selected, and all that selections depend on."""
         counts = {"selected": self.selected, "num_batches": self.num_batches, "random": self.generator.get_state()}
         return {**super().get_extra_state(), **counts, "embeddings": self.embeddings.state()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.num_batches = state["num_batches"]

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
 from baselines.parts.networks import sequences_of, trunk_of
 from ctgraph_rl.agent import Agent, MethodLike
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import NamedValues, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.task_like import most_actions
 from ctgraph_rl.tasks.protocol import Block, Protocol
@@ -165,7 +165,7 @@ class SelfLabelledAgent(nn.Module):
         self.num_tried = 0
         """Frames that the present label has been tried."""
 
-        self.snapshots: list[dict[str, Any]] = []
+        self.snapshots: list[NamedValues] = []
         """The older one first; each with ``state`` and ``frames``, those learned from until the next one."""
 
     @property
@@ -309,13 +309,13 @@ class SelfLabelledAgent(nn.Module):
             self.learner.start_task(label)
         self._resume(label)
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the labels, the snapshots and the detector's state."""
         own = {name: getattr(self, name) for name in STATE}
         snapshots = [{**each, "state": dict(each["state"])} for each in self.snapshots]
         return {**own, "waiting": list(self.waiting), "snapshots": snapshots, "detector": self.detector.state_dict()}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         for name in STATE:
             setattr(self, name, state[name])

@@ -7,9 +7,9 @@ import json
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 from ctgraph_rl import __version__
+from ctgraph_rl.checks import NamedValues
 
 CONTEXT = json.loads(Path(__file__).with_name("croissant_context.json").read_text(encoding="utf-8"))
 """The names that the specification fixes."""
@@ -22,7 +22,7 @@ Columns = Mapping[str, tuple[str, str]]
 """Types and meanings by the names of columns."""
 
 
-def croissant(files: Mapping[str, tuple[str, Columns]], key: str, published: date) -> dict[str, Any]:
+def croissant(files: Mapping[str, tuple[str, Columns]], key: str, published: date) -> NamedValues:
     """Return the metadata of CSV files that stand beside it.
 
     Args:
@@ -47,7 +47,7 @@ def croissant(files: Mapping[str, tuple[str, Columns]], key: str, published: dat
     }
 
 
-def _file(name: str, content: str) -> dict[str, Any]:
+def _file(name: str, content: str) -> NamedValues:
     """Return a file with its sum."""
     data = content.encode()
     return {
@@ -61,13 +61,13 @@ def _file(name: str, content: str) -> dict[str, Any]:
     }
 
 
-def _records(name: str, columns: Columns, key: str, first: str) -> dict[str, Any]:
+def _records(name: str, columns: Columns, key: str, first: str) -> NamedValues:
     """Return the records of a file, with a field for each column."""
     records = name.partition(".")[0]
     home = first.partition(".")[0]
     fields = []
     for column, (kind, meaning) in columns.items():
-        own: dict[str, Any] = {
+        own: NamedValues = {
             "@type": "cr:Field",
             "@id": f"{records}/{column}",
             "name": column,

@@ -12,6 +12,7 @@ from ctgraph_rl.board.method import OURS
 from ctgraph_rl.board.standings.ceilings import in_words
 from ctgraph_rl.board.standings.entries import LEVELS, shown_level
 from ctgraph_rl.board.standings.tables import BoardTable, Standing, is_significant
+from ctgraph_rl.checks import NamedValues
 from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics import METRICS
 from ctgraph_rl.report.formats import MEANS, measure_name
@@ -198,12 +199,12 @@ def scores_csv(tables: Sequence[BoardTable]) -> str:
     return csv_text([list(SCORE_COLUMNS), *rows])
 
 
-def as_json(tables: Sequence[BoardTable]) -> dict[str, Any]:
+def as_json(tables: Sequence[BoardTable]) -> NamedValues:
     """Return all tables as plain values."""
     return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": [_json(table) for table in tables]}
 
 
-def _json(table: BoardTable) -> dict[str, Any]:
+def _json(table: BoardTable) -> NamedValues:
     track = table.track
     variant = table.variant
     return {
@@ -230,7 +231,7 @@ def _json(table: BoardTable) -> dict[str, Any]:
     }
 
 
-def _json_line(line: Standing) -> dict[str, Any]:
+def _json_line(line: Standing) -> NamedValues:
     entry = line.entry
     return {
         "name": line.name,
@@ -248,7 +249,7 @@ def _json_line(line: Standing) -> dict[str, Any]:
     }
 
 
-def _numbers(estimate: Estimate) -> dict[str, Any]:
+def _numbers(estimate: Estimate) -> NamedValues:
     names = ("value", "low", "high", "n", "n_undefined", "method")
     return {name: getattr(estimate, name) for name in names}
 
@@ -263,7 +264,7 @@ def model_index(tables: Sequence[BoardTable]) -> str:
     return yaml.safe_dump({"model-index": models}, sort_keys=False, allow_unicode=True, width=120)
 
 
-def _result(table: BoardTable, line: Standing) -> dict[str, Any]:
+def _result(table: BoardTable, line: Standing) -> NamedValues:
     """Return the result of an entry: task, data set, metrics and source."""
     variant = table.variant
     method = line.entry.method
