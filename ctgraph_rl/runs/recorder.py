@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType, TracebackType
 from typing import Any
@@ -12,7 +12,6 @@ from torchrl.record.loggers.common import Logger
 
 from ctgraph_rl.checks import (
     NamedValues,
-    ReadOnlyValues,
     as_path,
     is_int,
     is_json_object,
@@ -114,7 +113,7 @@ class Recorder:
         curriculum: Curriculum,
         run_dir: Path | str | None = None,
         seed: int = 0,
-        about: ReadOnlyValues | None = None,
+        about: Mapping[str, Any] | None = None,
         code: Sequence[type | FunctionType] | None = None,
         *,
         overwrite: bool = False,
@@ -140,7 +139,7 @@ class Recorder:
         curriculum.evaluation.check((*curriculum.tasks, *curriculum.evaluation.held_out))
         self.curriculum = curriculum
         self.run_dir = None if run_dir is None else as_path("run_dir", run_dir)
-        self.saved: ReadOnlyValues | None = None
+        self.saved: Mapping[str, Any] | None = None
         self.frames = 0
         self.finished = False
         self._evaluated = -1
@@ -195,7 +194,7 @@ class Recorder:
         sync_folders(run_dir)
         return log
 
-    def _check_same(self, begun: ReadOnlyValues) -> None:
+    def _check_same(self, begun: Mapping[str, Any]) -> None:
         """Refuse to resume a run of another curriculum or of other settings; `resumed_log` knows of code."""
         before, now = (each.get("fingerprint") for each in (begun, self._about))
         other = f"{self.run_dir} holds a run of {begun.get('curriculum')} (fingerprint {before}), this one has {now}"
@@ -218,7 +217,7 @@ class Recorder:
         return log
 
     @takes_numbers
-    def checkpoint(self, state: Callable[[], ReadOnlyValues], frames: int) -> None:
+    def checkpoint(self, state: Callable[[]], frames: int) -> None:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
 
         A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
