@@ -217,7 +217,7 @@ class Recorder:
         return log
 
     @takes_numbers
-    def checkpoint(self, state: Callable[[]], frames: int) -> None:
+    def checkpoint(self, state: Callable[[], Mapping[str, Any]], frames: int) -> None:
         """Save the learner if it is time: at first, where a block ends, and when ``checkpoint_seconds`` have passed.
 
         A run that was stopped is resumed from its last checkpoint that can be read. Measurements that were logged after
