@@ -82,6 +82,11 @@ def as_text(app: Sphinx, what: str, name: str, obj: object, options: Any, lines:
         lines.insert(0, "\\ ")
 
 
+def _is_own(method: Any, of: Any) -> bool:
+    """Return whether a class's module defines a method; Python's own methods have no module."""
+    return getattr(method, "__module__", None) == of.__module__
+
+
 def with_plain_defaults(
     app: Sphinx, what: str, name: str, obj: object, options: Any, signature: str | None, returned: str | None
 ) -> tuple[str | None, str | None]:
@@ -89,7 +94,7 @@ def with_plain_defaults(
 
     A class of ours whose metaclass hides its arguments, as TorchRL's, gets those of its ``__init__``.
     """
-    if what == "class" and signature == "(*args, **kwargs)" and obj.__init__.__module__ == obj.__module__:
+    if what == "class" and signature == "(*args, **kwargs)" and _is_own(obj.__init__, obj):
         own = signature_of(obj.__init__, bound_method=True)
         signature = stringify_signature(own, show_return_annotation=False, unqualified_typehints=True)
     return signature and signature.replace("<factory>", "..."), returned
