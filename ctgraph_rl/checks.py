@@ -27,7 +27,7 @@ NamedValues = dict[str, Any]
 """Values by name, such as settings, a saved state or a line of a log."""
 
 ReadOnlyValues = Mapping[str, Any]
-"""The same, which nobody changes."""
+"""The same, read-only."""
 
 LARGEST_INT = 2**63 - 1
 """Of an int64."""
