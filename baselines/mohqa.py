@@ -31,12 +31,20 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import EGreedyModule
 from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import linear_layer
-from baselines.parts.networks import Data, EncoderModule, Items, TensorsByName, guided, num_actions_of, require_weights
+from baselines.parts.networks import (
+    Data,
+    EncoderModule,
+    Items,
+    TensorsByName,
+    guided,
+    is_greedy,
+    num_actions_of,
+    require_weights,
+)
 from baselines.parts.networks import encoder as make_encoder
 from baselines.parts.q_learning import QLearner, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
@@ -184,7 +192,7 @@ class ModulatedGreedy(TensorDictModuleBase):
         return self.greedy[1].module(features)
 
     def _noise(self, features: Tensor) -> Tensor:
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if is_greedy():
             return torch.zeros_like(features)
         return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
 

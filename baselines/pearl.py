@@ -33,12 +33,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot, softplus
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.inner_loop import NetInputs
 from baselines.parts.learner import MOST_PASSES, Learner
-from baselines.parts.networks import Data, draw, entropy, guided, num_actions_of
+from baselines.parts.networks import Data, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
 from baselines.update.optimiser import make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, one_of, positive, require
@@ -109,8 +108,7 @@ class PosteriorPolicy(TensorDictModuleBase):
         context = torch.where(begins, drawn, tensordict[CONTEXT])
         seen = tuple(tensordict[key] for key in self.seen_keys)
         logits = self.actor(*seen, context)
-        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
-        action = logits.argmax(dim=-1) if is_greedy else draw(logits.softmax(dim=-1))
+        action = logits.argmax(dim=-1) if is_greedy() else draw(logits.softmax(dim=-1))
         action = guided(tensordict, action)
         trial = torch.where(fresh, 1, episode)
         written = (action, trial, action, precision, weighted, context, *seen)

@@ -36,12 +36,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss, pad
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.distinct import distinct
 from baselines.parts.learner import require_finite
-from baselines.parts.networks import Data, guided, highest, num_actions_of, require_weights
+from baselines.parts.networks import Data, guided, highest, is_greedy, num_actions_of, require_weights
 from ctgraph_rl.checks import TakesNumbers, at_least_one, fraction, positive, require, require_memory
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -396,8 +395,7 @@ class PennA(TakesNumbers, TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and the next state; ``trial`` is the number of the episode in its life, from 1."""
         rows = torch.arange(len(tensordict), device=tensordict["trial"].device)
-        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
-        who = torch.zeros_like(rows) if is_greedy else rows // self.num_trials % len(self.population.size)
+        who = torch.zeros_like(rows) if is_greedy() else rows // self.num_trials % len(self.population.size)
         lives = self.population.take(who)
         waits = (tensordict["life"] != self.generation) | (tensordict["trial"] == 0)  # for its first episode
         trial = torch.where(waits, 0, tensordict["trial"]) + tensordict["is_init"]

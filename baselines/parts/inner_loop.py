@@ -29,11 +29,10 @@ from torch import Tensor, nn
 from torch.func import grad, vmap
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
-from baselines.parts.networks import Data, Items, TensorsByName, draw, guided, num_actions_of
+from baselines.parts.networks import Data, Items, TensorsByName, draw, guided, is_greedy, num_actions_of
 from baselines.update.optimiser import make_optimiser
 from baselines.update.trust_region import trust_region_step
 from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
@@ -190,8 +189,7 @@ class InnerPolicy(TensorDictModuleBase):
         own = self._own(theta, tensordict, rewards, fresh=fresh, adapts=adapts)
         seen = tuple(tensordict[key] for key in self.seen_keys)
         logits = vmap(model.logits, in_dims=(None, 0, 0))(theta, own, seen)
-        is_greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
-        action = logits.argmax(dim=-1) if is_greedy else draw(logits.softmax(dim=-1))
+        action = logits.argmax(dim=-1) if is_greedy() else draw(logits.softmax(dim=-1))
         tensordict.set("action", guided(tensordict, action))
         tensordict.set(("next", "trial"), episode.unsqueeze(-1))
         for name, key in self.own_keys.items():

@@ -372,10 +372,7 @@ class ActorCritic(TensorDictSequential):
         features = written.pop(key)
         log_probs = _normalised(logits(features))
         chances = log_probs.softmax(dim=-1)
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
-            action = chances.argmax(dim=-1)
-        else:
-            action = draw(chances)
+        action = chances.argmax(dim=-1) if is_greedy() else draw(chances)
         action = guided(data, action)
         written["action"] = action
         written["action_log_prob"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
@@ -390,6 +387,11 @@ def guided(data: Data, action: Tensor) -> Tensor:
     """Return the actions that a guide gave, int64 [num_envs], and where it gave none the policy's own."""
     given = data.get(GUIDED_ACTION, None)
     return action if given is None else torch.where(given < 0, action, given)
+
+
+def is_greedy() -> bool:
+    """Return whether policies take their best action at present, as TorchRL's exploration type says."""
+    return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
 def draw(chances: Tensor) -> Tensor:

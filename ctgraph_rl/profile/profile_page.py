@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,13 +81,11 @@ def _figures(scores: Profiles, titles: Sequence[str]) -> Iterator[CaptionedFigur
     height = 0.8 / len(shown)
     for position, (agent, of_agent) in enumerate(shown):
         look = agent_style(position, agent)
-        values, low, high = np.array([each[:3] for each in of_agent.values()], dtype=float).T  # None is not a number
+        estimates = np.array([each[:3] for each in of_agent.values()], dtype=float)  # None is not a number
+        values = estimates[:, 0]
         radar.plot(np.append(angles, 0), np.append(values, values[0]), markersize=3, label=short(agent), **look)
         places = numbers + (position + 0.5) * height - 0.4
-        bars.barh(places, values, height, color=look["color"])
-        bars.hlines(places, low, high, color="black", linewidth=0.8)
-        for place in places[np.isnan(values)]:
-            bars.text(0.01, place, "no value", va="center", fontsize=5, color=look["color"])
+        _draw_bars(bars, places, height, estimates, look["color"])
     radar.set_xticks(angles, numbers)
     radar.set_rgrids((0.5, 1.0), angle=18, fontsize=6)
     radar.set(theta_zero_location="N", theta_direction=-1, ylim=(0, 1))
@@ -95,3 +94,12 @@ def _figures(scores: Profiles, titles: Sequence[str]) -> Iterator[CaptionedFigur
     figure.legend(loc="outside upper center", ncols=3)
     caption = f"{MEANING}{left_out(len(scores), MOST_AGENTS, 'agents')}"
     yield CaptionedFigure("profile", "Profile", caption, figure)
+
+
+def _draw_bars(axes: Any, places: np.ndarray, height: float, estimates: np.ndarray, color: str) -> None:
+    """Draw the scores of an agent, float [properties, 3]: value and ends of the interval, NaN where there is none."""
+    values = estimates[:, 0]
+    axes.barh(places, values, height, color=color)
+    axes.hlines(places, estimates[:, 1], estimates[:, 2], color="black", linewidth=0.8)
+    for place in places[np.isnan(values)]:
+        axes.text(0.01, place, "no value", va="center", fontsize=5, color=color)

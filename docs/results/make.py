@@ -39,6 +39,7 @@ TABLES = {
     "collectives": "studies.collectives.runs",
     "no_labels": "studies.no_labels.runs",
     "rl2_swap": "studies.baselines.swap",
+    "adaptation": "studies.adaptation",
     "task_free": "studies.no_labels.task_free",
     "together_fo_b1": "studies.together",
 }

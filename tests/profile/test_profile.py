@@ -114,7 +114,7 @@ def test_the_policy_of_an_optimum_scores_1(name):
 
 
 def curves(name, solves):
-    """A log in which ``solves(task, evaluation)`` says from which evaluation of its own block on a task is solved."""
+    """A log of an agent that solves each task from the evaluation number ``solves(task)`` of its block on."""
     curriculum = curricula.load(name)
     log = RunLog()
     log.append("run", trained=[[1 + task for task in block] for block in curriculum.trained])
