@@ -12,6 +12,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import hydra
@@ -78,12 +79,12 @@ def show(run_dir: Path, report: bool) -> None:
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
-    """Print the table of a sweep that is done, if it is not long, and the command that shows more."""
+    """Print the table of a sweep that is done, if it is not long and scipy is there, and the command that shows more."""
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():
         print(f"ctgraph-rl collectives {folder} makes a page of figures and tables")
-    elif len(run_dirs) > MOST_IN_TABLE:
+    elif len(run_dirs) > MOST_IN_TABLE or find_spec("scipy") is None:
         print(f"ctgraph-rl results {folder} prints a table")
     else:
         from ctgraph_rl.report.results import print_table  # here: --help and a wrong setting need no torch
