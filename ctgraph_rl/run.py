@@ -79,7 +79,7 @@ def show(run_dir: Path, report: bool) -> None:
 
 
 def show_sweep(run_dirs: Sequence[Path]) -> None:
-    """Print the table of a sweep that is done, if it is not long and scipy is there, and the command that shows more."""
+    """Print the table of a sweep that is done, if it is short and scipy is there, and the command that shows more."""
     here = Path(os.path.relpath(os.path.commonpath(run_dirs)))
     folder = terminal_text(shlex.quote(str(here)))
     if not (run_dirs[0] / LOG).exists():

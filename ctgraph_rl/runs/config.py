@@ -406,4 +406,6 @@ def _unknown_setting(asked: str, node: DictConfig) -> str:
 
 def _says_what_to_do(error: BaseException) -> bool:
     """Return whether an error says more than what caused it."""
-    return isinstance(error, (ValueError, OSError, ModuleNotFoundError)) and not isinstance(error, OmegaConfBaseException)
+    if isinstance(error, OmegaConfBaseException):
+        return False
+    return isinstance(error, (ValueError, OSError, ModuleNotFoundError))
