@@ -1,9 +1,10 @@
-"""A progress bar on a terminal, and in a notebook with ipywidgets; a line every ten seconds elsewhere."""
+"""Progress bars on a terminal, and in a notebook with ipywidgets; a line every ten seconds elsewhere."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from datetime import timedelta
 from importlib.util import find_spec
 from types import TracebackType
@@ -12,6 +13,59 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 SECONDS_BETWEEN_LINES = 10.0
+
+QUICK = 2.0
+"""Seconds in which a command shows nothing."""
+
+Count = Callable[[str, int, int], object]
+"""Is called with the name of steps, how many are done and how many there are."""
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """Show nothing; a `Count`."""
+
+
+class StepCounter:
+    """Shows steps done, rate and time left on standard error once `QUICK` seconds have passed; a context manager.
+
+    Args:
+        console: where it shows; default: standard error.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = Console(stderr=True) if console is None else console
+        self._bar = Progress(
+            BarColumn(bar_width=16), TextColumn("{task.description}"), console=self.console, transient=True
+        )
+        self._task = self._bar.add_task("")
+        self._what = ""
+        self._first = self._start = self._now = self._last_line = time.perf_counter()
+
+    def __enter__(self) -> StepCounter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.console.is_terminal:
+            self._bar.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Count a step, see `Count`."""
+        if what != self._what:
+            self._what = what
+            self._start = self._now
+        self._now = time.perf_counter()
+        if self._now - self._first < QUICK:
+            return
+        rate = done / (self._now - self._start)
+        text = f"{done}/{total} {what}  {rate:.3g}/s  {timedelta(seconds=round((total - done) / rate))} left"
+        if self.console.is_terminal:
+            self._bar.start()
+            self._bar.update(self._task, completed=done, total=total, description=text)
+        elif self._last_line == self._first or self._now - self._last_line >= SECONDS_BETWEEN_LINES:
+            self._last_line = self._now
+            self.console.print(text, highlight=False, soft_wrap=True)
 
 
 class ProgressBar:

@@ -73,7 +73,7 @@ def collectives() -> ArgumentParser:
     of members, and who helped whom; the same as tidy CSV files. ctgraph-rl report takes members like other runs.
     """
     parser = _parser(collectives)
-    _add(parser, "runs", "directories of collectives, or folders that hold them", nargs="+")
+    _add(parser, "runs", "directories of collectives, or folders that hold them", type=existing, nargs="+")
     _add(parser, "--out", "where the page goes (default: collectives/)", default=Path("collectives"))
     return parser
 
@@ -150,7 +150,7 @@ def profile() -> ArgumentParser:
 def report() -> ArgumentParser:
     """Write a page of figures and tables of runs."""
     parser = _parser(report)
-    _add(parser, "runs", "run directories, or folders that hold them", nargs="+")
+    _add(parser, "runs", "run directories, or folders that hold them", type=existing, nargs="+")
     _add(parser, "--out", "where the report goes (default: report/ within the one folder given)")
     _add_agent(parser)
     parser.add_argument("--width", default="text", help="of figures: text of a page, or column, one of its two")
@@ -172,7 +172,7 @@ def results() -> ArgumentParser:
     of one configuration has changed between runs; these runs are named and shown separately.
     """
     parser = _parser(results)
-    _add(parser, "runs", "run directories, or folders that hold them", nargs="+")
+    _add(parser, "runs", "run directories, or folders that hold them", type=existing, nargs="+")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--all", action="store_true", help="show every measure instead of the most important")
     which.add_argument("--metrics", metavar="A,B", help="show these measures; 'solved' is one of each task")
@@ -263,6 +263,14 @@ def _add_task(parser: ArgumentParser) -> None:
     _add(who, "--run", "the trained agent of a run acts, in a task of its curriculum")
     parser.add_argument("--sampled", action="store_true", help="the trained agent samples and explores")
     _add(parser, "--seed", "of the environment", default=0, type=int)
+
+
+def existing(text: str) -> Path:
+    """Read a path of runs that exists."""
+    path = Path(text)
+    if not path.exists():
+        raise argparse.ArgumentTypeError(f"{text} holds no run: there is no such directory")
+    return path
 
 
 def decisions(text: str) -> tuple[int, ...]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 
 from ctgraph_rl import parsers
+from ctgraph_rl.learn.progress import StepCounter
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import METRICS
 from ctgraph_rl.log.refuse import refused_by
@@ -20,14 +20,15 @@ def main() -> None:
     with refused_by(parser):
         if len(arguments.runs) == 1 and (arguments.runs[0] / METRICS).is_file():
             print_summary(arguments.runs[0])
-        report = write_report(
-            arguments.runs,
-            arguments.out,
-            arguments.agent,
-            width=arguments.width,
-            colours=arguments.colour,
-            progress=partial(print, file=sys.stderr) if sys.stderr.isatty() else None,
-        )
+        with StepCounter() as count:
+            report = write_report(
+                arguments.runs,
+                arguments.out,
+                arguments.agent,
+                width=arguments.width,
+                colours=arguments.colour,
+                count=count,
+            )
     incomplete = print_problems(report.problems, report.runs)
     count = len(report.runs)
     print(f"report of {count} run{'s' * (count != 1)}: {terminal_text(report.page)}")

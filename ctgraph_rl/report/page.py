@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctgraph_rl import __version__
 from ctgraph_rl.checks import require
 from ctgraph_rl.disk import is_writable, made_folder, write_whole
+from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.report import formats, results
 from ctgraph_rl.report.figures.adaptation import adaptation_curves
 from ctgraph_rl.report.figures.aggregates import improvements, profiles
@@ -37,9 +38,6 @@ OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
 
 OF_AGENT: tuple[Callable[[Section, Result, Trees], CaptionedFigure | None], ...] = (transfer_maps, task_trees)
 """Figures of an agent with finished runs, in their order; None where there is nothing to draw."""
-
-QUICK = 2.0
-"""Seconds of a report that tells no progress."""
 
 MOST_ROWS = 2000
 """Rows up to which the table of every measure is shown."""
@@ -104,7 +102,7 @@ def write_report(
     agents: Sequence[str] = (),
     width: str = "text",
     colours: Sequence[str] = (),
-    progress: Callable[[str], object] | None = None,
+    count: Count = silent,
 ) -> Report:
     """Write ``report.html``, ``report.md``, ``tables.tex`` and ``figures/`` for all runs in or below some folders.
 
@@ -115,15 +113,14 @@ def write_report(
         agents: names and order of agents, see `ctgraph_rl.report.names.displayed`.
         width: of figures: ``text`` of a page, or one of two columns, ``column``.
         colours: of agents, each as ``NAME=COLOUR`` with its name in figures.
-        progress: is called with a sentence after each curriculum, once `QUICK` seconds have passed.
+        count: is called after each run that is read, each agent and each figure.
 
     Raises:
         ModuleNotFoundError: before any work, without what the extra ``report`` installs.
         ValueError: if there is no run that can be read, and for a width, an agent or a colour that there is not.
     """
-    start = time.perf_counter()
     require_packages()
-    runs, problems = find_runs(paths)
+    runs, problems = find_runs(paths, count)
     require((bool(runs), "; ".join(problem.reason for problem in problems)))
     runs = displayed(runs, agents)
     chosen = colours_of(runs, colours)
@@ -132,14 +129,10 @@ def write_report(
     if folder is None:
         within = len(paths) == 1 and is_writable(paths[0])
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
-    gallery = Gallery(Path(folder), width, chosen)
-    found = sections(runs)
+    found = sections(runs, count)
+    gallery = Gallery(Path(folder), width, chosen, partial(count, "figures", total=_most_figures(found)))
     together = gallery.write((), (experiments(each) for each in [found]))  # drawn in the gallery's style
-    parts = []
-    for section in found:
-        parts.append(_part(section, gallery))
-        if progress is not None and time.perf_counter() - start > QUICK:
-            progress(f"report: {len(parts)} of {len(found)} curricula")
+    parts = [_part(section, gallery) for section in found]
     page = Path(folder) / "report.html"
     for file in (page, page.with_suffix(".md")):
         text = rendered(
@@ -160,6 +153,12 @@ def write_report(
         write_whole(file, text)
     write_whole(Path(folder) / "tables.tex", _latex(parts))
     return Report(page, runs, problems)
+
+
+def _most_figures(found: Sequence[Section]) -> int:
+    """Return the number of figures of a report, if none is left out."""
+    agents = sum(min(len(section.results), MOST_AGENTS) for section in found)
+    return 1 + len(found) * len(OF_SECTION) + agents * len(OF_AGENT)
 
 
 def _title(parts: Sequence[Part]) -> str:

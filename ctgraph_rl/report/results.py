@@ -13,6 +13,7 @@ from typing import Any
 from ctgraph_rl import metrics, parsers
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
+from ctgraph_rl.learn.progress import Count, StepCounter, silent
 from ctgraph_rl.log.escape import csv_text, terminal_text
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import refused_by
@@ -91,18 +92,21 @@ class Row:
         return self.agent if self.seed is None else f"{self.agent}, seed {self.seed}"
 
 
-def table(runs: Sequence[Run], statistics: str = "exact") -> list[Row]:
+def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent) -> list[Row]:
     """Every metric, and how tasks ended, for each agent on each curriculum.
 
     Args:
         runs: finished or not.
         statistics: one of `ctgraph_rl.parsers.STATISTICS`.
+        count: is called after each agent on a curriculum.
     """
     bounds = bounds_by_curriculum(runs)
     rows = []
-    for (name, agent), by_seed in grouped(runs).items():
+    groups = grouped(runs)
+    for done, ((name, agent), by_seed) in enumerate(groups.items(), 1):
         lines = (*_metrics(by_seed, bounds[name], statistics), *_at_the_end(by_seed, bounds[name], statistics))
         rows += [Row(name, agent, *line) for line in lines]
+        count("agents", done, len(groups))
     return rows
 
 
@@ -314,11 +318,12 @@ def main() -> None:
         require(*(positive(difference=arguments.difference) if arguments.difference is not None else ()))
         if arguments.tidy is not None:
             check_table(arguments.tidy)
-        runs, problems = find_runs(arguments.runs)
-        require((bool(runs), "; ".join(problem.reason for problem in problems)))
-        runs = displayed(runs, arguments.agent)
-        pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
-        rows = rows_by_seed(runs) if arguments.per_seed else table(runs, arguments.statistics)
+        with StepCounter() as count:
+            runs, problems = find_runs(arguments.runs, count)
+            require((bool(runs), "; ".join(problem.reason for problem in problems)))
+            runs = displayed(runs, arguments.agent)
+            pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
+            rows = rows_by_seed(runs) if arguments.per_seed else table(runs, arguments.statistics, count)
         names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
         also = ["interquartile_return"] if arguments.statistics == "iqm" else []
         shown = rows if arguments.all else selected(rows, names, also)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.report.bounds import NO_BOUNDS, BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import measure_name
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
@@ -143,14 +144,14 @@ class Section:
         return {which: (names[which], *known[which]) for which in names}
 
 
-def sections(runs: Sequence[Run]) -> list[Section]:
-    """A section for each curriculum, in the order of the runs."""
+def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
+    """A section for each curriculum, in the order of the runs; counts agents on curricula."""
     agents: dict[str, list[Result]] = {}
     bounds = bounds_by_curriculum(runs)
     for (curriculum, agent), by_seed in grouped(runs).items():
         agents.setdefault(curriculum, []).append(Result(agent, by_seed, bounds[curriculum]))
     rows: dict[str, list[Row]] = {}
-    for row in table(runs):
+    for row in table(runs, count=count):
         rows.setdefault(row.curriculum, []).append(row)
     modified = modifications(runs)
     return [Section(name, tuple(results), rows[name], modified.get(name, "")) for name, results in agents.items()]

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.labels import Span, label_spans
+from ctgraph_rl.learn.progress import Count, silent
 from ctgraph_rl.log.damage import metrics_of
 from ctgraph_rl.log.files import FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON, MOST_BYTES_OF_METRICS, no_run
 from ctgraph_rl.log.measurement import check, parsed
@@ -134,27 +135,34 @@ BySeed = Mapping[int, Run | None]
 """Runs that differ only in their seed; None for a seed that only other agents have."""
 
 
-def find_runs(paths: Iterable[Path | str]) -> tuple[list[Run], list[Problem]]:
+def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[Run], list[Problem]]:
     """Every run in or below the directories, and what is left out: unreadable logs, and one run that is there twice.
 
     Single-task experts are left out without a word where there are other runs.
+
+    Args:
+        paths: directories.
+        count: is called after each file that is read.
     """
     found, problems = [], []
     refused: dict[Path, Path] = {}
+    every = []
     for path in paths:
         files, deep = files_below(Path(path), (LOG, FAILURE))
         problems += [Problem(each, too_deep(each)) for each in deep]
         if not files:
             problems.append(Problem(Path(path), no_run(Path(path))))
-        for file in files:
-            try:
-                if file.name == LOG:
-                    run = read_run(file.parent)
-                    found.append(((*run.configuration, run.seed), run))
-                elif not (file.parent / LOG).exists():
-                    refused.setdefault(file.parent.resolve(), file.parent)
-            except Exception as error:  # a broken directory is never an end for others
-                problems.append(Problem(file.parent, one_line_of(error, file)))
+        every += files
+    for done, file in enumerate(every, 1):
+        try:
+            if file.name == LOG:
+                run = read_run(file.parent)
+                found.append(((*run.configuration, run.seed), run))
+            elif not (file.parent / LOG).exists():
+                refused.setdefault(file.parent.resolve(), file.parent)
+        except Exception as error:  # a broken directory is never an end for others
+            problems.append(Problem(file.parent, one_line_of(error, file)))
+        count("runs read", done, len(every))
     problems += [Problem(folder, f"{folder} did not begin, {_failure(folder)}") for folder in refused.values()]
     runs: dict[tuple[Any, ...], Run] = {}
     for key, run in [each for each in found if each[1].group[0] != EXPERT] or found:

@@ -108,6 +108,7 @@ def test_an_unknown_word_is_refused_with_what_may_have_been_meant(call, runs, wo
 
 
 LISTS = ("", "--version", "curiculum", "agents", "methods", "curricula", "curricula list --format markdown", "agent=pp")
+MISSING = ("results nowhere", "report nowhere", "collectives nowhere")
 HELPS = tuple(f"{name} --help" for name in cli.COMMANDS)
 
 ONE_AFTER_THE_OTHER = """
@@ -122,14 +123,16 @@ for words in sys.argv[1:]:
 """
 
 
-def test_what_only_lists_imports_no_torch(checkout, tmp_path):
+def test_what_only_lists_or_names_a_missing_folder_imports_no_torch(checkout, tmp_path):
     env = {**os.environ, "PYTHONPATH": str(checkout)}
-    command = [sys.executable, "-c", ONE_AFTER_THE_OTHER, *LISTS, *HELPS]
+    words = (*LISTS, *HELPS, *MISSING)
+    command = [sys.executable, "-c", ONE_AFTER_THE_OTHER, *words]
 
     result = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
 
     ended = [line for line in result.stdout.splitlines() if line.startswith("ENDED")]
-    assert ended == [f"ENDED {words} False" for words in (*LISTS, *HELPS)], result.stderr
+    assert ended == [f"ENDED {each} False" for each in words], result.stderr
+    assert result.stderr.count("nowhere holds no run") == len(MISSING)
 
 
 @pytest.mark.parametrize(

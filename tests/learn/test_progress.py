@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from ctgraph_rl.learn import progress
-from ctgraph_rl.learn.progress import ProgressBar
+from ctgraph_rl.learn.progress import ProgressBar, StepCounter
 
 
 def written(terminal: bool) -> Console:
@@ -83,3 +83,28 @@ def test_a_run_that_goes_on_says_so_at_once(terminal):
     assert "resumed after 2.5k frames" in said
     assert bar._bar.tasks[0].completed == 2_500
     assert "evaluating before training" not in said
+
+
+def test_steps_are_shown_with_rate_and_time_left_once_two_seconds_have_passed(monkeypatch):
+    now = iter([0.0, 1.0, 4.0, 5.0, 14.0, 16.0])
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(now))
+    console = written(False)
+
+    with StepCounter(console) as count:
+        for done in (1, 2, 3, 4):
+            count("runs read", done, 8)
+        count("agents", 1, 3)
+
+    assert console.file.getvalue().splitlines() == [
+        "2/8 runs read  0.5/s  0:00:12 left",
+        "4/8 runs read  0.286/s  0:00:14 left",
+    ]
+
+
+def test_the_steps_of_a_quick_command_are_not_shown():
+    console = written(True)
+
+    with StepCounter(console) as count:
+        count("runs read", 1, 1)
+
+    assert console.file.getvalue() == ""

@@ -61,14 +61,14 @@ def test_a_report_is_four_kinds_of_files_within_the_one_folder_given(whole):
     ]
 
 
-def test_a_report_tells_progress_once_it_takes_long(tmp_path, monkeypatch, no_figures):
+def test_a_report_counts_runs_agents_and_figures(tmp_path, no_figures):
+    steps = []
     write_run(tmp_path / "run")
-    told: dict[float, list[str]] = {1e9: [], -1.0: []}
-    for quick, sentences in told.items():
-        monkeypatch.setattr(page, "QUICK", quick)
-        write_report([tmp_path / "run"], tmp_path / "report", progress=sentences.append)
 
-    assert told == {1e9: [], -1.0: ["report: 1 of 1 curricula"]}
+    write_report([tmp_path / "run"], tmp_path / "report", count=lambda *step: steps.append(step))
+
+    assert steps[:2] == [("runs read", 1, 1), ("agents", 1, 1)]
+    assert steps[2:] == [("figures", done, len(steps) - 2) for done in range(1, len(steps) - 1)]
 
 
 def test_several_folders_have_their_report_in_the_working_directory(tmp_path, monkeypatch, no_figures):

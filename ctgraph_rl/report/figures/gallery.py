@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,12 +47,21 @@ class Gallery:
         folder: of the report.
         width: of figures, see `style`.
         colours: of agents, see `style`.
+        count: is called with how many figures are drawn or not there to be drawn.
     """
 
-    def __init__(self, folder: Path, width: str = "text", colours: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        width: str = "text",
+        colours: Mapping[str, str] | None = None,
+        count: Callable[[int], object] | None = None,
+    ) -> None:
         self.folder = folder
         self.width = width
         self.colours = colours
+        self._count = count
+        self._done = 0
         self._taken: set[str] = set()
         made_folder(folder / FOLDER)
 
@@ -60,7 +69,7 @@ class Gallery:
         """Draw and write figures, skipping None; their file names start with ``names``."""
         written = []
         with style(self.width, self.colours):
-            for one in filter(None, figures):
+            for one in filter(None, map(self._counted, figures)):
                 path = f"{FOLDER}/{self._stem(*names, one.kind)}"
                 png = picture(one.figure, "png")
                 one.figure.set_layout_engine("none")  # its work is done, and is most of the time of a figure
@@ -68,6 +77,13 @@ class Gallery:
                 write_whole(self.folder / f"{path}.pdf", picture(one.figure, "pdf"))
                 written.append(Written(f"{path}.png", one.title, one.caption, base64.b64encode(png).decode()))
         return written
+
+    def _counted(self, figure: CaptionedFigure | None) -> CaptionedFigure | None:
+        """Count a figure, and return it."""
+        self._done += 1
+        if self._count is not None:
+            self._count(self._done)
+        return figure
 
     def _stem(self, *names: str) -> str:
         """A new name for a file, of letters that every system takes."""
