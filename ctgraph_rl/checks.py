@@ -8,6 +8,7 @@ import operator
 import os
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from difflib import get_close_matches
@@ -56,9 +57,14 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
     Initials count as a name, such as ``lr`` for ``learning_rate``; a part of a single name counts, too.
     """
     known = {choice.lower().replace("-", "_"): choice for choice in choices}
+    initials = []
+    parts = []
     word = word.lower().replace("-", "_")
-    initials = [name for name in known if word == "".join(part[:1] for part in name.split("_")) and len(word) > 1]
-    parts = [name for name in known if word in name.split("_")]
+    for name in known:
+        if len(word) > 1 and word == "".join(re.findall("(?:^|_)([^_])", name)):
+            initials.append(name)
+        if word in name.split("_"):
+            parts.append(name)
     close = get_close_matches(word, known, 1)
     found = [word] if word in known else close or initials[:1] or (parts if len(parts) == 1 else [])
     return known[found[0]] if found else None
@@ -104,6 +110,16 @@ def is_int(value: object, low: float = -math.inf, high: float = math.inf) -> boo
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
 
 
+def are_ints(value: object, low: float = -math.inf, high: float = math.inf) -> bool:
+    """True for a list of what `is_int` is true for."""
+    return isinstance(value, list) and all(is_int(each, low, high) for each in value)
+
+
+def repeated(values: Iterable[T]) -> list[T]:
+    """Return the values that are there more than once, each once."""
+    return [value for value, count in Counter(values).items() if count > 1]
+
+
 def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bool:
     """True for a finite ``int`` or ``float`` (not a ``bool``) in [low, high]."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -147,11 +163,10 @@ def _plain(value: Any, whole: bool) -> Any:
 
 def make_fields_plain(instance: Any) -> None:
     """Replace the numbers and arrays in the fields of a frozen dataclass by plain ones, see `plain`."""
-    for each in (field for field in fields(instance) if field.init):
-        value = getattr(instance, each.name)
-        found = plain(value, whole=_is_whole(each.type))
-        if found is not value:
-            object.__setattr__(instance, each.name, found)
+    for each in fields(instance):
+        if each.init:
+            value = getattr(instance, each.name)
+            object.__setattr__(instance, each.name, plain(value, whole=_is_whole(each.type)))
 
 
 def takes_numbers(function: Function) -> Function:
@@ -176,8 +191,8 @@ def takes_numbers(function: Function) -> Function:
 
 
 KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "int": ("an integer", lambda value: is_int(value)),
-    "float": ("a number", lambda value: is_real(value)),
+    "int": ("an integer", is_int),
+    "float": ("a number", is_real),
     "bool": ("true or false", lambda value: isinstance(value, bool)),
     "str": ("a text", lambda value: isinstance(value, str)),
     "Sequence": ("a list", lambda value: isinstance(as_tuple(value), tuple)),

@@ -107,15 +107,17 @@ def other_curriculum(curriculum: Curriculum, key: str) -> Curriculum:
         curriculum: what was learned.
         key: decides images and goals.
     """
-    others: dict[TaskLike, TaskLike] = {}
-    held_out = curriculum.evaluation.held_out
-    for task in (*curriculum.tasks, *held_out):
-        others[task] = other_task(task, key) if isinstance(task, Task) else task
-    blocks = tuple(replace(block, tasks=tuple(others[task] for task in block.tasks)) for block in curriculum.blocks)
-    evaluation = replace(curriculum.evaluation, held_out=tuple(others[task] for task in held_out))
+
+    def other(task: TaskLike) -> TaskLike:
+        return other_task(task, key) if isinstance(task, Task) else task
+
+    blocks = []
+    for block in curriculum.blocks:
+        blocks.append(replace(block, tasks=tuple(map(other, block.tasks))))
+    evaluation = replace(curriculum.evaluation, held_out=tuple(map(other, curriculum.evaluation.held_out)))
     name = f"{curriculum.name} (held out)"
     source = f"{curriculum.source}; images and goals drawn by {key}"
-    return replace(curriculum, name=name, source=source, blocks=blocks, evaluation=evaluation)
+    return replace(curriculum, name=name, source=source, blocks=tuple(blocks), evaluation=evaluation)
 
 
 def other_task(task: Task, key: str) -> Task:
@@ -140,8 +142,10 @@ def renamed(path: tuple[int, ...], branching_factor: int, key: str) -> tuple[int
         branching_factor: b.
         key: decides the new names.
     """
-    names = (_names(path[:place], branching_factor, key) for place in range(len(path)))
-    return tuple(new[decision] for new, decision in zip(names, path, strict=True))
+    new = []
+    for place, decision in enumerate(path):
+        new.append(_names(path[:place], branching_factor, key)[decision])
+    return tuple(new)
 
 
 def _names(before: tuple[int, ...], branching_factor: int, key: str) -> Mapping[int, int]:

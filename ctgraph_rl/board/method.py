@@ -10,7 +10,17 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, did_you_mean, is_int, is_real, is_shallow, require
+from ctgraph_rl.checks import (
+    NamedValues,
+    ReadOnlyValues,
+    Rule,
+    are_ints,
+    did_you_mean,
+    is_int,
+    is_real,
+    is_shallow,
+    require,
+)
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import named, yaml_value
 from ctgraph_rl.tasks.protocol import Protocol
@@ -43,8 +53,6 @@ failed: {}                  # seeds of runs without results, each with the reaso
 """
 """A ``method.yaml`` to fill in, with a comment on every line."""
 
-WRITTEN = ("track_version",)
-"""Keys that `ctgraph_rl.board.submit` writes, and earlier submissions do not have."""
 
 MOST_BYTES = 2**16
 """Largest ``method.yaml`` that is read."""
@@ -101,7 +109,7 @@ def check_method(method: Any) -> None:
 def _key_rules(given: ReadOnlyValues, example: ReadOnlyValues, prefix: str) -> list[Rule]:
     """Return the rules that an object has the keys of another one, and so have its parts."""
     rules = [(key in given, f"{prefix}{key} is missing; it may be null or empty") for key in example]
-    known = [*example, *(() if prefix else WRITTEN)]
+    known = [*example] if prefix else [*example, "track_version"]  # which earlier submissions do not have
     rules += [(key in known, f"unknown key {prefix}{key}: {did_you_mean(str(key), known)}") for key in given]
     for key, part in example.items():
         if isinstance(part, Mapping) and part and key in given:
@@ -113,20 +121,24 @@ def _key_rules(given: ReadOnlyValues, example: ReadOnlyValues, prefix: str) -> l
 
 def _rules(method: ReadOnlyValues) -> list[Rule]:
     """Return the rules for the values of an object with the right keys."""
-    code, tuning, compute = (method[key] for key in ("code", "tuning", "compute"))
+    code = method["code"]
+    tuning = method["tuning"]
+    compute = method["compute"]
     authors = method["authors"]
     failed = method["failed"]
     listed = isinstance(authors, list) and bool(authors) and all(map(_is_text, authors))
-    reasons = isinstance(failed, Mapping) and all(is_int(seed, 0) and _is_text(why) for seed, why in failed.items())
+    reasons = isinstance(failed, Mapping) and are_ints(list(failed), 0) and all(map(_is_text, failed.values()))
     seeds = tuning["seeds"]
-    whole = isinstance(seeds, list) and all(is_int(seed, 0) for seed in seeds)
     repository = code["repository"]
     commit = code["commit"]
     given = method["given"]
     return [
-        *(_text_rule(name, value) for name, value in (("name", method["name"]), ("code.licence", code["licence"]))),
-        *(_text_rule(f"given.{key}", given[key], or_null=True) for key in ("boundaries", "task_id")),
-        *(_text_rule(key, method[key], or_null=True) for key in ("track", "paper")),
+        _text_rule("name", method["name"]),
+        _text_rule("code.licence", code["licence"]),
+        _text_rule("given.boundaries", given["boundaries"], or_null=True),
+        _text_rule("given.task_id", given["task_id"], or_null=True),
+        _text_rule("track", method["track"], or_null=True),
+        _text_rule("paper", method["paper"], or_null=True),
         _text_rule("tuning.how", tuning["how"]),
         _text_rule("compute.hardware", compute["hardware"], or_null=True),
         (listed, f"authors must be a list of names, got {authors!r:.80}"),
@@ -142,14 +154,9 @@ def _rules(method: ReadOnlyValues) -> list[Rule]:
         (is_int(track_version(method), 1), f"track_version must be an integer >= 1, got {track_version(method)!r:.80}"),
         _count_rule("given.guide_frames", given["guide_frames"], or_null=True),
         _count_rule("bytes_per_task", method["bytes_per_task"]),
-        (whole, f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),
-        *(
-            (
-                compute[key] is None or is_real(compute[key], 0),
-                f"compute.{key} must be a number >= 0 or null, got {compute[key]!r:.80}",
-            )
-            for key in ("hours", "tuning_hours")
-        ),
+        (are_ints(seeds, 0), f"tuning.seeds must be a list of seeds, such as [100, 101], got {seeds!r:.80}"),
+        _hours_rule("hours", compute["hours"]),
+        _hours_rule("tuning_hours", compute["tuning_hours"]),
         (reasons, f"failed must have a reason for each seed, such as {{3: out of memory}}, got {failed!r:.80}"),
     ]
 
@@ -172,6 +179,10 @@ def _count_rule(name: str, value: object, or_null: bool = False) -> Rule:
     return is_int(value, 0) or (or_null and value is None), f"{name} must be {choice}, got {value!r:.80}"
 
 
+def _hours_rule(name: str, value: object) -> Rule:
+    return value is None or is_real(value, 0), f"compute.{name} must be a number >= 0 or null, got {value!r:.80}"
+
+
 def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> NamedValues:
     """Return a method with what is null in it as the runs say it.
 
@@ -179,11 +190,10 @@ def completed(method: ReadOnlyValues, facts: Mapping[str, ReadOnlyValues]) -> Na
         method: what a ``method.yaml`` holds.
         facts: what the runs say, as `facts_of` returns it.
     """
-    filled = {
-        part: {key: known.get(key) if value is None else value for key, value in method[part].items()}
-        for part, known in facts.items()
-    }
-    return {**method, **filled}
+    filled = dict(method)
+    for part, known in facts.items():
+        filled[part] = {key: known.get(key) if value is None else value for key, value in method[part].items()}
+    return filled
 
 
 def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
@@ -195,10 +205,10 @@ def facts_of(protocol: Protocol, runs: Sequence[Any]) -> dict[str, NamedValues]:
     """
     given = {key: getattr(protocol, key) for key in EXAMPLE["given"]}
     shared: dict[Any, float] = {}
+    machines: dict[str, None] = {}
     for run in runs:
-        key = run.group or run.seed
-        shared[key] = max(shared.get(key, 0.0), run.seconds)
-    machines = dict.fromkeys(f"{run.cpu or run.machine}, threads: {run.num_threads}" for run in runs)
+        shared[run.seeds] = max(shared.get(run.seeds, 0.0), run.seconds)
+        machines[f"{run.cpu or run.machine}, threads: {run.num_threads}"] = None
     hours = round(math.fsum(shared.values()) / 3600, 4)
     return {"given": given, "compute": {"hardware": "; ".join(machines), "hours": hours}}
 
@@ -214,7 +224,6 @@ def fact_rules(
         runs: lines of ``runs.csv``.
         num_tasks: of the curriculum.
     """
-    said = method["given"]
     hours = method["compute"]["hours"]
     logged = facts["compute"]["hours"]
     near = hours is None or abs(hours - logged) <= max(HOURS_APART, SHARE_APART * logged)
@@ -224,14 +233,11 @@ def fact_rules(
     all_kept = f"{kept:,} bytes for {num_tasks - 1} further tasks"
     further = method["bytes_per_task"]
     less = f"bytes_per_task is {further}, {all_kept}, the agents of the runs have {largest:,} bytes in all: correct it"
-    return [
-        *(
-            (
-                said[key] in (None, known),
-                f"given.{key} is {said[key]!r}, the runs were given {known!r}: write null, or that",
-            )
-            for key, known in facts["given"].items()
-        ),
-        (near, f"compute.hours is {hours}, the logs of the runs have {logged}: write null, or that"),
-        (fits, less),
-    ]
+    rules = []
+    for key, known in facts["given"].items():
+        said = method["given"][key]
+        rules.append(
+            (said in (None, known), f"given.{key} is {said!r}, the runs were given {known!r}: write null, or that")
+        )
+    rules.append((near, f"compute.hours is {hours}, the logs of the runs have {logged}: write null, or that"))
+    return [*rules, (fits, less)]

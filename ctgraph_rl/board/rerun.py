@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 from ctgraph_rl.board.isolate import Isolation, Limits, Outcome, run_isolated
 from ctgraph_rl.board.relearn import Relearning, run_dir_of
-from ctgraph_rl.board.rescore import Check, equal
+from ctgraph_rl.board.rescore import NO_ROW, Check, differing, equal
 from ctgraph_rl.board.submission import MOST_BYTES_OF_A_FILE, Submission, SubmittedRun, counted, experts_of, log_sum
 from ctgraph_rl.board.two_samples import compared
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import are_ints, is_int, require
 from ctgraph_rl.disk import made_folder, open_own, read_regular, read_text, require_no_link, write_whole
 from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, FAILURE, LOG, METRICS, MOST_BYTES_OF_A_REASON
@@ -32,6 +32,7 @@ from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_st
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.parsers import LEVELS
 from ctgraph_rl.portable import VARIABLES, cpu_model
+from ctgraph_rl.runs.read import split_by
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
 
@@ -122,9 +123,10 @@ def cells_of(submission: Submission, drawn: Sequence[SubmittedRun], folder: Path
         folder: where each process has a folder.
     """
     cells = []
-    for seeds in dict.fromkeys(run.group or (run.seed,) for run in drawn):
+    groups = split_by(submission.runs, lambda run: run.seeds)
+    for seeds in split_by(drawn, lambda run: run.seeds):
         own = folder / f"seed{'-'.join(map(str, seeds))}"
-        runs = tuple(run for run in submission.runs if (run.group or (run.seed,)) == seeds)
+        runs = tuple(groups[seeds])
         job = job_of(submission, seeds, runs[0])._replace(experts=_groups_of_experts(submission, runs))
         cells.append(RerunCell(own, job, runs, submission.curriculum, max(run.seconds for run in runs)))
     return cells
@@ -136,8 +138,8 @@ def _groups_of_experts(submission: Submission, runs: Sequence[SubmittedRun]) -> 
     for run in runs:
         for each in experts_of(submission.log(run)) if run.finished else ():
             seeds = each.get("together", [run.seed])
-            known = isinstance(seeds, list) and all(is_int(seed, 0) for seed in seeds)
-            require((known, f"the log of {run.run} has an expert with odd seeds, {seeds!r:.80}: restore it"))
+            odd = f"the log of {run.run} has an expert with odd seeds, {seeds!r:.80}: restore it"
+            require((are_ints(seeds, 0), odd))
             found[each["task"], tuple(seeds)] = None
     return tuple(found)
 
@@ -214,8 +216,8 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
     """Read what a seed has left; what cannot be read is a failure."""
     run_dir = run_dir_of(cell.folder, seed)
     try:
-        for path in (run_dir, *(run_dir / name for name in (LOG, AGENT, METRICS, FAILURE))):
-            require_no_link(path)
+        for name in ("", LOG, AGENT, METRICS, FAILURE):
+            require_no_link(run_dir / name)
         if not (run_dir / METRICS).is_file():
             return _failed(run_dir, outcome)
         log = RunLog.read(run_dir / LOG)
@@ -229,10 +231,13 @@ def result_of(cell: RerunCell, seed: int, outcome: Outcome) -> Rerun:
 
 def _experts(folder: Path, log: RunLog) -> tuple[RunLog, ...]:
     """Return the logs of the single-task experts that a log names; they must be in the folder of its process."""
-    paths = [(folder / str(each.get("run")) / LOG).resolve() for each in experts_of(log)]
-    inside = all(path.is_relative_to(folder) for path in paths)
-    require((inside, "its experts are outside the folder of its process: experts_dir must be a relative path"))
-    return tuple(map(RunLog.read, paths))
+    logs = []
+    for each in experts_of(log):
+        path = (folder / str(each.get("run")) / LOG).resolve()
+        outside = "its experts are outside the folder of its process: experts_dir must be a relative path"
+        require((path.is_relative_to(folder), outside))
+        logs.append(RunLog.read(path))
+    return tuple(logs)
 
 
 def _failed(run_dir: Path, outcome: Outcome) -> Rerun:
@@ -263,12 +268,16 @@ def why_other_bits(submission: Submission, runs: Sequence[SubmittedRun]) -> list
         this["machine"] = f"{platform.machine()} portable"
     device = str(submission.config.get("device", "cpu"))
     reasons = [f"device {device}"] if device != "cpu" else []
-    now = {name: version for name, version in versions().items() if name not in OWN_VERSION}
-    then = {name: submission.versions.get(name) for name in now}
-    reasons += [f"{name} {then[name]} there, {now[name]} here" for name in now if then[name] != now[name]]
-    compared_parts = ("machine",) if portable else ("machine", "cpu")
-    pairs = dict.fromkeys((part, getattr(run, part), this[part]) for run in runs for part in compared_parts)
-    return reasons + [f"{part} {before} there, {own} here" for part, before, own in pairs if before != own]
+    for name, own in versions().items():
+        before = submission.versions.get(name)
+        if name not in OWN_VERSION and before != own:
+            reasons.append(f"{name} {before} there, {own} here")
+    for run in runs:
+        for part in ("machine",) if portable else ("machine", "cpu"):
+            before = getattr(run, part)
+            if before != this[part]:
+                reasons.append(f"{part} {before} there, {this[part]} here")
+    return list(dict.fromkeys(reasons))
 
 
 def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequence[RunLog] = ()) -> list[Check]:
@@ -294,17 +303,17 @@ def checks_of(run: SubmittedRun, submitted: RunLog, result: Rerun, experts: Sequ
     note = "" if log.passed else first_difference(submitted, result.log)
     checks = [log._replace(note=note), equal("agent of the rerun", run.agent_sha256, result.agent_sha256, run.run)]
     checks.append(equal(BYTES, run.agent_bytes, result.agent_bytes, run.run))
-    sums = [[log_sum(each) for each in some] for some in (experts, result.experts)]
-    pairs = enumerate(zip_longest(*sums, fillvalue="none"), 1)
-    checks += [equal(f"log of expert {number} of the rerun", one, other, run.run) for number, (one, other) in pairs]
+    pairs = zip_longest(map(log_sum, experts), map(log_sum, result.experts), fillvalue="none")
+    for number, (one, other) in enumerate(pairs, 1):
+        checks.append(equal(f"log of expert {number} of the rerun", one, other, run.run))
     return [check._replace(level=RERUN) for check in checks]
 
 
 def first_difference(submitted: RunLog, found: RunLog) -> str:
     """Return in words the first measurement in which two logs differ; empty if there is none."""
-    lines = [[counted(measurement) for measurement in log.measurements] for log in (submitted, found)]
-    for number, (one, other) in enumerate(zip_longest(*lines, fillvalue={}), 1):
-        keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+    lines = zip_longest(map(counted, submitted.measurements), map(counted, found.measurements), fillvalue=NO_ROW)
+    for number, (one, other) in enumerate(lines, 1):
+        keys = differing(one, other)
         if keys:
             values = ", ".join(f"{key} {one.get(key)!r:.60} and {other.get(key)!r:.60}" for key in keys[:3])
             return terminal_text(f"first in line {number}, {one.get('kind', other.get('kind'))}: {values}")
@@ -328,8 +337,12 @@ def score_of(log: RunLog, curriculum: Curriculum, name: str) -> float | None:
 def submitted_scores(submission: Submission) -> list[float]:
     """Return the metric that is compared of each submitted run, as far as it has a value."""
     name = score_name(submission)
-    values = (score_of(submission.log(run), submission.curriculum, name) for run in submission.finished)
-    return [value for value in values if value is not None]
+    found = []
+    for run in submission.finished:
+        value = score_of(submission.log(run), submission.curriculum, name)
+        if value is not None:
+            found.append(value)
+    return found
 
 
 def check_of_scores(submission: Submission, found: Sequence[float], what: str, level: str, note: str = "") -> Check:
@@ -362,25 +375,24 @@ def verified(submission: Submission, results: Mapping[SubmittedRun, Rerun], othe
         results: of each run that was learned again.
         other_bits: why bits are not promised here; see `why_other_bits`.
     """
-    by_run = {
-        run: checks_of(run, submission.log(run), result, submission.experts(run) or () if run.finished else ())
-        for run, result in results.items()
-    }
-    differing = {}
-    for run, checks in by_run.items():
-        log = results[run].log
-        other = any(check.passed is False for check in checks if check.what != BYTES)
-        if run.finished and other and log is not None:
-            differing[run] = log
-    if not other_bits or not differing:
-        return [check for checks in by_run.values() for check in checks]
     name = score_name(submission)
-    values = [score_of(log, submission.curriculum, name) for log in differing.values()]
+    every: list[Check] = []
+    without_bits: list[Check] = []
+    scored: list[float | None] = []
+    for run, result in results.items():
+        experts = submission.experts(run) if run.finished else None
+        checks = checks_of(run, submission.log(run), result, experts or ())
+        every += checks
+        wrong = [check for check in checks if check.passed is False and check.what != BYTES]
+        if run.finished and wrong and result.log is not None and other_bits:
+            scored.append(score_of(result.log, submission.curriculum, name))
+            checks = [check for check in checks if check.what == BYTES]
+        without_bits += checks
+    if not scored:
+        return every
     note = f"bits differ, as they may with {'; '.join(other_bits)}"
-    what = f"{name} of {len(values)} reruns"
-    check = check_of_scores(submission, [v for v in values if v is not None], what, RERUN, note)
-    pairs = [(run, each) for run, checks in by_run.items() for each in checks]
-    return [check, *(each for run, each in pairs if run not in differing or each.what == BYTES)]
+    values = [value for value in scored if value is not None]
+    return [check_of_scores(submission, values, f"{name} of {len(scored)} reruns", RERUN, note), *without_bits]
 
 
 def _frames(run_dir: Path) -> int:

@@ -72,6 +72,11 @@ class Check(NamedTuple):
         return f"{where}{self.what}: expected {self.expected}, found {self.found}{note}"
 
 
+def differing(one: ReadOnlyValues, other: ReadOnlyValues) -> list[str]:
+    """Return the names that have other values in two mappings; None stands for none."""
+    return [name for name in {**one, **other} if one.get(name) != other.get(name)]
+
+
 def equal(what: str, expected: object, found: object, run: str = "") -> Check:
     """Return the check that two values are equal."""
     return Check(what, str(expected), str(found), expected == found, run)
@@ -87,10 +92,12 @@ def rescore(submission: Submission) -> list[Check]:
     """
     require_parquet()
     checks = [*_of_the_whole(submission)]
-    logs = {run: submission.log(run) for run in submission.runs}
-    for run, log in logs.items():
+    finished = {}
+    for run in submission.runs:
+        log = submission.log(run)
         checks += _of_the_log(submission, run, log)
-    finished = {run: log for run, log in logs.items() if run.finished}
+        if run.finished:
+            finished[run] = log
     checks += _of_metrics(submission, finished)
     return checks + _of_evaluations(submission, list(finished.values()))
 
@@ -157,10 +164,11 @@ def _of_experts(submission: Submission, run: SubmittedRun, log: RunLog) -> Itera
     """Yield checks that the logs of experts are those that a log names."""
     said = experts_of(log)
     alone = [expert.of_kind("run")[0] for expert in submission.experts(run) or ()]
-    for what, key in {"curricula": "fingerprint", **({"groups": "together"} if said else {})}.items():
-        expected = [each.get(key) for each in said]
-        found = [each.get(key) for each in alone]
-        yield equal(f"{what} of experts", expected, found, run.run)
+    for what, key in (("curricula", "fingerprint"), ("groups", "together")):
+        if said or what == "curricula":
+            expected = [each.get(key) for each in said]
+            found = [each.get(key) for each in alone]
+            yield equal(f"{what} of experts", expected, found, run.run)
 
 
 def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> Iterator[Check]:
@@ -169,7 +177,10 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
     how = submission.curriculum.evaluation
     yield equal("frames", curriculum.num_frames, log.ends()[-1], run.run)
     tasks_at = Evaluator(curriculum, run.seed, log).tasks_at
-    wanted = [(at, number, how.num_episodes) for at in curriculum.moments for number, _ in tasks_at(at).values()]
+    wanted = []
+    for at in curriculum.moments:
+        for number, _ in tasks_at(at).values():
+            wanted.append((at, number, how.num_episodes))
     there = [(m["frames"], m["task"], m.get("episodes")) for m in log.of_kind("evaluation")]
     notes = []
     for what, some in (("missing", {*wanted} - {*there}), ("more", {*there} - {*wanted})):
@@ -180,19 +191,19 @@ def of_the_protocol(submission: Submission, run: SubmittedRun, log: RunLog) -> I
 
 def metrics_text(found: Mapping[SubmittedRun, Mapping[str, Metric]]) -> str:
     """Return the content of ``metrics.csv``."""
-    rows = [cells for run, metrics in found.items() for cells in _metric_cells(run, metrics).values()]
-    return csv_text([list(METRIC_COLUMNS), *rows])
+    rows = [list(METRIC_COLUMNS)]
+    for run, metrics in found.items():
+        rows += _metric_cells(run, metrics).values()
+    return csv_text(rows)
 
 
 def _metric_cells(run: SubmittedRun, metrics: Mapping[str, Metric]) -> dict[str, list[str]]:
     """Return the cells of the lines of a run in ``metrics.csv``, by metric."""
-    return {
-        name: [
-            *(run.run, str(run.seed), name),
-            *("" if metric.value is None else repr(metric.value), metric.definition, metric.undefined or ""),
-        ]
-        for name, metric in metrics.items()
-    }
+    found = {}
+    for name, metric in metrics.items():
+        value = "" if metric.value is None else repr(metric.value)
+        found[name] = [run.run, str(run.seed), name, value, metric.definition, metric.undefined or ""]
+    return found
 
 
 def near(one: object, other: object) -> bool:
@@ -211,8 +222,9 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
     same_kind = submission.scored_on == machine()["machine"]
     wrong = []
     count = 0
-    needed = {name for stated in submission.metrics.values() for name in stated}
-    needed |= {*MEASURES} if submission.track is None else {*MEASURES, submission.track.score}
+    needed = set(MEASURES).union(*submission.metrics.values())
+    if submission.track is not None:
+        needed.add(submission.track.score)
     more = sorted(set(submission.metrics) - {run.run for run in logs})
     rule = "no finished run has this name"
     if more:
@@ -223,11 +235,13 @@ def _of_metrics(submission: Submission, logs: Mapping[SubmittedRun, RunLog]) -> 
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError) as error:
             wrong.append(Check(METRICS, "metrics of the log", "none", False, run.run, note=str(error)))
             continue
-        stated = {name: list(row.values()) for name, row in submission.metrics.get(run.run, {}).items()}
-        names = [name for name in {**cells, **stated} if name in needed]
-        count += len(names)
-        found = [_of_metric(run.run, name, cells.get(name), stated.get(name), same_kind) for name in names]
-        wrong += filter(None, found)
+        stated = submission.metrics.get(run.run, {})
+        for name in {**cells, **stated}:
+            if name in needed:
+                count += 1
+                line = list(stated[name].values()) if name in stated else None
+                check = _of_metric(run.run, name, cells.get(name), line, same_kind)
+                wrong += [] if check is None else [check]
     return wrong or [equal(METRICS, f"{count} values", f"{count} values")]
 
 
@@ -242,9 +256,13 @@ def _of_metric(
         return Check(what, _value(cells), _value(stated), False, run)
     if not same_kind and cells[4:] == stated[4:] and near(_number(cells[3]), _number(stated[3])):
         return None
-    pairs = [pair for pair in zip(cells, stated, strict=True) if pair[0] != pair[1]]
-    expected, found = (", ".join(cell or "nothing" for cell in side) for side in zip(*pairs, strict=True))
-    return Check(what, expected, found, False, run)
+    expected = []
+    found = []
+    for cell, other in zip(cells, stated, strict=True):
+        if cell != other:
+            expected.append(cell or "nothing")
+            found.append(other or "nothing")
+    return Check(what, ", ".join(expected), ", ".join(found), False, run)
 
 
 def _value(cells: Sequence[str] | None) -> str:
@@ -279,6 +297,5 @@ def _differing(one: ReadOnlyValues, other: ReadOnlyValues) -> tuple[str, str]:
     """Return in words what two rows have where they differ."""
     if not one or not other:
         return ("a row" if one else "no row"), ("a row" if other else "no row")
-    names = [name for name in {**one, **other} if one.get(name) != other.get(name)]
-    first, second = (listed(f"{name}={row.get(name)}" for name in names) for row in (one, other))
-    return first, second
+    names = differing(one, other)
+    return listed(f"{name}={one.get(name)}" for name in names), listed(f"{name}={other.get(name)}" for name in names)

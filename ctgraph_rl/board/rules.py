@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
 from ctgraph_rl.board.tracks import Track
@@ -39,10 +41,9 @@ def curriculum_rule(curriculum: Curriculum, of_track: Track | None) -> Rule:
     name = curriculum.name.removesuffix(MODIFIED)
     found = curriculum.fingerprint
     if of_track is not None:
-        wanted = ", ".join(each.curriculum.fingerprint for each in of_track.variants)
-        is_there = of_track.variant_of(curriculum) is not None
-        return is_there, (
-            f"curriculum {name} has fingerprint {found}, track {of_track.id} has {wanted}: "
+        wanted = of_track.by_fingerprint
+        return found in wanted, (
+            f"curriculum {name} has fingerprint {found}, track {of_track.id} has {', '.join(wanted)}: "
             f"run ctgraph-rl -m track={of_track.name}, with no other curriculum, protocol or evaluation"
         )
     published = is_published(replace(curriculum, name=name))
@@ -92,40 +93,48 @@ def same_rules(runs: Sequence[Run]) -> Iterator[Rule]:
     yield not nameless, f"{listed(nameless)} do not name their learner: {fix}"
     curricula = {f"{run.curriculum[0]} (fingerprint {run.curriculum[1]})" for run in runs}
     yield len(curricula) == 1, f"runs are of several curricula, {listed(sorted(curricula))}: submit those of one"
-    settings = dict.fromkeys(key for run in runs for key in run.settings) if not nameless else ()
-    several = {key: _values(run.settings.get(key) for run in runs) for key in settings}
-    differing = [f"{key}={' and '.join(values)}" for key, values in several.items() if len(values) > 1]
-    yield not differing, f"runs are of several configurations, {listed(differing)}: submit those of one"
-    names = dict.fromkeys(name for run in runs for name in run.code)
-    mixed = [name for name in names if len(_values(run.code.get(name, "") for run in runs)) > 1]
+    several = {} if nameless else _differing([run.settings for run in runs])
+    shown = listed(map("=".join, several.items()))
+    yield not several, f"runs are of several configurations, {shown}: submit those of one"
+    mixed = _differing([run.code for run in runs], absent="")
     yield not mixed, f"runs are of different code, {listed(mixed)} differs between them: run all with one"
-    versions = [run.about.get("versions") or {} for run in runs]
-    other = []
-    for name in dict.fromkeys(name for of_run in versions for name in of_run):
-        values = _values(of_run.get(name) for of_run in versions)
-        other += [f"{name} {' and '.join(values)}"] if len(values) > 1 else []
-    yield not other, f"runs are of different versions, {listed(other)}: run all with one"
+    other = _differing([run.about.get("versions") or {} for run in runs])
+    shown = listed(map(" ".join, other.items()))
+    yield not other, f"runs are of different versions, {shown}: run all with one"
 
 
-def _values(values: Iterable[Any]) -> list[str]:
-    """Return different values as texts, in order."""
-    return list(dict.fromkeys(json.dumps(value, sort_keys=True).strip('"') for value in values))
+def _differing(given: Sequence[ReadOnlyValues], absent: object = None) -> dict[str, str]:
+    """Return the names that have several values, each with these in words."""
+    found = {}
+    for name in dict.fromkeys(chain(*given)):
+        values: dict[str, None] = {}
+        for each in given:
+            values[json.dumps(each.get(name, absent), sort_keys=True).strip('"')] = None
+        if len(values) > 1:
+            found[name] = " and ".join(values)
+    return found
 
 
 def code_rules(runs: Sequence[Run]) -> Iterator[Rule]:
     """Yield the rules that the code of all runs is known, and that it has not changed since."""
-    unknown = [run.path for run in runs if any(value is None for value in run.code.values())]
-    unsaid = [run.path for run in runs if run.about.get("sources") is None and run.path not in unknown]
+    unknown: list[Path] = []
+    unsaid: list[Path] = []
+    changed: dict[str, None] = {}
+    for run in runs:
+        if None in run.code.values():
+            unknown.append(run.path)
+        elif run.about.get("sources") is None:
+            unsaid.append(run.path)
+        changed |= dict.fromkeys(code_changes(run.about, _code_now(run.about)))
     fix = "run again from files, and with Recorder(code=[MyLearner])"
     yield not unknown + unsaid, f"{listed(unknown + unsaid)} do not say of which source they are: {fix}"
-    changed = dict.fromkeys(name for run in runs for name in code_changes(run.about, _code_now(run.about)))
     yield not changed, f"the code has changed since the runs, {listed(changed)}: run again, or submit with that code"
 
 
 def _code_now(about: ReadOnlyValues) -> dict[str, Any]:
     """Return the code of this process, as far as a run's log names its parts; None for what cannot be found."""
     stored = about.get("sources") or {}
-    found = sources_of(name for name in stored if name not in SCRIPTS)
+    found = sources_of(stored.keys() - {*SCRIPTS})
     sources = {**dict.fromkeys(stored), **found} if about.get("sources") is not None else None
     return {"fingerprint": about["fingerprint"], "numbers": NUMBERS, "sources": sources}
 
@@ -163,16 +172,27 @@ def oracle_rule(config: ReadOnlyValues) -> Rule:
 
     A class of `baselines` goes by the name of the module that defines it only: what other names stand for is unknown.
     """
-    groups = {part: config.get(part) for part in ("method", "detector")}
-    names = {part: str(each.get("_target_")) for part, each in groups.items() if isinstance(each, Mapping)}
-    unknown = [f"{part}={name}" for part, name in names.items() if name.startswith(OF_OURS) and not _kind(part, name)]
+    unknown = []
+    named = []
+    parts: dict[str, object] = {}
+    for group in ("method", "detector"):
+        settings = config.get(group)
+        if not isinstance(settings, Mapping):
+            continue
+        name = str(settings.get("_target_"))
+        kind = _kind(group, name)
+        part = None if kind is None else _part(kind, settings)
+        if part is not None:
+            parts[group] = part
+            named.append(f"{group}={type(part).__name__}")
+        elif kind is None and name.startswith(OF_OURS):
+            unknown.append(f"{group}={name}")
     if unknown:
         return False, f"{listed(unknown)} is no method or detector of baselines: name it by the module that defines it"
-    parts = {part: _part(part, each) for part, each in groups.items()}
-    reads = [getattr(parts["method"], "reads_tasks", ""), getattr(parts["detector"], "is_oracle", False)]
-    named = [f"{part}={type(each).__name__}" for part, each in parts.items() if each is not None]
-    return reads[0] in MAY_BE_READ and not reads[1], (
-        f"{' '.join(named)} is an oracle, which reads {reads[0] or 'the true tasks'}: it is a reference for others, "
+    reads = getattr(parts.get("method"), "reads_tasks", "")
+    is_oracle = getattr(parts.get("detector"), "is_oracle", False)
+    return reads in MAY_BE_READ and not is_oracle, (
+        f"{' '.join(named)} is an oracle, which reads {reads or 'the true tasks'}: it is a reference for others, "
         f"submit runs without it"
     )
 
@@ -183,13 +203,9 @@ def _kind(part: str, name: str) -> type | None:
     return None if ours is None else class_named(ours[1], ours[2])
 
 
-def _part(part: str, settings: Any) -> object:
-    """Return what a group of a configuration builds, if its class is one of `baselines`; None for any other."""
-    settings = settings if isinstance(settings, Mapping) else {}
-    kind = _kind(part, str(settings.get("_target_")))
-    if kind is None:
-        return None
+def _part(kind: type, settings: ReadOnlyValues) -> object:
+    """Return what a group of a configuration builds of a class of ours; None for settings of another version."""
     try:
         return kind(**{key: value for key, value in with_added(settings).items() if not key.startswith("_")})
-    except (TypeError, ValueError):  # settings of another version
+    except (TypeError, ValueError):
         return None

@@ -25,7 +25,7 @@ from typing import Any
 
 from ctgraph_rl.board.method import read_method
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_shallow, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_shallow, repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import csv_text, from_csv
 from ctgraph_rl.log.files import CURRICULUM
@@ -70,6 +70,7 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=-]{0,119}")
 """Names of runs, which are names of files."""
 
 SUM = re.compile(r"[0-9a-f]{64}")
+WHOLE = re.compile(r"[0-9]{1,19}")
 
 NOT_COUNTED = ("versions", "machine", "num_threads", "cpu", "source")
 """Fields of a log's first line that its sum leaves out; the fingerprint stands for what the source describes."""
@@ -128,9 +129,14 @@ class SubmittedRun:
         return self.state == FINISHED
 
     @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds of its group; its own for a run without others."""
+        return self.group or (self.seed,)
+
+    @property
     def cells(self) -> list[Any]:
         """The cells of its line."""
-        return [" ".join(map(str, each)) if isinstance(each, tuple) else each for each in vars(self).values()]
+        return list({**vars(self), "group": " ".join(map(str, self.group))}.values())
 
 
 @dataclass(frozen=True)
@@ -178,8 +184,10 @@ class Submission:
             ValueError: see `log`.
             OSError: if one of them cannot be read.
         """
-        numbers = [each["task"] for each in experts_of(self.log(run))]
-        return [read_log(self.path / log_name(run.run, number)) for number in numbers] or None
+        found = []
+        for each in experts_of(self.log(run)):
+            found.append(read_log(self.path / log_name(run.run, each["task"])))
+        return found or None
 
     @cached_property
     def metrics(self) -> dict[str, dict[str, dict[str, str]]]:
@@ -194,12 +202,13 @@ class Submission:
         """SHA-256 over the sums of all files but verifications and hidden ones, in the order of their names."""
         names = []
         for file in _files(self.path):
-            own = file.relative_to(self.path)
-            hidden = any(part.startswith(".") for part in own.parts)
-            if not hidden and own.as_posix() != VERIFICATION:
-                names.append(own.as_posix())
-        lines = [f"{name} {sha256_of(self.path / name, MOST_BYTES)}\n" for name in sorted(names)]
-        return hashlib.sha256("".join(lines).encode()).hexdigest()
+            name = file.relative_to(self.path).as_posix()
+            if "/." not in f"/{name}" and name != VERIFICATION:
+                names.append(name)
+        found = hashlib.sha256()
+        for name in sorted(names):
+            found.update(f"{name} {sha256_of(self.path / name, MOST_BYTES)}\n".encode())
+        return found.hexdigest()
 
 
 def read_submission(path: Path | str, of_track: Track | None = None, config_dir: Path | None = None) -> Submission:
@@ -216,8 +225,7 @@ def read_submission(path: Path | str, of_track: Track | None = None, config_dir:
     """
     path = Path(path)
     require((path.is_dir(), f"{path} must be the folder of a submission"))
-    names = [str(each) for each in _files(path)]
-    odd = [name for name in names if name != name.encode("utf-8", "replace").decode()]
+    odd = [name for name in map(str, _files(path)) if name != name.encode("utf-8", "replace").decode()]
     missing = [name for name in (*FILES, LOGS) if not (path / name).exists()]
     require(
         (not odd, f"{path} has names that are not UTF-8, {', '.join(map(ascii, odd[:3]))}: give them others"),
@@ -251,52 +259,43 @@ def read_runs(path: Path) -> tuple[SubmittedRun, ...]:
     """
     rows = _rows(path, COLUMNS, ["run"], MOST_RUNS)
     runs = [_run(row, f"{path}: line {number}") for number, row in enumerate(rows, 2)]
-    names = [run.run.lower() for run in runs]
-    seeds = [run.seed for run in runs]
+    names = sorted(repeated(run.run.lower() for run in runs))
+    seeds = sorted(repeated(str(run.seed) for run in runs))
     require(
         (len(rows) > 0, f"{path} must have 1..{MOST_RUNS:,} runs, got none"),
-        (len(set(names)) == len(names), f"{path} names a run twice: {_twice(names)}"),
-        (len(set(seeds)) == len(seeds), f"{path} has a seed twice: {_twice(seeds)}"),
+        (not names, f"{path} names a run twice: {', '.join(names[:3])}"),
+        (not seeds, f"{path} has a seed twice: {', '.join(seeds[:3])}"),
     )
     return tuple(sorted(runs, key=lambda run: run.seed))
-
-
-def _twice(values: Sequence[Any]) -> str:
-    return ", ".join(sorted({str(value) for value in values if values.count(value) > 1})[:3])
 
 
 def _run(row: Mapping[str, str], place: str) -> SubmittedRun:
     """Return a line of ``runs.csv``."""
     group = row["group"].split(" ") if row["group"] else []
-    whole = {"seed": row["seed"], "num_threads": row["num_threads"]} | {f"group {each}": each for each in group}
-    sums = {"log_sha256": row["log_sha256"]}
-    if row["agent_bytes"]:
-        whole["agent_bytes"] = row["agent_bytes"]
-    if row["agent_sha256"]:
-        sums["agent_sha256"] = row["agent_sha256"]
     is_time = re.fullmatch(r"[0-9]+(\.[0-9]+)?", row["seconds"]) is not None and float(row["seconds"]) <= MOST_SECONDS
-    require(
+    rules = [
         (NAME.fullmatch(row["run"]) is not None, f"{place}: run must be a name of a file, got {row['run']!r:.80}"),
         (
             row["state"] in (FINISHED, FAILED),
             f"{place}: state must be {FINISHED} or {FAILED}, got {row['state']!r:.80}",
         ),
-        *(
-            (
-                re.fullmatch(r"[0-9]{1,19}", value) is not None,
-                f"{place}: {key} must be an integer >= 0, got {value!r:.80}",
-            )
-            for key, value in whole.items()
-        ),
-        *(
-            (SUM.fullmatch(value) is not None, f"{place}: {key} must be 64 hexadecimal digits, got {value!r:.80}")
-            for key, value in sums.items()
-        ),
+    ]
+    whole = [("seed", row["seed"]), ("num_threads", row["num_threads"]), *((f"group {each}", each) for each in group)]
+    for key, value in (*whole, ("agent_bytes", row["agent_bytes"] or "0")):
+        rules.append((WHOLE.fullmatch(value) is not None, f"{place}: {key} must be an integer >= 0, got {value!r:.80}"))
+    for key in ("log_sha256", "agent_sha256"):
+        value = row[key]
+        is_sum = SUM.fullmatch(value) is not None or (key == "agent_sha256" and not value)
+        rules.append((is_sum, f"{place}: {key} must be 64 hexadecimal digits, got {value!r:.80}"))
+    require(
+        *rules,
         (is_time, f"{place}: seconds must be a number in 0..{MOST_SECONDS:,.0f}, got {row['seconds']!r:.80}"),
     )
-    values: NamedValues = {**row, "agent_bytes": None}
-    values |= {key: int(value) for key, value in whole.items() if key in row}
-    return SubmittedRun(**values | {"group": tuple(map(int, group)), "seconds": float(row["seconds"])})
+    values: NamedValues = {**row, "seed": int(row["seed"]), "num_threads": int(row["num_threads"])}
+    values["agent_bytes"] = int(row["agent_bytes"]) if row["agent_bytes"] else None
+    values["group"] = tuple(map(int, group))
+    values["seconds"] = float(row["seconds"])
+    return SubmittedRun(**values)
 
 
 def _rows(path: Path, columns: Mapping[str, str], key: Sequence[str], most: int) -> list[dict[str, str]]:
@@ -320,8 +319,12 @@ def _versions(path: Path) -> dict[str, str]:
     with named(path):
         text = read_regular(path, MOST_BYTES_OF_A_CONFIGURATION).decode("utf-8")
     lines = text.replace("\r\n", "\n").removesuffix("\n").split("\n")  # no other letter ends a line, as for pip
-    pairs = {name: version for name, _, version in (line.removeprefix("# ").partition("==") for line in lines)}
-    wrong = [name for name, version in pairs.items() if not version]
+    pairs = {}
+    wrong = []
+    for line in lines:
+        name, _, version = line.removeprefix("# ").partition("==")
+        pairs[name] = version
+        wrong += [] if version else [name]
     require(
         (len(pairs) == len(lines), f"{path} has a name twice: leave one out"),
         (not wrong, f"{path} must have lines such as torch==2.9.0, got {wrong[:1]!r:.80}"),
@@ -332,8 +335,10 @@ def _versions(path: Path) -> dict[str, str]:
 
 def versions_text(versions: Mapping[str, str], machine: str) -> str:
     """Return the content of ``versions.txt``, which pip reads as constraints; what is no package is a comment."""
-    lines = {**versions, MACHINE: machine}
-    return "".join(f"{'# ' * (name in NO_PACKAGES)}{name}=={value}\n" for name, value in sorted(lines.items()))
+    text = ""
+    for name, value in sorted({**versions, MACHINE: machine}.items()):
+        text += f"{'# ' * (name in NO_PACKAGES)}{name}=={value}\n"
+    return text
 
 
 def runs_text(runs: Sequence[SubmittedRun]) -> str:
@@ -348,9 +353,12 @@ def log_name(run: str, expert: int | None = None) -> str:
 
 def experts_of(log: RunLog) -> list[NamedValues]:
     """Return what a log says of single-task experts, in the order of tasks; empty without any."""
-    said = [each for line in log.of_kind("experts") for each in line.get("experts", ())]
-    numbered = all(isinstance(each, dict) and is_int(each.get("task"), 1) for each in said)
-    require((numbered, "the log names experts without the numbers of their tasks: restore it"))
+    said: list[NamedValues] = []
+    for line in log.of_kind("experts"):
+        said += line.get("experts", ())
+    for each in said:
+        numbered = isinstance(each, dict) and is_int(each.get("task"), 1)
+        require((numbered, "the log names experts without the numbers of their tasks: restore it"))
     return said
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import filterfalse
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import yaml
 
 from ctgraph_rl import parsers
 from ctgraph_rl.board import submission as files
-from ctgraph_rl.board.method import TEMPLATE, WRITTEN, completed, fact_rules, facts_of, read_method
+from ctgraph_rl.board.method import TEMPLATE, completed, fact_rules, facts_of, read_method
 from ctgraph_rl.board.rescore import metrics_text, near, rescore
 from ctgraph_rl.board.rules import (
     code_rules,
@@ -38,7 +39,7 @@ from ctgraph_rl.board.submission import (
     versions_text,
 )
 from ctgraph_rl.board.tracks import Track, track
-from ctgraph_rl.checks import ReadOnlyValues, Rule, require
+from ctgraph_rl.checks import ReadOnlyValues, Rule, repeated, require
 from ctgraph_rl.disk import made_folder, new_folder, require_new, write_whole
 from ctgraph_rl.log.escape import listed, terminal_text
 from ctgraph_rl.log.files import AGENT, CURRICULUM, LOG
@@ -48,7 +49,8 @@ from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_state
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
-from ctgraph_rl.runs.read import Run, find_runs
+from ctgraph_rl.metrics import Metric
+from ctgraph_rl.runs.read import Run, find_runs, reasons
 from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
@@ -85,7 +87,8 @@ def submit(
     lines = [_line(run, name, method["failed"]) for run, name in zip(runs, names, strict=True)]
     facts = facts_of(curriculum.protocol, lines)
     require(*fact_rules(method, facts, lines, len(curriculum.tasks)))
-    about = {key: value for key, value in completed(method, facts).items() if key not in WRITTEN}
+    about = completed(method, facts)
+    about.pop("track_version", None)
     about["track"] = None
     if of_track is not None:
         about |= {"track": of_track.name, "track_version": of_track.version}
@@ -100,10 +103,16 @@ def submit(
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     """Return the runs that have some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
-    require(*((False, problem.reason) for problem in problems))
-    settings = [dict(flat(run.about["config"])) for run in found]
-    chosen = [run for run, has in zip(found, settings, strict=True) if all(has.get(k) == v for k, v in only.items())]
-    there = [f"{key}={listed(dict.fromkeys(str(has.get(key)) for has in settings))}" for key in only]
+    require((not problems, reasons(problems)))
+    chosen = []
+    values: dict[str, dict[str, None]] = {key: {} for key in only}
+    for run in found:
+        settings = {**dict.fromkeys(only), **dict(flat(run.about["config"]))}
+        if only.items() <= settings.items():
+            chosen.append(run)
+        for key, own in values.items():
+            own[str(settings[key])] = None
+    there = [f"{key}={listed(own)}" for key, own in values.items()]
     require((bool(chosen), f"no run is left by --only; there are {'; '.join(there)}"))
     return sorted(chosen, key=lambda run: run.seed)
 
@@ -116,7 +125,7 @@ def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) ->
     config = runs[0].about["config"]
     rules += [entry_rule(config, method["entry_point"]), oracle_rule(config)]
     curricula = [run.path / CURRICULUM for run in runs]
-    unwritten = [path for path in curricula if not path.exists()]
+    unwritten = list(filterfalse(Path.exists, curricula))
     message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a curriculum of ours"
     rules.append((not unwritten, message))
     first = None if unwritten else Curriculum.from_json(curricula[0])
@@ -126,7 +135,8 @@ def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) ->
         rules += [curriculum_rule(first, of_track), (not other, message)]
     fix = "submit from the directory that the run was started in"
     for run in runs:
-        missing = [path for path in _experts(run).values() if not path.is_file()] if run.reason is None else []
+        experts = _experts(run) if run.reason is None else {}
+        missing = list(filterfalse(Path.is_file, experts.values()))
         message = f"{run.path} was trained with experts, {listed(missing)} cannot be found: {fix}"
         rules.append((not missing, message))
     require(*rules)
@@ -142,7 +152,7 @@ def _experts(run: Run) -> dict[int, Path]:
 def _names(runs: Sequence[Run]) -> list[str]:
     """Return a name for each run: that of its directory, or its seed where these are no different names of files."""
     names = [run.path.resolve().name for run in runs]
-    usable = all(files.NAME.fullmatch(name) for name in names) and len({name.lower() for name in names}) == len(names)
+    usable = all(map(files.NAME.fullmatch, names)) and not repeated(map(str.lower, names))
     return names if usable else [f"seed{run.seed}" for run in runs]
 
 
@@ -187,23 +197,26 @@ def _write(
 ) -> None:
     """Write all files of a submission."""
     made_folder(folder / files.LOGS)
+    logs = []
+    found = {}
     for run, line in zip(runs, lines, strict=True):
         write_whole(folder / log_name(line.run), packed((run.path / LOG).read_bytes()))
-        for number, path in _experts(run).items() if line.finished else ():
+        if not line.finished:
+            continue
+        experts = _experts(run)
+        for number, path in experts.items():
             write_whole(folder / log_name(line.run, number), packed(path.read_bytes()))
+        logs.append(RunLog.read(run.path / LOG))
+        found[line] = scores(logs[-1], curriculum, list(map(RunLog.read, experts.values())) or None)
+        require(_metrics_rule(run, found[line]))
+    config = dict(runs[0].about["config"])
+    config.pop("seed", None)
     write_whole(folder / files.METHOD, _yaml(method))
-    write_whole(folder / files.CONFIG, _yaml({k: v for k, v in runs[0].about["config"].items() if k != "seed"}))
+    write_whole(folder / files.CONFIG, _yaml(config))
     write_whole(folder / files.VERSIONS, versions_text(runs[0].about["versions"], machine()["machine"]))
     write_whole(folder / CURRICULUM, file_text(curriculum.to_json()))
     write_whole(folder / files.RUNS, runs_text(lines))
-    finished = [(run, line) for run, line in zip(runs, lines, strict=True) if line.finished]
-    logs = [RunLog.read(run.path / LOG) for run, _ in finished]
     write_whole(folder / files.EVALUATIONS, evaluations_parquet(logs))
-    found = {}
-    for (run, line), log in zip(finished, logs, strict=True):
-        experts = [RunLog.read(path) for path in _experts(run).values()] or None
-        found[line] = scores(log, curriculum, experts)
-        require(_metrics_rule(run, {name: metric.value for name, metric in found[line].items()}))
     write_whole(folder / files.METRICS, metrics_text(found))
 
 
@@ -220,10 +233,12 @@ class _WithoutAliases(yaml.SafeDumper):
         return True
 
 
-def _metrics_rule(run: Run, found: Mapping[str, float | None]) -> Rule:
+def _metrics_rule(run: Run, found: Mapping[str, Metric]) -> Rule:
     """Return the rule that the metrics of a run are what its log gives, up to the rounding of another machine."""
-    stored = {name: metric["value"] for name, metric in run.metrics.items() if name in found}
-    other = [f"{name} {value} for {found[name]}" for name, value in stored.items() if not near(value, found[name])]
+    other = []
+    for name, stored in run.metrics.items():
+        if name in found and not near(stored["value"], found[name].value):
+            other.append(f"{name} {stored['value']} for {found[name].value}")
     return not other, f"{run.path} has metrics that its log does not give, {listed(other)}: run it again"
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import filterfalse, product
 from pathlib import Path
 from typing import Any
 
@@ -114,11 +114,16 @@ class Track:
         cfgs: dict[tuple[str, ...], Any] = {}  # each is composed once, as it takes 0.1 s
         found: list[Variant] = []
         for rung in self.rungs:
-            chosen = tuple(setting for setting in rung if not _is_value(setting))
+            chosen = tuple(filterfalse(_is_value, rung))
             if chosen not in cfgs:
                 cfgs[chosen] = config.composed([f"{GROUP}={self.name}", *chosen], self.config_dir)
             found += self._of_rung(rung, cfgs[chosen])
         return tuple(found)
+
+    @cached_property
+    def by_fingerprint(self) -> dict[str, Variant]:
+        """The variants by the fingerprints of their curricula."""
+        return {each.curriculum.fingerprint: each for each in self.variants}
 
     @property
     def curriculum(self) -> Curriculum:
@@ -127,7 +132,7 @@ class Track:
 
     def variant_of(self, curriculum: Curriculum) -> Variant | None:
         """Return the variant with this curriculum; None if the track has no such."""
-        return next((each for each in self.variants if each.curriculum.fingerprint == curriculum.fingerprint), None)
+        return self.by_fingerprint.get(curriculum.fingerprint)
 
     def draw_held_out_seeds(self, digest: str, number: int, count: int) -> tuple[int, ...]:
         """Return different seeds that follow from a submission and a number of the verifier.
@@ -146,7 +151,8 @@ class Track:
     def _of_rung(self, rung: Sequence[str], composed: Any) -> Iterator[Variant]:
         """Yield the variants of a rung, from the configuration with its choices of groups."""
         cfg = deepcopy(composed)
-        for key, _, value in (setting.partition("=") for setting in rung if _is_value(setting)):
+        for setting in filter(_is_value, rung):
+            key, _, value = setting.partition("=")
             group, _, name = key.partition(".")
             cfg[group][name] = yaml.safe_load(value)
         made = config.target(cfg, "curriculum")()
@@ -197,12 +203,13 @@ def track(name: str, config_dir: Path | None = None) -> Track:
     Raises:
         ValueError: for an unknown name, with the one that was probably meant, and for a file that lacks a part.
     """
-    folders = [Path(folder) for folder in (config_dir, conf_dir()) if folder is not None]
-    home = next((folder for folder in folders if name in names_in(folder, GROUP)), None)
-    choices = [each for folder in folders for each in names_in(folder, GROUP)]
-    require((home is not None, f"unknown track {name!r}: {did_you_mean(str(name), choices)}"))
-    assert home is not None
-    file = home / GROUP / f"{name}.yaml"
+    homes: dict[str, Path] = {}
+    ours = Path(conf_dir())
+    for folder in (config_dir or ours, ours):
+        for each in names_in(folder, GROUP):
+            homes.setdefault(each, folder)
+    require((name in homes, f"unknown track {name!r}: {did_you_mean(str(name), homes)}"))
+    file = homes[name] / GROUP / f"{name}.yaml"
     settings = yaml.safe_load(file.read_text(encoding="utf-8"))
     about = settings.get(GROUP) or {}
     values = swept(settings.get("hydra", {}).get("sweeper", {}).get("params", {}))
@@ -223,8 +230,8 @@ def track(name: str, config_dir: Path | None = None) -> Track:
 
 def tracks() -> tuple[Track, ...]:
     """Return the tracks of this package; the small one is the first."""
-    names = names_in(conf_dir(), GROUP)
-    return tuple(track(name) for name in sorted(names, key=lambda name: (name != "small", name)))
+    names = sorted(names_in(conf_dir(), GROUP), key=lambda name: (name != "small", name))
+    return tuple(map(track, names))
 
 
 def _is_value(setting: str) -> bool:
@@ -234,5 +241,8 @@ def _is_value(setting: str) -> bool:
 
 def _in_words(rung: Sequence[str]) -> str:
     """Return a rung as ``depth 2, expected length 10``."""
-    parts = (setting.rpartition(".")[2].partition("=") for setting in rung)
-    return ", ".join(value if key == "curriculum" else f"{key.replace('_', ' ')} {value}" for key, _, value in parts)
+    words = []
+    for setting in rung:
+        key, _, value = setting.rpartition(".")[2].partition("=")
+        words.append(value if key == "curriculum" else f"{key.replace('_', ' ')} {value}")
+    return ", ".join(words)

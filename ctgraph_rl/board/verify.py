@@ -13,7 +13,7 @@ import math
 import secrets
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
@@ -29,7 +29,7 @@ from ctgraph_rl.board.rerun import RERUN, RerunCell, cells_of, draw, learn_again
 from ctgraph_rl.board.rescore import RESCORED, Check, rescore
 from ctgraph_rl.board.submission import MOST_RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.two_samples import runs_needed
-from ctgraph_rl.checks import is_int, is_real, require
+from ctgraph_rl.checks import Rule, is_int, is_real, require
 from ctgraph_rl.disk import made_folder, write_whole
 from ctgraph_rl.learn.progress import ProgressBar
 from ctgraph_rl.log.escape import terminal_lines, terminal_text
@@ -74,6 +74,11 @@ class Plan(NamedTuple):
     def cells(self) -> list[RerunCell]:
         """All processes, in order."""
         return [*self.reruns, *self.held_out]
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of all processes."""
+        return sum(cell.num_frames for cell in self.cells)
 
 
 class Means(NamedTuple):
@@ -142,26 +147,32 @@ def described(plan: Plan, means: Means) -> list[str]:
     """Return lines about what will run, in which limits, and what is not isolated."""
     submission = plan.submission
     cells = plan.cells
-    seeds = [f"{RERUN} of seeds {_listed(cell.job.seeds for cell in plan.reruns)}"]
-    seeds += [f"{HELD_OUT} seeds {_listed(cell.job.seeds for cell in plan.held_out)}"] if plan.held_out else []
-    frames = sum(cell.num_frames for cell in cells)
+    seeds = f"{RERUN} of seeds {_seeds(plan.reruns)}"
+    if plan.held_out:
+        seeds += f"; {HELD_OUT} seeds {_seeds(plan.held_out)}"
     seconds = sum(cell.seconds for cell in cells)
     limits = means.limits(max(cells, key=lambda cell: cell.seconds))
     most = f"each at most {_time(limits.seconds)}, {means.memory:g} GB of memory and {means.disk:g} GB of disk"
     count = f"{len(cells)} process{'es' * (len(cells) > 1)}"
     lines = [
-        f"number {plan.number} draws {'; '.join(seeds)}",
-        f"{count}, {frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
-        f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_listed([means.paths])}",
-        *([f"scores are tested where bits differ: {'; '.join(plan.other_bits)}"] if plan.other_bits else []),
-        f"isolated: {'; '.join(means.isolation.closed()) or f'nothing, {means.isolation.why_not}'}",
-        *(f"NOT isolated: {text}" for text in means.isolation.missing()),
+        f"number {plan.number} draws {seeds}",
+        f"{count}, {plan.num_frames:,} frames, {_time(seconds)} by the submitted times; {most}; in {plan.folder}",
+        f"code: {code_in_words(submission)}{', also looked for in ' * bool(means.paths)}{_joined(means.paths)}",
     ]
-    return [terminal_text(line) for line in lines]
+    if plan.other_bits:
+        lines.append(f"scores are tested where bits differ: {'; '.join(plan.other_bits)}")
+    lines.append(f"isolated: {'; '.join(means.isolation.closed()) or f'nothing, {means.isolation.why_not}'}")
+    for text in means.isolation.missing():
+        lines.append(f"NOT isolated: {text}")
+    return list(map(terminal_text, lines))
 
 
-def _listed(groups: Iterator[Sequence[object]] | Sequence[Sequence[object]]) -> str:
-    return ", ".join("+".join(map(str, each)) for each in groups)
+def _seeds(cells: Sequence[RerunCell]) -> str:
+    return ", ".join(_joined(cell.job.seeds) for cell in cells)
+
+
+def _joined(values: Iterable[object]) -> str:
+    return "+".join(map(str, values))
 
 
 def _time(seconds: float) -> str:
@@ -219,7 +230,7 @@ def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
     What an earlier verification of the same number has finished is not run again.
     """
     cells = plan.cells
-    total = sum(cell.num_frames for cell in cells)
+    total = plan.num_frames
     before = sum(cell.frames for cell in cells)
     outcomes = {}
     with Bar(len(cells), total, done=min(before, total)) as bar:
@@ -235,11 +246,15 @@ def run_plan(plan: Plan, means: Means) -> dict[int, Outcome]:
 
 def checks_of_plan(plan: Plan, outcomes: Mapping[int, Outcome]) -> list[Check]:
     """Return the checks of all that a plan has run."""
-    ended = list(zip(plan.cells, outcomes.values(), strict=True))
-    again = {run: result_of(cell, run.seed, outcome) for cell, outcome in ended for run in cell.runs}
-    fresh = [(cell, result_of(cell, cell.job.seeds[0], outcome)) for cell, outcome in ended if not cell.runs]
+    again = {}
+    fresh = []
+    for cell, outcome in zip(plan.cells, outcomes.values(), strict=True):
+        for run in cell.runs:
+            again[run] = result_of(cell, run.seed, outcome)
+        if not cell.runs:
+            fresh.append((cell, result_of(cell, cell.job.seeds[0], outcome)))
     checks = verified(plan.submission, again, plan.other_bits)
-    return checks + ([*held_out_checks(plan.submission, fresh)] if fresh else [])
+    return [*checks, *held_out_checks(plan.submission, fresh)] if fresh else checks
 
 
 def level_of(checks: Sequence[Check]) -> str:
@@ -270,14 +285,19 @@ def write_verification(
         plan: what was run; None if only files were checked.
         means: with which limits and isolation.
     """
+    drawn: list[str] = []
+    seeds: list[int] = []
+    for cell in () if plan is None else plan.cells:
+        drawn += [run.run for run in cell.runs]
+        seeds += () if cell.runs else cell.job.seeds
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "level": level_of(checks),
         "bits": not any(check.level == RERUN and not check.run for check in checks),  # false: scores were tested
         "digest": submission.digest,
         "number": None if plan is None else plan.number,
-        "cells": [] if plan is None else [run.run for cell in plan.reruns for run in cell.runs],
-        "held_out_seeds": [] if plan is None else [seed for cell in plan.held_out for seed in cell.job.seeds],
+        "cells": drawn,
+        "held_out_seeds": seeds,
         "isolation": None if means is None else means.isolation._asdict(),
         "checks": [],
         **machine(),
@@ -298,8 +318,11 @@ def report(submission: Submission, checks: Sequence[Check]) -> str:
     about = f"{submission.method['name']}: {len(checks)} checks of {len(submission.runs)} runs"
     verdict = f"{len(wrong)} not passed" if wrong else "all passed"
     lines = [f"{about}, {verdict}; level {level_of(checks)}"]
-    lines += [f"- {'undecided: ' if check.passed is None else ''}{check.text}" for check in wrong]
-    return "\n".join(map(terminal_text, [*lines, *(f"+ {check.text}" for check in scores)]))
+    for check in wrong:
+        lines.append(f"- {'undecided: ' if check.passed is None else ''}{check.text}")
+    for check in scores:
+        lines.append(f"+ {check.text}")
+    return "\n".join(map(terminal_text, lines))
 
 
 def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]:
@@ -355,11 +378,13 @@ def _check(arguments: argparse.Namespace) -> None:
             hours is None or (is_real(hours, 0, MOST_HOURS) and hours > 0),
             f"--hours must be a number > 0 and at most {MOST_HOURS:,}, got {hours}",
         ),
-        *(
-            (is_real(value, LEAST_GB, MOST_GB), f"{option} must be in [{LEAST_GB}, {MOST_GB:,}] GB, got {value}")
-            for option, value in (("--memory", arguments.memory), ("--disk", arguments.disk))
-        ),
+        _size_rule("--memory", arguments.memory),
+        _size_rule("--disk", arguments.disk),
     )
+
+
+def _size_rule(option: str, value: object) -> Rule:
+    return is_real(value, LEAST_GB, MOST_GB), f"{option} must be in [{LEAST_GB}, {MOST_GB:,}] GB, got {value}"
 
 
 def main() -> None:

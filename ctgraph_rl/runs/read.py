@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, require
 from ctgraph_rl.disk import read_regular, read_text
@@ -60,6 +60,17 @@ class History(NamedTuple):
     adaptation: Mapping[str, Adaptation]  # the last one, of ``trained`` and ``held-out`` tasks as far as there is one
     seconds: float
     experts_together: tuple[bool, ...]  # for each single-task expert of the log, whether a group of seeds trained it
+
+
+T = TypeVar("T")
+
+
+def split_by(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
+    """Return the items of each key, in their order."""
+    found: dict[Any, list[T]] = {}
+    for item in items:
+        found.setdefault(key(item), []).append(item)
+    return found
 
 
 @dataclass(frozen=True)
@@ -129,6 +140,11 @@ class Problem(NamedTuple):
 
     path: Path
     reason: str
+
+
+def reasons(problems: Iterable[Problem]) -> str:
+    """Return why directories are left out."""
+    return "; ".join(problem.reason for problem in problems)
 
 
 BySeed = Mapping[int, Run | None]

@@ -14,7 +14,7 @@ from ctgraph_rl.board.method import track_version
 from ctgraph_rl.board.rescore import MEASURES, Check
 from ctgraph_rl.board.submission import METHOD, METRICS, RUNS, VERIFICATION, Submission, read_submission
 from ctgraph_rl.board.tracks import Track, Variant
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import repeated, require
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.log.escape import listed
 from ctgraph_rl.report.bounds import bounds_of_curriculum
@@ -133,11 +133,11 @@ def read_entries(paths: Iterable[Path | str], config_dir: Path | None = None) ->
         config_dir: where tracks of the user are, as ``track/NAME.yaml``.
     """
     found: dict[str, BoardEntry] = {}
-    problems = []
+    problems: list[Problem] = []
     for path in map(Path, paths):
         files, deep = files_below(path, (METHOD,))
         folders = [file.parent for file in files if (file.parent / RUNS).is_file()]
-        problems += [Problem(each, too_deep(each)) for each in deep]
+        problems += map(Problem, deep, map(too_deep, deep))
         if not folders:
             problems.append(Problem(path, f"{path} holds no submission: ctgraph-rl submit RUNS --to DIR makes one"))
         for folder in folders:
@@ -172,14 +172,13 @@ def entry_of(submission: Submission) -> BoardEntry:
         (own.version <= track.version, f"the newest version of the track is {track.id}{other}"),
     )
     assert variant is not None
-    by_seed = {run.seed: run for run in submission.runs}
-    names = [by_seed[seed].run if seed in by_seed else None for seed in track.seeds]
+    names = {run.seed: run.run for run in submission.runs}
     evaluations = sum(frames > 0 for frames in submission.curriculum.moments)
     bounds = bounds_of_curriculum(submission.curriculum, max(1, evaluations))
-    values = {
-        metric: tuple(_value(submission, run, metric, bounds.of_metric(metric)) for run in names)
-        for metric in dict.fromkeys((track.score, *MEASURES))
-    }
+    values = {}
+    for metric in dict.fromkeys((track.score, *MEASURES)):
+        limits = bounds.of_metric(metric)
+        values[metric] = tuple(_value(submission, names.get(seed), metric, limits) for seed in track.seeds)
     return BoardEntry(
         digest=submission.digest,
         method=submission.method,
@@ -234,7 +233,9 @@ def _plain(found: Any) -> dict[str, Any]:
     """
     given = {"bits": True, **(found if isinstance(found, dict) else {})}
     unknown = [name for name in given if name not in FIELDS]
-    schema, level, bits = (given.get(key) for key in ("schema", "level", "bits"))
+    schema = given.get("schema")
+    level = given.get("level")
+    bits = given["bits"]
     checks = _checks(given.get("checks"))
     require(
         (type(schema) is int and schema == verify.SCHEMA, f"its schema must be {verify.SCHEMA}, got {schema!r:.80}"),
@@ -250,13 +251,17 @@ def _plain(found: Any) -> dict[str, Any]:
 
 def _checks(found: Any) -> list[Check] | None:
     """Return the checks of a ``verification.json``; None for what are none."""
-    if not (isinstance(found, list) and all(isinstance(each, dict) for each in found)):
+    if not isinstance(found, list):
         return None
-    checks = [Check(*(each.get(name, "") for name in Check._fields)) for each in found]
-    fit = all(each.passed is None or isinstance(each.passed, bool) for each in checks)
-    texts = [getattr(each, name) for each in checks for name in Check._fields if name != "passed"]
-    known = all(set(each) <= {*Check._fields} for each in found)
-    return checks if fit and known and all(isinstance(text, str) for text in texts) else None
+    checks = []
+    for each in found:
+        if not isinstance(each, dict) or not set(each) <= {*Check._fields}:
+            return None
+        check = Check(*(each.get(name, "") for name in Check._fields))
+        if type(check.passed) not in (bool, type(None)) or {*map(type, (*check[:3], *check[4:]))} != {str}:
+            return None
+        checks.append(check)
+    return checks
 
 
 def shown_level(level: str) -> str:
@@ -266,7 +271,5 @@ def shown_level(level: str) -> str:
 
 def names_of(entries: Sequence[BoardEntry]) -> list[str]:
     """Return a name for each entry: that of its method, with digits of the digest where two have the same."""
-    names = [entry.name for entry in entries]
-    return [
-        name if names.count(name) == 1 else f"{name} ({entry.id})" for name, entry in zip(names, entries, strict=True)
-    ]
+    several = repeated(entry.name for entry in entries)
+    return [f"{entry.name} ({entry.id})" if entry.name in several else entry.name for entry in entries]

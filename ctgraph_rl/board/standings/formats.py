@@ -81,7 +81,8 @@ def notes(table: BoardTable) -> list[str]:
         found += [f"{line.name} has no rank: {why}."] if why else []
         none = line.entry.verification.why_none
         found += [f"{line.name}: {none}."] if none else []
-        found += [f"{line.name}, seed {seed} failed: {reason}" for seed, reason in line.entry.failed.items()]
+        for seed, reason in line.entry.failed.items():
+            found.append(f"{line.name}, seed {seed} failed: {reason}")
     return found
 
 
@@ -116,9 +117,11 @@ def markdown(tables: Sequence[BoardTable]) -> str:
         parts.append(f"## {markdown_text(table.title)}")
         parts.append(f"{markdown_text(track.measures)} Breakthrough: {markdown_text(track.breakthrough)}")
         parts.append("; ".join(f"{markdown_text(name)}: {markdown_text(value)}" for name, value in facts(table)) + ".")
-        lines = [columns(line) for line in table.standings]
-        rows = [[markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells] for cells in lines]
-        parts.append(markdown_table([cell.head for cell in lines[0]], rows))
+        rows = []
+        for line in table.standings:
+            cells = columns(line)
+            rows.append([markdown_text(f"{cell.shown} {cell.interval}".strip()) for cell in cells])
+        parts.append(markdown_table([cell.head for cell in cells], rows))
         if notes(table):
             parts.append("\n".join(f"- {markdown_text(note)}" for note in notes(table)))
     return "\n\n".join(parts) + "\n"
@@ -189,24 +192,27 @@ def entries_csv(tables: Sequence[BoardTable]) -> str:
 
 def scores_csv(tables: Sequence[BoardTable]) -> str:
     """Return a line for each metric of each seed of each entry."""
-    rows = [
-        [line.entry.id, seed, metric, value]
-        for table in tables
-        for line in table.standings
-        for metric, values in line.entry.values.items()
-        for seed, value in zip(line.entry.seeds, values, strict=True)
-    ]
-    return csv_text([list(SCORE_COLUMNS), *rows])
+    rows: list[Sequence[Any]] = [list(SCORE_COLUMNS)]
+    for table in tables:
+        for line in table.standings:
+            for metric, values in line.entry.values.items():
+                for seed, value in zip(line.entry.seeds, values, strict=True):
+                    rows.append([line.entry.id, seed, metric, value])
+    return csv_text(rows)
 
 
 def as_json(tables: Sequence[BoardTable]) -> NamedValues:
     """Return all tables as plain values."""
-    return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": [_json(table) for table in tables]}
+    return {"schema": SCHEMA, "made_by": f"ctgraph_rl {__version__}", "tables": list(map(_json, tables))}
 
 
 def _json(table: BoardTable) -> NamedValues:
     track = table.track
     variant = table.variant
+    comparisons = []
+    for (one, other), found in table.pairs.items():
+        pair = {"first": one, "second": other, "difference": _numbers(found.difference)}
+        comparisons.append({**pair, "p_value": found.p_value, "holm": found.holm})
     return {
         "track": {"name": track.name, "version": track.version, "measures": track.measures},
         "breakthrough": track.breakthrough,
@@ -217,17 +223,8 @@ def _json(table: BoardTable) -> NamedValues:
         "seeds": list(track.seeds),
         "score": {"name": track.score, "definition": METRICS[track.score].meaning.id},
         "ceilings": table.ceilings._asdict(),
-        "entries": [_json_line(line) for line in table.standings],
-        "comparisons": [
-            {
-                "first": one,
-                "second": other,
-                "difference": _numbers(found.difference),
-                "p_value": found.p_value,
-                "holm": found.holm,
-            }
-            for (one, other), found in table.pairs.items()
-        ],
+        "entries": list(map(_json_line, table.standings)),
+        "comparisons": comparisons,
     }
 
 
@@ -245,7 +242,7 @@ def _json_line(line: Standing) -> NamedValues:
         "measures": {name: _numbers(estimate) for name, estimate in line.estimates.items()},
         "values": {name: list(values) for name, values in entry.values.items()},
         "agent_bytes": entry.agent_bytes,
-        "failed": {str(seed): reason for seed, reason in entry.failed.items()},
+        "failed": dict(zip(map(str, entry.failed), entry.failed.values(), strict=True)),
     }
 
 
@@ -268,6 +265,11 @@ def _result(table: BoardTable, line: Standing) -> NamedValues:
     """Return the result of an entry: task, data set, metrics and source."""
     variant = table.variant
     method = line.entry.method
+    metrics = []
+    for name, estimate in line.estimates.items():
+        if estimate.value is not None:
+            text = f"{measure_name(name)}, {estimate.method}, {estimate}"
+            metrics.append({"type": name, "value": estimate.value, "name": text})
     return {
         "task": dict(TASK),
         "dataset": {
@@ -276,11 +278,7 @@ def _result(table: BoardTable, line: Standing) -> NamedValues:
             "config": variant.curriculum.name,
             "revision": variant.curriculum.fingerprint,
         },
-        "metrics": [
-            {"type": name, "value": estimate.value, "name": f"{measure_name(name)}, {estimate.method}, {estimate}"}
-            for name, estimate in line.estimates.items()
-            if estimate.value is not None
-        ],
+        "metrics": metrics,
         "source": {
             "name": f"submission {line.entry.id}, {line.entry.verified}",
             "url": PAPER if method["code"]["repository"] == OURS else method["code"]["repository"],

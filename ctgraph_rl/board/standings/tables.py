@@ -18,6 +18,7 @@ from ctgraph_rl.board.tracks import Track, Variant
 from ctgraph_rl.report import statistics
 from ctgraph_rl.report.bounds import bounds_of_curriculum
 from ctgraph_rl.report.statistics import LEVEL, Comparison, Estimate
+from ctgraph_rl.runs.read import split_by
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class BoardTable:
     @property
     def title(self) -> str:
         """Track, rung and what is given."""
-        return ", ".join(part for part in (self.track.id, self.variant.rung, f"given: {self.variant.given}") if part)
+        return ", ".join(filter(None, (self.track.id, self.variant.rung, f"given: {self.variant.given}")))
 
     @cached_property
     def ceilings(self) -> Ceilings:
@@ -85,25 +86,26 @@ class BoardTable:
 
 def tables(entries: Iterable[BoardEntry]) -> list[BoardTable]:
     """Return a table for all entries that are comparable, in the order of tracks, rungs and what is given."""
-    found: dict[tuple[str, str], list[BoardEntry]] = {}
-    for entry in entries:
-        found.setdefault((entry.track.id, entry.variant.curriculum.fingerprint), []).append(entry)
-    made = [_table(some) for some in found.values()]
+    groups = split_by(entries, lambda entry: (entry.track.id, entry.variant.curriculum.fingerprint))
+    made = map(_table, groups.values())
 
     def place(table: BoardTable) -> tuple[bool, str, int]:
-        variants = [each.curriculum.fingerprint for each in table.track.variants]
-        return table.track.name != "small", table.track.id, variants.index(table.variant.curriculum.fingerprint)
+        fingerprints = list(table.track.by_fingerprint)
+        return table.track.name != "small", table.track.id, fingerprints.index(table.variant.curriculum.fingerprint)
 
     return sorted(made, key=place)
 
 
 def _table(entries: Sequence[BoardEntry]) -> BoardTable:
     """Return the table of comparable entries."""
-    lines = [Standing(entry, name, _estimates(entry)) for entry, name in zip(entries, names_of(entries), strict=True)]
+    lines = list(map(Standing, entries, names_of(entries), map(_estimates, entries)))
     lines.sort(key=lambda line: (line.score.value is None, -(line.score.value or 0.0), line.name))
-    pairs = _pairs([line for line in lines if line.entry.why_not_ranked is None])
-    ranked = [_ranked(line, pairs) if line.entry.why_not_ranked is None else line for line in lines]
-    return BoardTable(entries[0].track, entries[0].variant, ranked, pairs)
+    ranked = [line for line in lines if line.entry.why_not_ranked is None]
+    pairs = _pairs(ranked)
+    for place, line in enumerate(lines):
+        if line.entry.why_not_ranked is None:
+            lines[place] = _ranked(line, pairs, len(ranked))
+    return BoardTable(entries[0].track, entries[0].variant, lines, pairs)
 
 
 def _estimates(entry: BoardEntry) -> dict[str, Estimate]:
@@ -121,12 +123,15 @@ def _pairs(lines: Sequence[Standing]) -> dict[tuple[str, str], Comparison]:
     return statistics.corrected(found)
 
 
-def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison]) -> Standing:
-    """Return a line with its rank."""
-    better = sum(other == line.name and is_significant(each) for (_, other), each in pairs.items())
-    worse = sum(one == line.name and is_significant(each) for (one, _), each in pairs.items())
-    count = len({name for pair in pairs for name in pair} | {line.name})
-    return replace(line, best_rank=1 + better, worst_rank=count - worse)
+def _ranked(line: Standing, pairs: Mapping[tuple[str, str], Comparison], count: int) -> Standing:
+    """Return a line with its rank among so many."""
+    best = 1
+    worst = count
+    for (one, other), found in pairs.items():
+        if is_significant(found):
+            best += line.name == other
+            worst -= line.name == one
+    return replace(line, best_rank=best, worst_rank=worst)
 
 
 def is_significant(found: Comparison) -> bool:
