@@ -19,7 +19,8 @@ from ctgraph_rl.tasks.configurations import CONFIGURATIONS, ct_fo_b1, ct_fo_b2, 
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import GroupedImages
 from ctgraph_rl.tasks.observations import Observations
-from ctgraph_rl.tasks.protocol import Evaluation
+from ctgraph_rl.tasks.protocol import Block, Evaluation
+from ctgraph_rl.tasks.switch import ByEpisode
 from ctgraph_rl.tasks.task import Task
 from curricula import axes
 from curricula.order import OneOrMore
@@ -235,7 +236,9 @@ def changing_goals(num_frames: int = FRAMES, depth: int = 2, image_seed: int = 1
     return axes.sequence("su_b1_changing_goals", [tasks], num_frames, 1, PAPER, evaluation=trials)
 
 
-def random_graphs(num_frames: int = 51_200, image_seed: int = 1, num_tasks: int = 100, seed: int = 2023) -> Curriculum:
+def random_graphs(
+    num_frames: int = 51_200, image_seed: int = 1, num_tasks: int = 100, seed: int = 2023, held_out: int = 0
+) -> Curriculum:
     """A large set of random surjective graphs that share their images: which features are invariant?
 
     Section 3.5 of the paper: n graphs differ in branching factor (2 or 3), depth (2, 3 or 4), wait probability (0 or
@@ -246,9 +249,17 @@ def random_graphs(num_frames: int = 51_200, image_seed: int = 1, num_tasks: int 
         image_seed: seed of the image set that all tasks share.
         num_tasks: n.
         seed: draws the graphs, an integer >= 0.
+        held_out: the number of graphs that a first block leaves out, from 0 to n - 1. That block trains all others,
+            which take turns by episode. Then each held-out graph has its block. 0: each graph has its block.
     """
     tasks = axes.random_tasks(num_tasks, seed, kinds=("surjective",), image_seeds=(image_seed,))
-    return _curriculum("random_graphs", tasks, num_frames)
+    curriculum = _curriculum("random_graphs", tasks, num_frames)
+    in_range = is_int(held_out) and 0 <= held_out < num_tasks
+    require((in_range, f"held_out must be an integer from 0 to {num_tasks - 1}, got {held_out!r}"))
+    if held_out == 0:
+        return curriculum
+    training = Block(tasks[:-held_out], num_frames * (num_tasks - held_out), ByEpisode())
+    return replace(curriculum, blocks=(training, *curriculum.blocks[-held_out:]))
 
 
 def fo_b2_gradient(num_frames: int = FRAMES, image_seed: int = 1) -> Curriculum:

@@ -2,16 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
 from baselines.methods.method import Method
+from baselines.methods.parts.weights import Weights, flat
+from baselines.parts.learner import Learner
 from ctgraph_rl.agent import Agent
+from ctgraph_rl.checks import require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Finetune(Method):
-    """The agent learns one task after the other, unchanged. Nothing is stored, and any agent will do."""
+    """The agent learns one task after the other. Nothing is stored, and any agent will do.
+
+    Args:
+        trunk: "trained", or "kept": after the first task all layers but the output layers keep their weights. This
+            measures whether features of the first block serve later tasks.
+
+    Raises:
+        ValueError: for another trunk.
+    """
 
     needs_boundaries = False
 
+    def __init__(self, trunk: str = "trained") -> None:
+        super().__init__()
+        require((trunk in ("trained", "kept"), f"trunk must be trained or kept, got {trunk!r}"))
+        self.trunk = trunk
+        self.needs_boundaries = trunk == "kept"
+
     def attach(self, agent: Agent, curriculum: Curriculum) -> Agent:
-        """Return the agent itself."""
-        return agent
+        """Return the agent itself, where its trunk is trained."""
+        return super().attach(agent, curriculum) if self.trunk == "kept" else agent
+
+    def setup(self, agent: Learner, weights: Weights, curriculum: Curriculum) -> None:
+        """See `Method`."""
+        super().setup(agent, weights, curriculum)
+        self.register_buffer("learned", torch.zeros((), dtype=torch.bool, device="cpu"))
+        self.register_buffer("kept", weights.zeros())
+        self.register_buffer("in_heads", weights.in_heads)
+
+    def end_task(self) -> None:
+        """Keep the trunk that the first task leaves."""
+        if not self.learned:
+            self.kept.copy_(self.weights.vector().detach())
+            self.learned.fill_(True)
+
+    @torch.no_grad()
+    def after_step(self, weights: Sequence[Tensor]) -> None:
+        """Undo the optimiser's changes of the trunk."""
+        self.weights.write(torch.where(self.in_heads | ~self.learned, flat(weights), self.kept))

@@ -34,7 +34,7 @@ class Method(TakesNumbers, Hooks):
     hidden_ids_hint = ""
     """What else can be done where ids are hidden, for the message that refuses them."""
 
-    needs_boundaries: ClassVar[bool] = True
+    needs_boundaries: bool = True
     """Whether task changes must be announced."""
 
     reads_tasks: str = ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import (
+    not_negative,
     of_changes_but_one,
     of_counts,
     of_lost_shares,
@@ -198,3 +200,48 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
     needed = torch.as_tensor(threshold, dtype=ends.dtype, device="cpu").expand(ends.shape[1])[sorted(last)]
     unknown = reached.isnan() | needed.isnan()
     return torch.where(unknown, torch.nan, (reached >= needed).double())
+
+
+@defined(
+    "ctgraph_rl/frames-to-mastery",
+    "mean over tasks j trained alone of the frames from the start of j's first block to p_j >= threshold_j",
+    HERE,
+    missing="a task was not mastered in its block",
+    inputs={"threshold": "mastered_returns"},
+    bounds=not_negative,
+    is_time=True,
+)
+def frames_to_mastery(curves: Curves, threshold: Tensor | float = MASTERED) -> Tensor:
+    """Frames of a task's first block until the first evaluation that finds the task mastered.
+
+    Tasks that are only trained together with others are left out. Undefined if a task was not mastered in its block.
+    The distance between two evaluations is the resolution.
+
+    Args:
+        curves: the evaluations of a run.
+        threshold: as in `tasks_learned`.
+    """
+    num_tasks = curves.performance.shape[1]
+    needed = torch.as_tensor(threshold, dtype=curves.performance.dtype, device="cpu").expand(num_tasks)
+    found = []
+    seen: set[int] = set()
+    for block, tasks in enumerate(curves.trained, 1):
+        if len(set(tasks)) == 1 and tasks[0] not in seen:
+            found.append(_frames_to(needed[tasks[0]], curves, block, tasks[0]))
+        seen.update(tasks)
+    if not found:
+        raise Undefined("the definition needs a block that trains one task")
+    return torch.tensor(found, dtype=torch.float64, device="cpu")
+
+
+def _frames_to(needed: Tensor, curves: Curves, block: int, task: int) -> float:
+    """Frames of a block until a task's first evaluation that is at least as needed; NaN where there is none."""
+    rows = curves.of_block(block)
+    before = curves.of_block(block - 1)
+    if block > 1 and not before:
+        raise Undefined(f"the definition needs an evaluation at the end of block {block - 1}")
+    start = curves.frames[before[-1]] if block > 1 else 0
+    for row in rows:
+        if curves.performance[row, task] >= needed:
+            return curves.frames[row] - start
+    return math.nan

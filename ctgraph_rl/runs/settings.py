@@ -59,6 +59,8 @@ ADDED: dict[str, NamedValues] = {
         "reward_fn": "needle",
     },
     "curricula.penn_a_swap": {"num_lives": None},
+    "curricula.random_graphs": {"held_out": 0},
+    "baselines.methods.finetune.Finetune": {"trunk": "trained"},
 }
 """Settings that were added after runs had been stored, each with the value for "as before".
 

@@ -250,6 +250,16 @@ def test_random_graphs_differ_in_shape_and_share_what_images_mean():
     assert len({(task.images, task.observations) for task in tasks}) == 1
 
 
+def test_held_out_graphs_come_alone_after_all_others():
+    whole = curricula.load("random_graphs", num_frames=100, num_tasks=5)
+    split = curricula.load("random_graphs", num_frames=100, num_tasks=5, held_out=2)
+
+    assert [set(block.tasks) for block in split.blocks] == [set(whole.tasks[:3]), {whole.tasks[3]}, {whole.tasks[4]}]
+    assert [block.num_frames for block in split.blocks] == [300, 100, 100]
+    with pytest.raises(ValueError, match="held_out must be an integer from 0 to 4, got 5"):
+        curricula.load("random_graphs", num_tasks=5, held_out=5)
+
+
 @BY_CONFIGURATION
 def test_uncorrelated_tasks_share_neither_goal_nor_images(configuration):
     tasks = curricula.load(f"{configuration}_uncorrelated").tasks

@@ -194,6 +194,18 @@ def test_tasks_learned_counts_what_was_mastered_after_its_last_block():
     assert (again.value, again.terms) == (1.0, (0.0, 1.0))
 
 
+def test_frames_to_mastery_count_from_the_start_of_the_first_block_of_a_task_alone():
+    low = [0.5, 1.0, 0.5]
+    together_first = replace(CURVES, trained=((0, 1), (1,), (2,)))
+    again = replace(CURVES, trained=((0,), (1,), (0,)))
+
+    assert metrics.frames_to_mastery(CURVES, tensor(low)).terms == (10.0, 20.0, 10.0)
+    assert metrics.frames_to_mastery(together_first, tensor(low)).terms == (10.0,)
+    assert metrics.frames_to_mastery(again, tensor(low)).terms == (10.0, 20.0)
+    never = metrics.frames_to_mastery(CURVES)
+    assert (never.value, never.n_undefined) == (None, 1)
+
+
 @pytest.mark.parametrize(
     "metric",
     [metrics.continual_world_performance, metrics.instant_cumulative_return, metrics.total_performance_over_time],
@@ -221,8 +233,9 @@ def test_all_metrics_without_experts_are_computed_by_name():
         "total_performance_over_time",
         "relative_forgetting",
         "tasks_learned",
+        "frames_to_mastery",
     ]
-    assert all(metric.value is not None for metric in found.values())
+    assert [name for name, metric in found.items() if metric.value is None] == ["frames_to_mastery"]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import torch
 from helpers.scripted import ONE, THREE
 from helpers.small_agents import TASKS, batches, same, small, stay, weights_for, with_method
 
+from baselines.methods.finetune import Finetune
 from baselines.methods.method import AgentWithMethod
 from baselines.methods.packnet import FREE, PackNet
 from baselines.methods.scratch import Scratch
@@ -73,6 +74,21 @@ def test_kept_weights_are_bit_equal_after_later_tasks_and_later_ones_begin_at_ze
     own = (method.owner == 1) & trunk
     assert not first[own].any() and second[own].any() and torch.equal(last[own], second[own])
     assert not first[free].any() and not second[free].any()
+
+
+def test_a_kept_trunk_stays_after_the_first_task_and_output_layers_learn_on(compose):
+    method = Finetune(trunk="kept")
+    attached = with_method(compose, "ppo", method)
+    start = method.weights.vector().detach()
+    stay(attached, 0)
+    first = method.weights.vector().detach()
+    stay(attached, 1)
+    last = method.weights.vector().detach()
+
+    heads = method.in_heads
+    assert not torch.equal(first[~heads], start[~heads])
+    assert torch.equal(last[~heads], first[~heads])
+    assert not torch.equal(last[heads], first[heads])
 
 
 @pytest.mark.parametrize(("retrain", "number_of_prunings"), [(0.5, 2), (0.0, 4), (0.75, 1)])
