@@ -50,7 +50,7 @@ from ctgraph_rl.log.saved import content_of, num_bytes_of, read_plain, sum_of_st
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import evaluations_parquet, require_parquet
 from ctgraph_rl.metrics import Metric
-from ctgraph_rl.runs.read import Run, find_runs, reasons
+from ctgraph_rl.runs.read import Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.curriculum_json import file_text
@@ -103,7 +103,7 @@ def submit(
 def _found(paths: Sequence[Path], only: ReadOnlyValues) -> list[Run]:
     """Return the runs that have some settings, by seed; refuse what cannot be read."""
     found, problems = find_runs(paths)
-    require((not problems, reasons(problems)))
+    require((not problems, why_left_out(problems)))
     chosen = []
     values: dict[str, dict[str, None]] = {key: {} for key in only}
     for run in found:

@@ -31,6 +31,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -334,8 +335,10 @@ class RunLog:
         last = [row for (when, _), row in rows.items() if when == frames]
         lengths = {len(row) for row in last}
         require((len(lengths) == 1, f"tasks must adapt in as many episodes, the log has {lengths}: restore the log"))
-        names = ("return_mean", "success_rate", "found_rate", "exact_rate")
-        return Adaptation(*(torch.stack([_row([m.get(name) for m in row]) for row in last]) for name in names))
+        fields = []
+        for name in ("return_mean", "success_rate", "found_rate", "exact_rate"):
+            fields.append(torch.stack([_row([m.get(name) for m in row]) for row in last]))
+        return Adaptation(*fields)
 
     def curves(self, trained: Sequence[Sequence[int]] | None = None) -> Curves:
         """All evaluations of the curriculum's tasks in time order, those during blocks included.
@@ -352,7 +355,7 @@ class RunLog:
         require((bool(points), "this log has no evaluation"))
         blocks, frames = zip(*points, strict=True)
         of_blocks = self._trained(trained)
-        num_tasks = 1 + max(task for block in of_blocks for task in block)
+        num_tasks = 1 + max(chain(*of_blocks))
         return Curves(self._matrix(points.values(), num_tasks), blocks, frames, of_blocks)
 
     def regimes(self, trained: Sequence[Sequence[int]] | None = None) -> list[Regime]:
@@ -375,17 +378,21 @@ class RunLog:
             ValueError: for a block that trains several tasks, whose effects cannot be separated, one without a
                 finished episode, and a task that was never evaluated.
         """
-        tasks = [sorted(set(block)) for block in self._trained(trained)]
-        mixed = [str(number) for number, block in enumerate(tasks, 1) if len(block) > 1]
+        tasks = []
+        mixed = []
+        for number, block in enumerate(self._trained(trained), 1):
+            tasks.append(min(block) + 1)
+            if len({*block}) > 1:
+                mixed.append(str(number))
         several = f"lifelong metrics need blocks that train one task, block {', '.join(mixed)} trains several"
         require((not mixed, several))
         said = {m["task"]: label_of(m) for m in self._evaluations(during=True)}
-        require((all(block[0] + 1 in said for block in tasks), "lifelong metrics need an evaluation of every task"))
+        require(({*tasks} <= {*said}, "lifelong metrics need an evaluation of every task"))
         label = said if labels is None else dict(enumerate(labels, 1))
         names: dict[str, int] = {}
         rows = []
         values: list[float | None] = []
-        for task, training, own in self._stays([block[0] + 1 for block in tasks]):
+        for task, training, own in self._stays(tasks):
             rows.append((names.setdefault(label[task], len(names)), training, len(own)))
             values += own
         return RegimeTable([*names], Column(*zip(*rows, strict=True)), _row(values))
@@ -407,7 +414,7 @@ class RunLog:
         if trained is None:
             trained = self._said()
             require((bool(trained), "this log does not say what each block trained: give trained, Curriculum.trained"))
-        return tuple(tuple(block) for block in trained)
+        return tuple(map(tuple, trained))
 
     def _said(self) -> list[list[int]]:
         """The tasks of each block, counted from 0, if the first line says them."""
@@ -423,9 +430,8 @@ class RunLog:
 
     def _matrix(self, rows: Iterable[Mapping[int, float | None]], num_tasks: int) -> Tensor:
         """Rows of values by task number, NaN where a row has none."""
-        trained = [number + 1 for block in self._said() for number in block]
         evaluated = {m["task"] for m in self._evaluations(during=True)}
-        tasks = range(1, max([num_tasks, *trained, *evaluated]) + 1)
+        tasks = range(1, max(num_tasks, 1 + max(chain(*self._said()), default=-1), *evaluated) + 1)
         rows = list(rows)
         size = len(rows) * len(tasks)
         most = min(MOST_CELLS, FEW_CELLS + CELLS_OF_A_BYTE * self._num_bytes)

@@ -103,7 +103,7 @@ def _of_graphs(log: RunLog, tasks: Sequence[TaskLike]) -> NamedValues:
         **ceilings(tasks),
         "end_rates": log.last("end_rate", len(tasks)),
         "success_rates": log.last("success_rate", len(tasks)),
-        "random_frames": [random_frames_to_goal(task) for task in tasks],
+        "random_frames": list(map(random_frames_to_goal, tasks)),
         "search_episodes": [task.graph.expected_search_episodes for task in tasks],
     }
 
@@ -140,19 +140,19 @@ def optimal_values(tasks: Sequence[TaskLike]) -> Tensor | Undefined:
     """
     if not are_graphs(tasks):
         return _said_by(tasks, "optimal_value", lambda task: task.optimal_value(1.0))
-    return _numbers([_known(optimal_value, task) for task in tasks])
+    return _of_each(partial(_known, optimal_value), tasks)
 
 
 def ceilings(tasks: Sequence[Task]) -> dict[str, Tensor | Undefined]:
     """Return exact ceilings of each task and what its observations tell, float64 [tasks], or why one is not known."""
-    found: dict[str, Callable[[Task], float]] = {
-        "open_loop_ceilings": open_loop_ceiling,
-        "memoryless_ceilings": memoryless_ceiling,
-        **{f"{policy}_entropies": partial(state_entropy, policy=policy) for policy in POLICIES},
+    known: dict[str, Tensor | Undefined] = {
+        "open_loop_ceilings": _of_each(open_loop_ceiling, tasks),
+        "memoryless_ceilings": _of_each(memoryless_ceiling, tasks),
     }
-    known = {name: _of_each(value, tasks) for name, value in found.items()}
     if any(task.goal_change is not None for task in tasks):
-        known |= dict.fromkeys(("open_loop_ceilings", "memoryless_ceilings"), GOAL_CHANGES)
+        known = dict.fromkeys(known, GOAL_CHANGES)
+    for policy in POLICIES:
+        known[f"{policy}_entropies"] = _of_each(partial(state_entropy, policy=policy), tasks)
     return known
 
 
@@ -173,7 +173,7 @@ def _said_by(tasks: Sequence[TaskLike], member: str, value: Callable[[Any], floa
 def _of_each(value: Callable[[Any], float], tasks: Sequence[Any]) -> Tensor | Undefined:
     """Return a value of each task; the reason of the first that has none."""
     try:
-        return _numbers([value(task) for task in tasks])
+        return _numbers(list(map(value, tasks)))
     except ValueError as error:
         return Undefined(str(error))
 
@@ -265,11 +265,12 @@ def _first_blocks(log: RunLog, curriculum: Curriculum) -> NamedValues:
     frames = log.training_by_block("frames")
     episodes = log.training_by_block("episodes")
     success_rates = log.training_by_block("success_rate")
-    return {
-        "first_frames": [frames.get(number + 1, nothing) - starts[number] for number in first],
-        "first_episodes": [episodes.get(number + 1, nothing) for number in first],
-        "first_success_rates": [success_rates.get(number + 1, nothing) for number in first],
-    }
+    found: dict[str, list[Tensor]] = {"first_frames": [], "first_episodes": [], "first_success_rates": []}
+    for number in first:
+        found["first_frames"].append(frames.get(number + 1, nothing) - starts[number])
+        found["first_episodes"].append(episodes.get(number + 1, nothing))
+        found["first_success_rates"].append(success_rates.get(number + 1, nothing))
+    return found
 
 
 def _regimes(
@@ -288,16 +289,14 @@ def _regimes(
     except ValueError as error:
         return dict.fromkeys(("regimes", "experts"), Undefined(str(error)))
     ranges = dict(zip(curriculum.labels, zip(lowest.tolist(), best.tolist(), strict=True), strict=True))
-    returns = [_returns(expert) for expert in experts or ()]
-    curves = {label: [curve] for label, curve in zip(curriculum.labels, returns, strict=False) if len(curve)}
+    curves = {}
+    for label, expert in zip(curriculum.labels, experts or (), strict=False):
+        returns = expert.training("return_mean")
+        known = returns[~returns.isnan()]
+        if len(known):
+            curves[label] = [known]
     prepared, of_experts = metrics.prepare(regimes, curves, ranges)
     return {"regimes": prepared, "experts": Undefined(NO_EXPERTS) if experts is None else of_experts}
-
-
-def _returns(expert: RunLog) -> Tensor:
-    """The training curve of an expert."""
-    returns = expert.training("return_mean")
-    return returns[~returns.isnan()]
 
 
 def _areas(curves: Curves, best: Tensor | Undefined, experts: Sequence[RunLog] | None, trapezoids: bool) -> NamedValues:

@@ -11,7 +11,7 @@ from ctgraph_rl.metrics.bounds import Known, of_performance
 from ctgraph_rl.metrics.record import METRICS
 from ctgraph_rl.packages import curriculum_named
 from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
-from ctgraph_rl.runs.read import Run, grouped
+from ctgraph_rl.runs.read import Run, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import are_graphs
 
@@ -61,7 +61,7 @@ def bounds_by_curriculum(runs: Sequence[Run]) -> dict[str, BoundsOfRuns]:
     """Return the bounds of what the runs of each curriculum measure, by the curriculum's name in tables."""
     of: dict[str, list[Run]] = {}
     for (name, _), by_seed in grouped(runs).items():
-        of.setdefault(name, []).extend(run for run in by_seed.values() if run is not None)
+        of.setdefault(name, []).extend(present(by_seed))
     return {name: bounds_of(some) for name, some in of.items()}
 
 

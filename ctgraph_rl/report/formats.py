@@ -10,6 +10,7 @@ from ctgraph_rl.log.escape import markdown_table, markdown_text, terminal_text
 from ctgraph_rl.parsers import TABLE_FORMATS
 from ctgraph_rl.report.latex import PREAMBLE, Labels, Table, TableCell
 from ctgraph_rl.report.latex import latex as latex_table
+from ctgraph_rl.runs.read import split_by
 
 if TYPE_CHECKING:
     from ctgraph_rl.report.results import Row
@@ -49,7 +50,9 @@ def text(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = L
     head = textwrap.fill(legend, WIDTH)
     if legend == LEGEND:
         head += "\n" + textwrap.fill(WHY_EXACT, WIDTH)
-    return "\n\n".join([head, *(_text(page, modified.get(page.curriculum)) for page in pages(rows))])
+    for page in pages(rows):
+        head += "\n\n" + _text(page, modified.get(page.curriculum))
+    return head
 
 
 def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
@@ -69,26 +72,32 @@ def markdown(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str
 def latex(rows: Sequence[Row], modified: Modified = NOT_MODIFIED, legend: str = LEGEND) -> str:
     """Return a table of agents and measures in LaTeX for each curriculum; see `ctgraph_rl.report.latex`."""
     labels = Labels()
-    tables = (as_latex(each, labels, modified.get(each.curriculum), legend) for each in matrices(rows))
-    return "\n\n".join([PREAMBLE, *tables])
+    parts = [PREAMBLE]
+    for each in matrices(rows):
+        parts.append(as_latex(each, labels, modified.get(each.curriculum), legend))
+    return "\n\n".join(parts)
 
 
 def matrices(rows: Sequence[Row]) -> Iterator[Matrix]:
     """Return the table of agents and measures of each curriculum; the first column is the agents' number of seeds."""
-    for curriculum in dict.fromkeys(row.curriculum for row in rows):
-        its = [row for row in rows if row.curriculum == curriculum]
-        cells = {(row.shown, measure_name(row.measure)): row for row in its if row.measure != NO_RUN_FINISHED}
-        notes = list(dict.fromkeys(row.note for row in its if row.note))
-        measures = list(dict.fromkeys(measure for _, measure in cells))
+    for curriculum, its in split_by(rows, lambda row: row.curriculum).items():
+        notes = _notes(its)
+        measures = split_by(its, lambda row: row.measure)
+        measures.pop(NO_RUN_FINISHED, None)
         lines = []
-        for agent in dict.fromkeys(row.shown for row in its):
-            most = max((row.estimate for row in its if row.shown == agent), key=lambda estimate: estimate.n)
-            line = [TableCell(str(most).rpartition(" n = ")[2])]
-            for measure in measures:
-                row = cells.get((agent, measure))
-                line.append(TableCell("-") if row is None else _as_cell(row, notes))
-            lines.append((agent, line))
-        yield Matrix(curriculum, ("n", *measures), lines, notes)
+        for agent, own in split_by(its, lambda row: row.shown).items():
+            cells = dict.fromkeys(measures, TableCell("-"))
+            most = max(own, key=lambda row: row.estimate.n)
+            for row in own:
+                if row.measure in cells:
+                    cells[row.measure] = _as_cell(row, notes)
+            lines.append((agent, [TableCell(str(most.estimate).rpartition(" n = ")[2]), *cells.values()]))
+        yield Matrix(curriculum, ("n", *map(measure_name, measures)), lines, notes)
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    """Return the notes of rows, each once, in the order of their numbers."""
+    return list(dict.fromkeys(row.note for row in rows if row.note))
 
 
 def _as_cell(row: Row, notes: Sequence[str]) -> TableCell:
@@ -147,9 +156,8 @@ class Page(NamedTuple):
 
 def pages(rows: Sequence[Row]) -> Iterator[Page]:
     """The rows in the form that is shown, for each curriculum."""
-    for curriculum in dict.fromkeys(row.curriculum for row in rows):
-        its = [row for row in rows if row.curriculum == curriculum]
-        notes = list(dict.fromkeys(row.note for row in its if row.note))
+    for curriculum, its in split_by(rows, lambda row: row.curriculum).items():
+        notes = _notes(its)
         lines = []
         for row in its:
             value, _, n = str(row.estimate).partition(" n = ")
@@ -160,10 +168,11 @@ def pages(rows: Sequence[Row]) -> Iterator[Page]:
 
 def _text(page: Page, modified: str | None) -> str:
     lines = [Line(*map(terminal_text, line)) for line in page.lines]
-    measures, values, counts = (max(len(line[i]) for line in lines) for i in (1, 2, 3))
+    _, measures, values, counts, _ = (max(map(len, column)) for column in zip(*lines, strict=True))
     widest = sum((measures, values, counts)) + len("      n =     (9)")
     gap = "  " if widest < WIDTH else " "
-    shown, agent = [terminal_text(page.curriculum)], None
+    shown = [terminal_text(page.curriculum)]
+    agent = None
     if modified:
         about = terminal_text(f"modified: {modified}")
         shown.append(textwrap.fill(about, WIDTH, initial_indent="  ", subsequent_indent="    "))
@@ -175,6 +184,7 @@ def _text(page: Page, modified: str | None) -> str:
         shown.append(
             f"    {line.measure:{measures}}{gap}{line.value:{values}}{gap}n = {line.n:{counts}}{gap}{note}".rstrip()
         )
-    notes = (f"({number}) {terminal_text(note)}" for number, note in enumerate(page.notes, 1))
-    shown += [textwrap.fill(note, WIDTH, initial_indent="  ", subsequent_indent="      ") for note in notes]
+    for number, note in enumerate(page.notes, 1):
+        text = f"({number}) {terminal_text(note)}"
+        shown.append(textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="      "))
     return "\n".join(shown)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from itertools import count
 from string import ascii_lowercase
 from typing import NamedTuple
 
@@ -60,8 +59,10 @@ def latex(table: Table) -> str:
     columns = _columns(table)
     parts = [(start, min(start + columns, len(table.head))) for start in range(0, max(len(table.head), 1), columns)]
     most = max(1, MOST_LINES // (2 * len(parts)))
-    pieces = [table.rows[start : start + most] for start in range(0, max(len(table.rows), 1), most)]
-    return "\n\n".join(_float(table, rows, parts, number) for number, rows in enumerate(pieces, 1))
+    floats: list[str] = []
+    for start in range(0, max(len(table.rows), 1), most):
+        floats.append(_float(table, table.rows[start : start + most], parts, len(floats) + 1))
+    return "\n\n".join(floats)
 
 
 def _columns(table: Table) -> int:
@@ -77,10 +78,13 @@ def _float(
     """Return one table with its parts."""
     again = f" (part {number})" if number > 1 else ""
     label = f"{table.label}-{number}" if number > 1 else table.label
-    used = sorted({cell.note for _, cells in rows for cell in cells if cell.note})
-    notes = [
-        rf"\par\smallskip\raggedright\textsuperscript{{{letters(i)}}} {latex_text(table.notes[i - 1])}" for i in used
-    ]
+    used: set[int] = set()
+    for _, cells in rows:
+        used.update(cell.note for cell in cells)
+    notes = []
+    for i in sorted(used - {0}):
+        note = latex_text(table.notes[i - 1])
+        notes.append(rf"\par\smallskip\raggedright\textsuperscript{{{letters(i)}}} {note}")
     bodies = [_tabular(table, rows, part) for part in parts]
     head = [r"\begin{table}[htbp]", r"\centering", r"\setlength{\belowcaptionskip}{6pt}"]
     head += [rf"\caption{{{latex_text(table.caption + again)}}}"]
@@ -92,7 +96,9 @@ def _tabular(table: Table, rows: Sequence[tuple[str, Sequence[TableCell]]], part
     """Return some columns of a table, scaled down where they are wider than a line."""
     start, end = part
     heads = [latex_text(table.first), *map(_heading, table.head[start:end])]
-    lines = [line for name, cells in rows for line in _lines(name, cells[start:end])]
+    lines: list[str] = []
+    for name, cells in rows:
+        lines += _lines(name, cells[start:end])
     inner = [
         rf"\begin{{tabular}}{{@{{}}l{'r' * (end - start)}@{{}}}}",
         r"\toprule",
@@ -149,6 +155,10 @@ class Labels:
     def new(self, *names: str) -> str:
         """Return a label of letters, digits and hyphens that was not given before."""
         stem = re.sub(r"[^a-z0-9]+", "-", "-".join(names).lower()).strip("-")
-        label = next(each for i in count(1) if (each := stem if i == 1 else f"{stem}-v{i}") not in self._taken)
+        label = stem
+        version = 1
+        while label in self._taken:
+            version += 1
+            label = f"{stem}-v{version}"
         self._taken.add(label)
         return label

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ctgraph_rl.checks import did_you_mean, require
+from ctgraph_rl.checks import did_you_mean, repeated, require
 from ctgraph_rl.report.bounds import curriculum_of, published
-from ctgraph_rl.runs.read import MODIFIED, Run, grouped
+from ctgraph_rl.runs.read import MODIFIED, Run, grouped, present
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 NOT_COMPARED = ("name", "source", "fingerprint", "schema", "about")
@@ -20,12 +20,13 @@ MOST_CHANGES, MOST_VALUES = 6, 3
 
 def modifications(runs: Sequence[Run]) -> dict[str, str]:
     """Return what differs from the published curriculum, for each modified one by its name in tables."""
-    found = {}
+    found: dict[str, str] = {}
     for (name, _), by_seed in grouped(runs).items():
-        its = [run for run in by_seed.values() if run is not None]
-        if name not in found and any(run.curriculum[0].endswith(MODIFIED) for run in its):
-            found[name] = next((said for run in its if (said := modification(run))), "")
-    return {name: said for name, said in found.items() if said}
+        for run in present(by_seed):
+            said = "" if name in found else modification(run)
+            if said:
+                found[name] = said
+    return found
 
 
 def modification(run: Run) -> str:
@@ -37,7 +38,8 @@ def modification(run: Run) -> str:
 
 def _changes(published: Curriculum, learned: Curriculum) -> Iterator[str]:
     """Yield the settings that differ, such as ``blocks.num_frames=8192 instead of 51200``."""
-    before, now = (_settings(curriculum.to_json()) for curriculum in (published, learned))
+    before = _settings(published.to_json())
+    now = _settings(learned.to_json())
     differing = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     for key in differing[:MOST_CHANGES]:
         yield f"{key}={_values(now.get(key, []))} instead of {_values(before.get(key, []))}"
@@ -83,19 +85,22 @@ def displayed(runs: Sequence[Run], agents: Sequence[str] = ()) -> list[Run]:
     Raises:
         ValueError: for an unknown agent, with the one that was probably meant, and for a name of two agents.
     """
-    known = list(dict.fromkeys(agent for _, agent in grouped(runs)))
+    known = _agents(runs)
     chosen = dict(_choice(each, known) for each in agents)
-    shown = [*chosen.values(), *(agent for agent in known if agent not in chosen)]
-    twice = sorted({name for name in shown if shown.count(name) > 1})
+    twice = sorted(repeated(chosen.get(agent, agent) for agent in known))
     require((len(chosen) == len(agents), "--agent names an agent twice; give each once"))
     require((not twice, f"--agent gives the name {', '.join(twice)} to two agents; choose different ones"))
     places = {agent: (place, name) for place, (agent, name) in enumerate(chosen.items())}
-    return [
-        replace(run, shown=places.get(agent))
-        for (_, agent), by_seed in grouped(runs).items()
-        for run in by_seed.values()
-        if run is not None
-    ]
+    found = []
+    for (_, agent), by_seed in grouped(runs).items():
+        for run in present(by_seed):
+            found.append(replace(run, shown=places.get(agent)))
+    return found
+
+
+def _agents(runs: Sequence[Run]) -> list[str]:
+    """Return the names of agents in tables, each once."""
+    return list(dict.fromkeys(agent for _, agent in grouped(runs)))
 
 
 def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
@@ -104,7 +109,7 @@ def colours_of(runs: Sequence[Run], given: Sequence[str]) -> dict[str, str]:
     Raises:
         ValueError: for an unknown agent, with the one that was probably meant, and for what has no colour.
     """
-    known = list(dict.fromkeys(agent for _, agent in grouped(runs)))
+    known = _agents(runs)
     found = {}
     for each in given:
         name, _, colour = each.rpartition("=")  # settings in names have the sign of equality, too

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from ctgraph_rl.report.sections import Result, Section, sections
 from ctgraph_rl.report.style import MOST_AGENTS, require_packages, style
 from ctgraph_rl.report.templates import rendered
 from ctgraph_rl.report.terminal import code_notes, group_size, label_notes, mixed_code
-from ctgraph_rl.runs.read import Problem, Run, find_runs
+from ctgraph_rl.runs.read import Problem, Run, find_runs, why_left_out
 from ctgraph_rl.runs.settings import flat
 
 OF_SECTION: tuple[Callable[[Section], CaptionedFigure | None], ...] = (
@@ -92,7 +93,9 @@ class Part(NamedTuple):
     @property
     def by_agent(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """The table of agents and measures as texts: its head and its rows."""
-        lines = [(agent, *(f"{c.value} {c.interval}".strip() for c in cells)) for agent, cells in self.matrix.rows]
+        lines = []
+        for agent, cells in self.matrix.rows:
+            lines.append((agent, *(f"{cell.value} {cell.interval}".strip() for cell in cells)))
         return ("agent", *self.matrix.head), lines
 
 
@@ -121,7 +124,7 @@ def write_report(
     """
     require_packages()
     runs, problems = find_runs(paths, count)
-    require((bool(runs), "; ".join(problem.reason for problem in problems)))
+    require((bool(runs), why_left_out(problems)))
     runs = displayed(runs, agents)
     chosen = colours_of(runs, colours)
     with style(width, chosen):
@@ -131,8 +134,12 @@ def write_report(
         folder = made_folder(Path(paths[0]) / "report" if within else Path("report"))
     found = sections(runs, count)
     gallery = Gallery(Path(folder), width, chosen, partial(count, "figures", total=_most_figures(found)))
-    together = gallery.write((), (experiments(each) for each in [found]))  # drawn in the gallery's style
-    parts = [_part(section, gallery) for section in found]
+    together = gallery.write((), map(experiments, [found]))  # drawn in the gallery's style
+    parts = []
+    missing: list[Run] = []
+    for section in found:
+        parts.append(_part(section, gallery))
+        missing += [run for run in section.runs if run.reason is not None]
     page = Path(folder) / "report.html"
     for file in (page, page.with_suffix(".md")):
         text = rendered(
@@ -147,7 +154,7 @@ def write_report(
             legend_of_means=formats.MEANS,
             definitions=_definitions(parts),
             version=__version__,
-            missing=[run for part in parts for run in part.section.runs if run.reason is not None],
+            missing=missing,
             num_runs=len(runs),
         )
         write_whole(file, text)
@@ -163,7 +170,9 @@ def _most_figures(found: Sequence[Section]) -> int:
 
 def _title(parts: Sequence[Part]) -> str:
     """The curriculum and the agents as far as they fit, else how many there are."""
-    agents = list(dict.fromkeys(agent.result.agent for part in parts for agent in part.agents))
+    agents: dict[str, None] = {}
+    for part in parts:
+        agents |= dict.fromkeys(agent.result.agent for agent in part.agents)
     who = ", ".join(agents) if len(agents) <= 3 else f"{len(agents)} agents"
     where = parts[0].section.name if len(parts) == 1 else f"{len(parts)} curricula"
     return f"{where}: {who}"
@@ -179,8 +188,8 @@ def _part(section: Section, gallery: Gallery) -> Part:
         everything=next(formats.pages(section.rows)) if len(section.rows) <= MOST_ROWS else None,
         agents=[_agent(section, result, gallery) for result in section.results[:MOST_AGENTS]],
         unshown=max(0, len(section.results) - MOST_AGENTS),
-        runs=[row for result in section.results for row in _runs(result)],
-        systems=Counter(_system(run) for run in section.runs).most_common(),
+        runs=list(chain(*map(_runs, section.results))),
+        systems=Counter(map(_system, section.runs)).most_common(),
     )
 
 
@@ -217,8 +226,13 @@ def _agent(section: Section, result: Result, gallery: Gallery) -> AgentPart:
 
 def _sentences(result: Result, trees: Trees | None) -> Iterator[str]:
     """Return sentences on what is missing, and why."""
-    missing = [f"Seed {seed} has no run." for seed, run in result.by_seed.items() if run is None]
-    missing += [f"Seed {run.seed} has no results: {run.reason}." for run in result.runs if run.reason is not None]
+    missing = []
+    for seed, run in result.by_seed.items():
+        if run is None:
+            missing.append(f"Seed {seed} has no run.")
+    for run in result.runs:
+        if run.reason is not None:
+            missing.append(f"Seed {run.seed} has no results: {run.reason}.")
     yield from missing[:MOST_SENTENCES]
     if len(missing) > MOST_SENTENCES:
         yield f"{len(missing) - MOST_SENTENCES} more seeds have no results; the list of runs says why."
@@ -257,7 +271,8 @@ def _runs(result: Result) -> Iterator[tuple[str, ...]]:
 def _system(run: Run) -> str:
     """Versions and hardware."""
     versions = ", ".join(f"{name} {version}" for name, version in (run.about.get("versions") or {}).items())
-    threads, device = run.about.get("num_threads", "?"), run.about["config"].get("device", "not said")
+    threads = run.about.get("num_threads", "?")
+    device = run.about["config"].get("device", "not said")
     machine = run.about.get("machine", "not said")
     group = f"; trained in a group of {group_size(run)} seeds" if group_size(run) > 1 else ""
     return f"{versions or 'versions not said'}; machine {machine}, threads of torch {threads}, device {device}{group}"
@@ -265,15 +280,18 @@ def _system(run: Run) -> str:
 
 def _definitions(parts: Sequence[Part]) -> list[tuple[str, str, str, str]]:
     """Measure, id, formula and source of every measure on the page."""
-    known = {which: meaning for part in parts for which, meaning in part.section.definitions().items()}
+    known: dict[str, tuple[str, str, str]] = {}
+    for part in parts:
+        known |= part.section.definitions()
     return [(name, which, formula, source) for which, (name, formula, source) in known.items()]
 
 
 def _latex(parts: Sequence[Part]) -> str:
     """Return tables for papers: the measures of each curriculum, and each agent's matrices."""
-    labels, found = Labels(), [PREAMBLE]
+    labels = Labels()
+    found = [PREAMBLE]
     for part in parts:
-        found += [formats.as_latex(part.matrix, labels, part.section.modified)]
+        found.append(formats.as_latex(part.matrix, labels, part.section.modified))
         for agent in part.agents:
             for numbers in agent.numbers if len(part.section.labels) <= MOST_COLUMNS else ():
                 who = f"{part.section.name}, {agent.result.agent} (n = {agent.result.n})"
@@ -285,5 +303,7 @@ def _latex(parts: Sequence[Part]) -> str:
 
 def _named_cells(numbers: Numbers) -> list[tuple[str, list[TableCell]]]:
     """Return the rows of a matrix, each with its name and its cells."""
-    split = [(name, [cell.partition(" ") for cell in cells]) for name, *cells in numbers.rows]
-    return [(name, [TableCell(value, interval) for value, _, interval in cells]) for name, cells in split]
+    rows = []
+    for name, *cells in numbers.rows:
+        rows.append((name, [TableCell(*cell.partition(" ")[::2]) for cell in cells]))
+    return rows

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from ctgraph_rl import metrics, parsers
 from ctgraph_rl.checks import positive, require
 from ctgraph_rl.disk import write_named
 from ctgraph_rl.learn.progress import Count, StepCounter, silent
-from ctgraph_rl.log.escape import csv_text, terminal_text
+from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.files import LOG
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.log.run_log import RunLog
@@ -24,8 +25,8 @@ from ctgraph_rl.report.bounds import BoundsOfRuns, bounds_by_curriculum
 from ctgraph_rl.report.formats import FORMATS, LEGENDS, NO_RUN_FINISHED, SENTENCES
 from ctgraph_rl.report.names import displayed, modifications
 from ctgraph_rl.report.statistics import Comparison, Estimate, mean
-from ctgraph_rl.report.terminal import print_problems
-from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped
+from ctgraph_rl.report.terminal import print_note, print_problems
+from ctgraph_rl.runs.read import BySeed, Run, find_runs, grouped, present, why_left_out
 
 SOLVED = 0.9
 """Success rate from which on a task counts as solved."""
@@ -87,6 +88,11 @@ class Row:
     seed: int | None = None
 
     @property
+    def kind(self) -> str:
+        """The measure without a task."""
+        return self.measure.split(" ")[0]
+
+    @property
     def shown(self) -> str:
         """The agent, and the seed of a row of one run."""
         return self.agent if self.seed is None else f"{self.agent}, seed {self.seed}"
@@ -104,8 +110,8 @@ def table(runs: Sequence[Run], statistics: str = "exact", count: Count = silent)
     rows = []
     groups = grouped(runs)
     for done, ((name, agent), by_seed) in enumerate(groups.items(), 1):
-        lines = (*_metrics(by_seed, bounds[name], statistics), *_at_the_end(by_seed, bounds[name], statistics))
-        rows += [Row(name, agent, *line) for line in lines]
+        for line in _lines(by_seed, bounds[name], statistics):
+            rows.append(Row(name, agent, *line))
         count("agents", done, len(groups))
     return rows
 
@@ -116,11 +122,17 @@ def rows_by_seed(runs: Sequence[Run]) -> list[Row]:
     rows = []
     for (name, agent), by_seed in grouped(runs).items():
         for seed, run in by_seed.items():
-            alone = {seed: run}
-            lines = (*_metrics(alone, bounds[name], "std"), *_at_the_end(alone, bounds[name], "std"))
-            every = [Row(name, agent, *line, seed=seed) for line in lines]
-            rows += [_without_interval(row) for row in every if row.measure != "interquartile_return"]
+            for line in _lines({seed: run}, bounds[name], "std"):
+                row = Row(name, agent, *line, seed=seed)
+                if row.measure != "interquartile_return":
+                    rows.append(_without_interval(row))
     return rows
+
+
+def _lines(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
+    """Yield measure, estimate, definition and note of each row of an agent."""
+    yield from _metrics(by_seed, bounds, kind)
+    yield from _at_the_end(by_seed, bounds, kind)
 
 
 def _without_interval(row: Row) -> Row:
@@ -135,14 +147,17 @@ def comparisons(runs: Sequence[Run], metric: str) -> dict[tuple[str, str, str], 
     Raises:
         ValueError: if no run has the metric; lists those that there are.
     """
-    choices = dict.fromkeys(name for run in runs for name in run.metrics)
+    choices: dict[str, None] = {}
+    for run in runs:
+        choices |= dict.fromkeys(run.metrics)
     require((metric in choices, f"no run has a metric {metric!r}; there are: {', '.join(choices) or 'none'}"))
-    found, bounds = {}, bounds_by_curriculum(runs)
+    found = {}
+    bounds = bounds_by_curriculum(runs)
     for (first, one), (second, other) in combinations(grouped(runs).items(), 2):
         if first[0] == second[0] and list(one) == list(other):
-            values, others = ([_value(run, metric) for run in by_seed.values()] for by_seed in (one, other))
             limits = bounds[first[0]].of_metric(metric)
-            found[first[0], first[1], second[1]] = statistics.compare(values, others, bounds=limits)
+            compared = statistics.compare(_values(one, metric), _values(other, metric), bounds=limits)
+            found[first[0], first[1], second[1]] = compared
     return statistics.corrected(found)
 
 
@@ -167,14 +182,19 @@ def selected(rows: Sequence[Row], names: Sequence[str] | None = None, also: Sequ
     Raises:
         ValueError: for a name that no row has; lists those that there are.
     """
-    choices = list(dict.fromkeys(row.measure.split(" ")[0] for row in rows if row.measure != NO_RUN_FINISHED))
+    choices: dict[str, None] = {}
+    with_value = set()
+    for row in rows:
+        if row.measure != NO_RUN_FINISHED:
+            choices[row.kind] = None
+        if row.measure in WHERE_KNOWN and row.estimate.n:
+            with_value.add((row.curriculum, row.measure))
     unknown = [name for name in names or () if name not in choices]
     message = f"no run has a measure {', '.join(map(repr, unknown))}; there are: {', '.join(choices) or 'none'}"
     require((not choices or not unknown, message))
-    with_value = {(row.curriculum, row.measure) for row in rows if row.measure in WHERE_KNOWN and row.estimate.n}
     always = (*SHOWN, *also, NO_RUN_FINISHED) if names is None else (*names, NO_RUN_FINISHED)
     further = with_value if names is None else ()
-    return [row for row in rows if row.measure.split(" ")[0] in always or (row.curriculum, row.measure) in further]
+    return [row for row in rows if row.kind in always or (row.curriculum, row.measure) in further]
 
 
 def write_csv(path: Path | str, rows: Sequence[Row]) -> None:
@@ -195,21 +215,26 @@ def write_tidy(path: Path, runs: Sequence[Run]) -> None:
         ValueError: for another ending.
         ModuleNotFoundError: for Parquet without pyarrow.
     """
-    known = [(agent, run) for (_, agent), of in grouped(runs).items() for run in of.values() if run is not None]
-    logs = [(agent, str(run.path), RunLog.read(run.path / LOG)) for agent, run in known if run.history is not None]
+    logs = []
+    for (_, agent), by_seed in grouped(runs).items():
+        for run in present(by_seed):
+            if run.history is not None:
+                logs.append((agent, str(run.path), RunLog.read(run.path / LOG)))
     write_evaluations(path, logs)
 
 
 def _metrics(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """A line for each metric; one for all if no run finished."""
-    present = [run for run in by_seed.values() if run is not None]
-    if not any(run.metrics for run in present):
+    definitions: dict[str, str] = {}
+    for run in present(by_seed):
+        for name, metric in run.metrics.items():
+            definitions.setdefault(name, metric["definition"])
+    if not definitions:
         estimate = mean([None] * len(by_seed))
         yield NO_RUN_FINISHED, estimate, "", _note(by_seed, None, estimate)
-    for metric in dict.fromkeys(metric for run in present for metric in run.metrics):
-        definition = next(run.metrics[metric]["definition"] for run in present if metric in run.metrics)
-        estimate = _estimate(by_seed, metric, bounds, kind)
-        yield metric, estimate, definition, _note(by_seed, metric, estimate)
+    for name, definition in definitions.items():
+        estimate = _estimate(by_seed, name, bounds, kind)
+        yield name, estimate, definition, _note(by_seed, name, estimate)
 
 
 def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> Estimate:
@@ -220,7 +245,7 @@ def _estimate(by_seed: BySeed, metric: str, bounds: BoundsOfRuns, kind: str) -> 
             never = run is not None and run.metrics.get(metric, {}).get("n_undefined")
             times.append(math.inf if never else _value(run, metric))
         return statistics.median_time(times)
-    return _over_seeds([_value(run, metric) for run in by_seed.values()], bounds.of_metric(metric), kind)
+    return _over_seeds(_values(by_seed, metric), bounds.of_metric(metric), kind)
 
 
 def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind: str) -> Estimate:
@@ -236,11 +261,17 @@ def _over_seeds(values: Sequence[float | None], bounds: statistics.LowHigh, kind
 
 def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """Return and share of solved tasks, the interquartile mean of returns, and each task's share of solved seeds."""
-    if any(run is not None and run.tasks for run in by_seed.values()):
+    tasks: dict[str, None] = {}
+    own: dict[str, None] = {}
+    for run in present(by_seed):
+        tasks |= dict.fromkeys(run.success)
+        own |= dict.fromkeys(run.tasks)
+    if own:
         yield from _over_tasks(by_seed, bounds, kind)
-    tasks = dict.fromkeys(task for run in by_seed.values() if run is not None for task in run.success)
     if tasks:
-        returns = [[None if run is None else run.returns.get(task) for run in by_seed.values()] for task in tasks]
+        returns = []
+        for task in tasks:
+            returns.append([None if run is None else run.returns.get(task) for run in by_seed.values()])
         if kind == "iqm":
             estimate = statistics.iqm(returns)
         else:
@@ -253,10 +284,13 @@ def _at_the_end(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tu
 
 def _over_tasks(by_seed: BySeed, bounds: BoundsOfRuns, kind: str) -> Iterator[tuple[str, Estimate, str, str]]:
     """Means over tasks that are not held out, of what was measured last; a seed needs a value of each."""
-    runs = by_seed.values()
-    returns = [None if run is None else _mean(run.returns[task] for task in run.tasks) for run in runs]
+    returns: list[float | None] = [None] * len(by_seed)
+    solved = returns.copy()
+    for place, run in enumerate(by_seed.values()):
+        if run is not None:
+            returns[place] = _mean([run.returns[task] for task in run.tasks])
+            solved[place] = _mean([_solved(run, task) for task in run.tasks])
     yield _ended("mean_final_return", _over_seeds(returns, bounds.of_returns, kind), by_seed)
-    solved = [None if run is None else _mean(_solved(run, task) for task in run.tasks) for run in runs]
     yield _ended("solved_rate", _over_seeds(solved, (0.0, 1.0), kind), by_seed)
 
 
@@ -264,15 +298,18 @@ def _ended(measure: str, estimate: Estimate, by_seed: BySeed) -> tuple[str, Esti
     return measure, estimate, AT_END[measure.split(" ")[0]].id, _note(by_seed, None, estimate)
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = list(values)
-    numbers = [value for value in known if value is not None]
-    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(known) else None
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known and len(known) == len(values) else None
 
 
 def _solved(run: Run | None, task: str) -> bool | None:
     rate = None if run is None else run.success.get(task)
     return None if rate is None else rate >= SOLVED
+
+
+def _values(by_seed: BySeed, metric: str) -> list[float | None]:
+    return [_value(run, metric) for run in by_seed.values()]
 
 
 def _value(run: Run | None, metric: str) -> float | None:
@@ -287,7 +324,7 @@ def _note(by_seed: BySeed, metric: str | None, estimate: Estimate) -> str:
         if reason is not None:
             reasons.setdefault(reason, []).append(str(seed))
     notes = [f"seed {', '.join(seeds)}: {reason}" for reason, seeds in reasons.items()]
-    return "; ".join(notes + ([estimate.reason] if estimate.reason else []))
+    return "; ".join(filter(None, [*notes, estimate.reason]))
 
 
 def _missing(run: Run | None, metric: str | None) -> str | None:
@@ -305,7 +342,7 @@ def print_table(run_dirs: Sequence[Path]) -> None:
     runs, problems = find_runs(run_dirs)
     print(FORMATS["text"](selected(table(runs)), modifications(runs), LEGENDS["exact"]))
     for problem in problems:
-        print(terminal_text(f"left out: {problem.reason}"), file=sys.stderr)
+        print_note("left out", problem.reason)
 
 
 def main() -> None:
@@ -320,11 +357,11 @@ def main() -> None:
             check_table(arguments.tidy)
         with StepCounter() as count:
             runs, problems = find_runs(arguments.runs, count)
-            require((bool(runs), "; ".join(problem.reason for problem in problems)))
+            require((bool(runs), why_left_out(problems)))
             runs = displayed(runs, arguments.agent)
             pairs = {} if arguments.compare is None else _pairs(runs, arguments.compare)
             rows = rows_by_seed(runs) if arguments.per_seed else table(runs, arguments.statistics, count)
-        names = None if arguments.metrics is None else [name.strip() for name in arguments.metrics.split(",")]
+        names = None if arguments.metrics is None else list(map(str.strip, arguments.metrics.split(",")))
         also = ["interquartile_return"] if arguments.statistics == "iqm" else []
         shown = rows if arguments.all else selected(rows, names, also)
         kind = "seeds" if arguments.per_seed else arguments.statistics

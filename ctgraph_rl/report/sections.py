@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, zip_longest
+from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from ctgraph_rl.report.intervals import UNBOUNDED, Bounds
 from ctgraph_rl.report.names import modifications
 from ctgraph_rl.report.results import AT_END, Row, table
 from ctgraph_rl.report.statistics import Estimate, mean
-from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped
+from ctgraph_rl.runs.read import BySeed, Curve, History, Run, grouped, present, split_by
 
 Estimates = list[list[Estimate]]
 """Estimates over seeds, [blocks][tasks]."""
@@ -59,7 +60,7 @@ class Result:
     @property
     def runs(self) -> list[Run]:
         """All that there are, finished or not."""
-        return [run for run in self.by_seed.values() if run is not None]
+        return present(self.by_seed)
 
     @property
     def finished(self) -> list[Run]:
@@ -83,13 +84,15 @@ class Result:
 
     def _over_seeds(self, matrices: Sequence[list[list[float]]], bounds: Callable[[str], Bounds]) -> Estimates:
         missing = [None] * (len(self.by_seed) - len(matrices))
-        shape = max(map(len, matrices), default=0), max((len(row) for rows in matrices for row in rows), default=0)
         labels = next((history.labels for history in _histories(self.finished)), ())
-        limits = [bounds(labels[j]) if j < len(labels) else UNBOUNDED for j in range(shape[1])]
-        return [
-            [mean([*(_at(rows, i, j) for rows in matrices), *missing], bounds=limits[j]) for j in range(shape[1])]
-            for i in range(shape[0])
-        ]
+        estimates = []
+        for rows in zip_longest(*matrices, fillvalue=[]):
+            of_block = []
+            for values, label in zip_longest(zip_longest(*rows), labels):
+                limits = UNBOUNDED if label is None else bounds(label)
+                of_block.append(mean([*(values or [None] * len(matrices)), *missing], bounds=limits))
+            estimates.append(of_block)
+        return estimates
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,11 @@ class Section:
         """All that there are, finished or not."""
         return [run for result in self.results for run in result.runs]
 
+    @property
+    def finished(self) -> list[Run]:
+        """Those with results."""
+        return [run for run in self.runs if run.reason is None]
+
     @cached_property
     def one(self) -> Run:
         """The run that tells the section's facts: the first finished one, if there is one."""
@@ -131,8 +139,8 @@ class Section:
     @cached_property
     def ends(self) -> tuple[int, ...]:
         """Frames at the end of each block, 0 first; of a block that a run does not measure, as others say."""
-        every = [run.history.ends for run in self.runs if run.history is not None]
-        return tuple(accumulate((max(block) for block in zip_longest(*every, fillvalue=0)), max)) or (0,)
+        every = [history.ends for history in _histories(self.runs)]
+        return tuple(accumulate(map(max, zip_longest(*every, fillvalue=0)), max)) or (0,)
 
     def definitions(self) -> dict[str, tuple[str, str, str]]:
         """Formula and source of each measure in the table, by the id of its definition."""
@@ -140,8 +148,11 @@ class Section:
         for run in self.runs:
             for metric in run.metrics.values():
                 known[metric["definition"]] = (metric.get("formula", ""), metric.get("source", ""))
-        names = {row.definition: measure_name(row.measure.split(" ")[0]) for row in self.rows if row.definition}
-        return {which: (names[which], *known[which]) for which in names}
+        found = {}
+        for row in self.rows:
+            if row.definition:
+                found[row.definition] = (measure_name(row.kind), *known[row.definition])
+        return found
 
 
 def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
@@ -150,9 +161,7 @@ def sections(runs: Sequence[Run], count: Count = silent) -> list[Section]:
     bounds = bounds_by_curriculum(runs)
     for (curriculum, agent), by_seed in grouped(runs).items():
         agents.setdefault(curriculum, []).append(Result(agent, by_seed, bounds[curriculum]))
-    rows: dict[str, list[Row]] = {}
-    for row in table(runs, count=count):
-        rows.setdefault(row.curriculum, []).append(row)
+    rows = split_by(table(runs, count=count), lambda row: row.curriculum)
     modified = modifications(runs)
     return [Section(name, tuple(results), rows[name], modified.get(name, "")) for name, results in agents.items()]
 
@@ -166,7 +175,7 @@ def mean_curve(history: History) -> Curve:
     """Return the mean return over all tasks of a run, at the evaluations of all of them."""
     curves = [dict(history.evaluations.get(label, [])) for label in history.labels]
     shared = sorted(set.intersection(*map(set, curves))) if curves else []
-    return [(frames, math.fsum(curve[frames] for curve in curves) / len(curves)) for frames in shared]
+    return [(frames, fmean(curve[frames] for curve in curves)) for frames in shared]
 
 
 def training_curve(
@@ -193,15 +202,18 @@ def over_seeds(curves: Sequence[Curve], bounds: Bounds = UNBOUNDED) -> list[Poin
         for frames, value in dict(curve).items():
             if not math.isnan(value):
                 values.setdefault(frames, []).append(value)
-    complete = {frames: some for frames, some in sorted(values.items()) if len(some) == len(curves)}
-    return [_point(frames, some, bounds) for frames, some in complete.items()]
+    points = []
+    for frames, some in sorted(values.items()):
+        if len(some) == len(curves):
+            points.append(_point(frames, some, bounds))
+    return points
 
 
 def _point(frames: int, values: Sequence[float], bounds: Bounds) -> Point:
     if len(values) < FEWEST_FOR_BANDS:
-        return Point(frames, math.fsum(values) / len(values), None, None, len(values))
+        return Point(frames, fmean(values), None, None, len(values))
     estimate = mean(values, bounds=bounds)
-    return Point(frames, math.fsum(values) / len(values), estimate.low, estimate.high, len(values))
+    return Point(frames, fmean(values), estimate.low, estimate.high, len(values))
 
 
 def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
@@ -210,12 +222,8 @@ def _in_places(curve: Curve, start: int, end: int, places: int) -> Curve:
     values: dict[int, list[float]] = {}
     for frames, value in curve:
         values.setdefault(math.ceil((frames - start) / width), []).append(value)
-    return [(min(round(start + place * width), end), math.fsum(some) / len(some)) for place, some in values.items()]
+    return [(min(round(start + place * width), end), fmean(some)) for place, some in values.items()]
 
 
 def _histories(runs: Iterable[Run]) -> list[History]:
     return [run.history for run in runs if run.history is not None]
-
-
-def _at(rows: list[list[float]], i: int, j: int) -> float | None:
-    return rows[i][j] if i < len(rows) and j < len(rows[i]) else None

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -61,7 +62,7 @@ def print_summary(run_dir: Path | str, console: Console | None = None) -> None:
     assert run.history is not None
     name = Path(run_dir).name
     tables = [_matrix(name, run.history), _curves(sparklines(run.history.evaluations, bars))]
-    if any(_width(table) > console.width for table in tables):
+    if max(map(_width, tables)) > console.width:
         tables = [_task_table(name, run.history, bars, console.width)]
     modified = modification(run)
     if modified:
@@ -85,9 +86,11 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
     The scale goes from the lowest value, or 0, to the highest, or 1. Evaluations beyond ``most`` share a place, which
     shows their mean; one without a value is a space.
     """
-    known = [value for curve in evaluations.values() for _, value in curve if not math.isnan(value)]
-    low = min([0.0, *known])
-    high = max([1.0, *known])
+    known = [0.0, 1.0]
+    for curve in evaluations.values():
+        known += [value for _, value in curve if not math.isnan(value)]
+    low = min(known)
+    high = max(known)
 
     def bar(values: Sequence[float]) -> str:
         there = [value for value in values if not math.isnan(value)]
@@ -99,8 +102,11 @@ def sparklines(evaluations: Mapping[str, Curve], bars: str = BARS, most: int = M
 def _shared(curve: Curve, most: int) -> list[list[float]]:
     """Return the values of a curve in at most so many parts of nearly equal length."""
     places = min(most, len(curve))
-    cuts = [len(curve) * place // places for place in range(places + 1)]
-    return [[value for _, value in curve[start:end]] for start, end in pairwise(cuts)]
+    values = [value for _, value in curve]
+    parts = []
+    for place in range(places):
+        parts.append(values[len(curve) * place // places : len(curve) * (place + 1) // places])
+    return parts
 
 
 def _matrix(name: str, history: History) -> Table:
@@ -108,7 +114,7 @@ def _matrix(name: str, history: History) -> Table:
     table = Table(title=_text(f"{name}: mean return on each task after each block"))
     for heading in ("block", "frames", *history.labels):
         table.add_column(_text(heading), justify="right")
-    for block, (frames, values) in enumerate(_blocks(history)):
+    for block, (frames, values) in enumerate(zip(history.ends, history.performance, strict=False)):
         table.add_row(str(block), f"{frames:,}", *map(_shown, values))
     return table
 
@@ -142,7 +148,7 @@ def _tasks(title: str, history: History, curves: Mapping[str, str]) -> Table:
         table.add_column(heading, justify="left" if heading == "task" else "right")
     if curves:
         table.add_column("curve")
-    by_task = zip(*(values for _, values in _blocks(history)), strict=True)
+    by_task = zip(*history.performance[: len(history.ends)], strict=True)
     for label, values in zip(history.labels, by_task, strict=True):
         curve = [_text(curves.get(label, ""))] if curves else []
         table.add_row(_text(_shortened(label)), *_summary(values), *curve)
@@ -162,11 +168,6 @@ def _shortened(label: str) -> str:
     return label if len(label) <= LONGEST_LABEL else f"{label[: half - 2]}...{label[1 - half :]}"
 
 
-def _blocks(history: History) -> list[tuple[int, list[float]]]:
-    """Return the frames at the end of each block so far, and the mean return on each task then."""
-    return list(zip(history.ends, history.performance, strict=False))
-
-
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:z.2f}"
 
@@ -176,10 +177,9 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
     table = Table(title=f"Metrics; metrics.json has all {len(metrics)}")
     for name, justify in (("metric", "left"), ("value", "right"), ("definition", "left")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in (
-        *ALWAYS,
-        *(name for name in (*LIFELONG, *WITH_EXPERTS, *OF_DETECTION) if metrics.get(name, {}).get("value") is not None),
-    ):
+    for name in (*ALWAYS, *LIFELONG, *WITH_EXPERTS, *OF_DETECTION):
+        if name not in ALWAYS and metrics.get(name, {}).get("value") is None:
+            continue
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"
         table.add_row(LIFELONG.get(name, measure_name(name)), value, _text(metric["undefined"] or metric["formula"]))
@@ -202,7 +202,7 @@ def _state(run: Run) -> tuple[str, str, str]:
 
 
 def _sentence(states: Sequence[Sequence[Run]]) -> str:
-    every = [run for some in states for run in some]
+    every = list(chain(*states))
     fingerprints = len({run.group[1] for run in every}) > 1
     parts = []
     for some in states:
@@ -213,18 +213,25 @@ def _sentence(states: Sequence[Sequence[Run]]) -> str:
     return f"{who}: {'; '.join(parts)}; overwrite=stale runs what is stale again"
 
 
-def print_problems(problems: Iterable[Problem], runs: Sequence[Run]) -> bool:
+def print_problems(problems: Sequence[Problem], runs: Sequence[Run]) -> bool:
     """Print on standard error what is left out, and what is to be said of code.
 
     Returns:
         Whether something is left out, or runs of one configuration are of different code.
     """
-    left_out = [f"left out: {problem.reason}" for problem in problems]
     mixed = mixed_code(runs)
-    notes = [f"code: {sentence}" for sentence in (*mixed, *code_notes(runs))]
-    for line in (*left_out, *notes, *(f"labels: {sentence}" for sentence in label_notes(runs))):
-        print(terminal_text(line), file=sys.stderr)
-    return bool(left_out or mixed)
+    for problem in problems:
+        print_note("left out", problem.reason)
+    for sentence in (*mixed, *code_notes(runs)):
+        print_note("code", sentence)
+    for sentence in label_notes(runs):
+        print_note("labels", sentence)
+    return bool(problems or mixed)
+
+
+def print_note(about: str, sentence: str) -> None:
+    """Print on standard error what is to be said about something."""
+    print(terminal_text(f"{about}: {sentence}"), file=sys.stderr)
 
 
 def group_size(run: Run) -> int:
@@ -241,18 +248,17 @@ def code_notes(runs: Sequence[Run]) -> list[str]:
     older = [run for run in runs if run.code["numbers version"] < numbers_of(run.about)]
     unknown = [run for run in runs if None in run.code.values()]
     versions = ", ".join(sorted({str(run.code["numbers version"]) for run in older}))
-    present = ", ".join(sorted({str(numbers_of(run.about)) for run in older}))
-    said = f"of numbers version {versions}, this package is of {present}: it may give other numbers"
-    found = [(older, said), (unknown, "of unknown code: they do not say of which source they are")]
-    sizes = [group_size(run) for run in runs]
-    for size in sorted({*sizes} - {1}) if len({*sizes}) > 1 else ():
-        of_size = [run for run in runs if group_size(run) == size]
-        found.append((of_size, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
+    needed = ", ".join(sorted({str(numbers_of(run.about)) for run in older}))
+    said = f"of numbers version {versions}, this package is of {needed}: it may give other numbers"
+    found = [(len(older), said), (len(unknown), "of unknown code: they do not say of which source they are")]
+    for size, count in sorted(Counter(map(group_size, runs)).items()):
+        if size > 1 and count < len(runs):
+            found.append((count, f"of seeds trained together, {size} at a time; they differ from others by rounding"))
     experts = [run.history.experts_together for run in runs if run.history is not None]
-    if {True, False} <= {each for of_run in experts for each in of_run}:
-        some = [run for run in runs if run.history is not None and any(run.history.experts_together)]
-        found.append((some, "compared with experts of seeds trained together; those differ from others by rounding"))
-    return [f"{len(some)} of {len(runs)} runs are {what}" for some, what in found if some]
+    if {True, False} <= {*chain(*experts)}:
+        rounded = "compared with experts of seeds trained together; those differ from others by rounding"
+        found.append((sum(map(any, experts)), rounded))
+    return [f"{count} of {len(runs)} runs are {what}" for count, what in found if count]
 
 
 def label_notes(runs: Sequence[Run]) -> list[str]:

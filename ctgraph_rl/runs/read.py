@@ -11,10 +11,11 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, is_real, repeated, require
 from ctgraph_rl.disk import read_regular, read_text
 from ctgraph_rl.learn.labels import Span, label_spans
 from ctgraph_rl.learn.progress import Count, silent
@@ -120,9 +121,14 @@ class Run:
     @property
     def code(self) -> NamedValues:
         """The numbers version of the package, and the digest of each module of the user; None where it is not known."""
-        sources, learners = self.about.get("sources"), targets({**self.about["config"], "curriculum": None})
-        unknown = {name.rpartition(".")[0]: None for name in learners if not is_ours(name)}
-        return {"numbers version": self.about.get("numbers", 1), **(unknown if sources is None else sources)}
+        found = {"numbers version": self.about.get("numbers", 1)}
+        sources = self.about.get("sources")
+        if sources is not None:
+            return {**found, **sources}
+        for name in targets({**self.about["config"], "curriculum": None}):
+            if not is_ours(name):
+                found[name.rpartition(".")[0]] = None
+        return found
 
     @property
     def alike(self) -> tuple[tuple[str, str], str]:
@@ -142,13 +148,18 @@ class Problem(NamedTuple):
     reason: str
 
 
-def reasons(problems: Iterable[Problem]) -> str:
-    """Return why directories are left out."""
+def why_left_out(problems: Iterable[Problem]) -> str:
+    """Return why directories are left out, in one text."""
     return "; ".join(problem.reason for problem in problems)
 
 
 BySeed = Mapping[int, Run | None]
 """Runs that differ only in their seed; None for a seed that only other agents have."""
+
+
+def present(by_seed: BySeed) -> list[Run]:
+    """Return the runs that there are, by seed."""
+    return list(filter(None, by_seed.values()))
 
 
 def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[Run], list[Problem]]:
@@ -160,12 +171,13 @@ def find_runs(paths: Iterable[Path | str], count: Count = silent) -> tuple[list[
         paths: directories.
         count: is called after each file that is read.
     """
-    found, problems = [], []
+    found = []
+    problems: list[Problem] = []
     refused: dict[Path, Path] = {}
     every = []
     for path in paths:
         files, deep = files_below(Path(path), (LOG, FAILURE))
-        problems += [Problem(each, too_deep(each)) for each in deep]
+        problems += map(Problem, deep, map(too_deep, deep))
         if not files:
             problems.append(Problem(Path(path), no_run(Path(path))))
         every += files
@@ -197,7 +209,9 @@ def read_run(path: Path) -> Run:
     """
     file = path / LOG
     about = _about(file)
-    config = {key: value for key, value in about["config"].items() if key not in OF_THE_CURRICULUM}
+    config = dict(about["config"])
+    for key in OF_THE_CURRICULUM:
+        config.pop(key, None)
     if _called(config.get("method")) == NO_METHOD:
         del config["method"]
     seed = config.pop("seed")
@@ -213,7 +227,16 @@ def read_run(path: Path) -> Run:
         reason = str(error) if isinstance(error, ValueError) else f"{file}: a measurement lacks or misuses {error}"
         return Run(path, about, agent, settings, seed, reason=reason)
     metrics, why = _metrics(path, log)
-    ends = [m for m in log.of_kind("evaluation") if m.get("moment") != "during"] if metrics else []
+    success = {}
+    returns = {}
+    tasks: dict[str, None] = {}
+    for m in log.of_kind("evaluation") if metrics else ():
+        if m.get("moment") != "during":
+            label = label_of(m)
+            success[label] = m.get("success_rate")  # the last
+            returns[label] = m.get("return_mean")
+            if not m.get("held_out"):
+                tasks[label] = None
     return Run(
         path,
         about,
@@ -222,9 +245,9 @@ def read_run(path: Path) -> Run:
         seed,
         reason=why,
         metrics=metrics,
-        success={label_of(m): m.get("success_rate") for m in ends},  # the last
-        returns={label_of(m): m.get("return_mean") for m in ends},
-        tasks=list(dict.fromkeys(label_of(m) for m in ends if not m.get("held_out"))),
+        success=success,
+        returns=returns,
+        tasks=list(tasks),
         history=history,
     )
 
@@ -255,7 +278,7 @@ def _agent(config: ReadOnlyValues) -> str | None:
     learner = config.get("agent")
     agent = _called(learner) or _called(config.get("learner"))
     cell = _called(learner.get("cell")) if isinstance(learner, Mapping) else None
-    parts = (agent, cell, *(_called(config.get(part)) for part in ("method", "detector")))
+    parts = (agent, cell, _called(config.get("method")), _called(config.get("detector")))
     return " + ".join(filter(None, parts)) if agent else agent
 
 
@@ -290,18 +313,22 @@ def _failure(path: Path) -> str | None:
 
 def _history(log: RunLog) -> History:
     about = log.of_kind("run")[0]
-    own = [m for m in log.of_kind("evaluation") if not m.get("held_out")]
     performance = log.performance().tolist()
-    known = dict(enumerate(about.get("tasks") or (), 1)) | {m["task"]: label_of(m) for m in own}
+    known = dict(enumerate(about.get("tasks") or (), 1))
     evaluations: dict[str, Curve] = {}
-    for m in own:
-        mean = math.nan if m["return_mean"] is None else m["return_mean"]
-        evaluations.setdefault(label_of(m), []).append((m["frames"], mean))
+    for m in log.of_kind("evaluation"):
+        if not m.get("held_out"):
+            known[m["task"]] = label_of(m)
+            mean = math.nan if m["return_mean"] is None else m["return_mean"]
+            evaluations.setdefault(label_of(m), []).append((m["frames"], mean))
     training: dict[int, Curve] = {}
     for m in log.of_kind("training"):
         if m["return_mean"] is not None:
             training.setdefault(m["block"], []).append((m["frames"], m["return_mean"]))
     adapted = {"trained": log.adaptation(), "held-out": log.adaptation(held_out=True)}
+    experts_together: list[bool] = []
+    for line in log.of_kind("experts"):
+        experts_together += ["together" in each for each in line["experts"]]
     seconds = log.measurements[-1].get("seconds", 0.0)
     return History(
         labels=tuple(str(known.get(task, f"task {task}")) for task in range(1, len(performance[0]) + 1)),
@@ -313,7 +340,7 @@ def _history(log: RunLog) -> History:
         spans=label_spans(log),
         adaptation={name: found for name, found in adapted.items() if found is not None},
         seconds=seconds,
-        experts_together=tuple("together" in each for line in log.of_kind("experts") for each in line["experts"]),
+        experts_together=tuple(experts_together),
     )
 
 
@@ -326,9 +353,9 @@ def grouped(runs: Sequence[Run]) -> dict[tuple[str, str], dict[int, Run | None]]
         if run.agent is not None:
             expected.setdefault(run.group, set()).add(run.seed)
     one_each = [next(iter(by_seed.values())) for by_seed in groups.values()]
-    curricula, agents = _curriculum_names(runs), _agent_names(one_each)
+    curricula = _curriculum_names(runs)
     found: dict[tuple[str, str], dict[int, Run | None]] = {}
-    for one, agent, by_seed in zip(one_each, agents, groups.values(), strict=True):
+    for one, agent, by_seed in zip(one_each, _agent_names(one_each), groups.values(), strict=True):
         seeds = sorted(by_seed if one.agent is None else expected[one.group])
         name = agent if one.shown is None else one.shown[1]
         found[curricula[one.group], name] = {seed: by_seed.get(seed) for seed in seeds}
@@ -345,14 +372,14 @@ def _curriculum_names(runs: Iterable[Run]) -> dict[tuple[str, str], str]:
     named: dict[tuple[str, str], str] = {}
     for run in runs:
         named[run.group] = min(named.get(run.group, run.curriculum[0]), run.curriculum[0], key=len)
-    names = list(named.values())
-    return {group: name if names.count(name) == 1 else f"{name} {group[1]}" for group, name in named.items()}
+    several = repeated(named.values())
+    return {group: f"{name} {group[1]}" if name in several else name for group, name in named.items()}
 
 
 def _in_order(runs: Sequence[Run]) -> list[Run]:
     """Runs of one curriculum and agent where the first of them is, by the settings in which they differ."""
     found: list[Run] = []
-    for some in _alike(runs).values():
+    for some in split_by(runs, _kind).values():
         keys = _differing(some)
         found += sorted(some, key=lambda run: [_rank(run.settings.get(key)) for key in keys])
     return found
@@ -365,14 +392,12 @@ def _rank(value: Any) -> tuple[int, float, str]:
 
 def _agent_names(runs: Sequence[Run]) -> list[str]:
     """Each run's agent, with the settings in which it differs from others of the name on the curriculum."""
-    differing = {key: _differing(some) for key, some in _alike(runs).items()}
-    twins: dict[Any, list[Run]] = {}
-    for run in runs:
-        twins.setdefault(run.alike, []).append(run)
+    differing = {kind: _differing(some) for kind, some in split_by(runs, _kind).items()}
+    twins = split_by(runs, lambda run: run.alike)
     names = []
     for run in runs:
         parts = [_name(run)]
-        for key in differing[run.group, _name(run)]:
+        for key in differing[_kind(run)]:
             parts.append(f"{key.removeprefix('agent.').removeprefix('method.')}={run.settings.get(key)}")
         code = code_of(run, twins[run.alike])
         names.append(" ".join([*parts, f"({code})"] if code else parts))
@@ -382,8 +407,11 @@ def _agent_names(runs: Sequence[Run]) -> list[str]:
 def code_of(run: Run, others: Sequence[Run]) -> str:
     """Return in words the code of a run, as far as it differs between others."""
     codes = [other.code for other in others]
-    names = sorted({name for code in codes for name in code if len({each.get(name, "") for each in codes}) > 1})
-    values = [(name, run.code.get(name, "")) for name in names]
+    own = run.code
+    values = []
+    for name in sorted(set(chain(*codes))):
+        if len({code.get(name, "") for code in codes}) > 1:
+            values.append((name, own.get(name, "")))
     said = [f"{name} {'unknown' if value is None else value or 'not there'}" for name, value in values]
     if len(said) > MOST_MODULES:
         rest = json.dumps(values[MOST_MODULES:])
@@ -391,12 +419,9 @@ def code_of(run: Run, others: Sequence[Run]) -> str:
     return ", ".join(said)
 
 
-def _alike(runs: Iterable[Run]) -> dict[tuple[Any, ...], list[Run]]:
-    """Runs by curriculum and name of the agent."""
-    found: dict[tuple[Any, ...], list[Run]] = {}
-    for run in runs:
-        found.setdefault((run.group, _name(run)), []).append(run)
-    return found
+def _kind(run: Run) -> tuple[tuple[str, str], str]:
+    """Return curriculum and name of the agent."""
+    return run.group, _name(run)
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:

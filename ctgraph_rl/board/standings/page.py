@@ -23,7 +23,7 @@ from ctgraph_rl.log.escape import terminal_text
 from ctgraph_rl.log.refuse import refused_by
 from ctgraph_rl.report.style import require_packages
 from ctgraph_rl.report.templates import rendered
-from ctgraph_rl.runs.read import Problem
+from ctgraph_rl.runs.read import Problem, why_left_out
 
 PAGE = "board.html"
 
@@ -58,7 +58,7 @@ def write_board(
     """
     require_packages("the board", "jinja2", "scipy")
     entries, problems = read_entries(paths, config_dir)
-    require((bool(entries), "; ".join(problem.reason for problem in problems)))
+    require((bool(entries), why_left_out(problems)))
     made = tables(entries)
     folder = made_folder(Path(folder))
     data = {

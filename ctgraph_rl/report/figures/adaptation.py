@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import torch
@@ -44,7 +45,7 @@ def draw_adaptation(section: Section, kinds: list[str]) -> Any:
             if seeds:
                 mean = torch.stack(seeds).mean(dim=0)
                 axes.plot(_episodes(mean), mean, label=named(result), markevery=1 + len(mean) // 8, **look)
-        exact = next(adaptation.exact.mean(dim=0) for result in shown for adaptation in _of_seeds(result, kind))
+        exact = next(chain(*(_of_seeds(result, kind) for result in shown))).exact.mean(dim=0)
         axes.plot(_episodes(exact), exact, "k--", marker="", linewidth=1, label="best search")
         axes.set(title=f"{kind} tasks", xlabel="episode of a row", ylim=(-0.05, 1.05))
     panels[0].set_ylabel("share at the goal")
@@ -55,8 +56,11 @@ def draw_adaptation(section: Section, kinds: list[str]) -> Any:
 
 def _of_seeds(result: Result, kind: str) -> list[Adaptation]:
     """Return what the finished runs of an agent measured on trained or held-out tasks."""
-    histories = [run.history for run in result.finished if run.history is not None]
-    return [history.adaptation[kind] for history in histories if kind in history.adaptation]
+    found = []
+    for run in result.finished:
+        if run.history is not None and kind in run.history.adaptation:
+            found.append(run.history.adaptation[kind])
+    return found
 
 
 def _episodes(curve: Tensor) -> range:

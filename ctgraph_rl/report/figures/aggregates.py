@@ -8,7 +8,7 @@ less than they say.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,12 +44,13 @@ class Interval(NamedTuple):
 
 def scores(result: Result) -> dict[str, np.ndarray]:
     """Return an agent's mean returns at the last evaluation of each task that is not held out."""
-    tasks = dict.fromkeys(task for run in result.finished for task in run.tasks)
-    found = {}
-    for task in tasks:
-        values = [run.returns.get(task) for run in result.finished]
-        found[task] = np.array([value for value in values if value is not None], dtype=np.float64)
-    return {task: values for task, values in found.items() if len(values)}
+    found: dict[str, list[float]] = {}
+    for run in result.finished:
+        for task in run.tasks:
+            value = run.returns.get(task)
+            if value is not None:
+                found.setdefault(task, []).append(value)
+    return {task: np.array(values, dtype=np.float64) for task, values in found.items()}
 
 
 def performance_profile(of_tasks: Scores, thresholds: np.ndarray, seed: int = 0) -> Interval:
@@ -117,7 +118,7 @@ def profiles(section: Section) -> CaptionedFigure | None:
 def draw_profiles(section: Section) -> Any:
     """Draw the performance profile of each agent."""
     shown = _shown(section)[:MOST_AGENTS]
-    every = np.concatenate([values for result in shown for values in scores(result).values()])
+    every = np.concatenate(list(chain(*(scores(result).values() for result in shown))))
     thresholds = np.linspace(min(0.0, every.min()), max(1.0, every.max()), THRESHOLDS)
     figure = new_figure(figure_width(), 2.5)
     axes = figure.subplots()

@@ -18,7 +18,7 @@ COLUMNS = 3
 
 def experiments(found: Sequence[Section]) -> CaptionedFigure | None:
     """Return the mean return over all tasks on several curricula; None for fewer than two with a finished run."""
-    measured = [section for section in found if any(result.finished for result in section.results)]
+    measured = [section for section in found if section.finished]
     if len(measured) < 2:
         return None
     agents = left_out(len(_agents(measured)), MOST_AGENTS, "agents")
@@ -44,10 +44,13 @@ def draw_experiments(found: Sequence[Section]) -> Any:
     for row in grid:
         row[0].set_ylabel("mean return")
     figure.supxlabel("frames", fontsize=8)
-    agents_legend(figure, [(short(agent), look) for agent, look in looks.items()])
+    agents_legend(figure, list(zip(map(short, looks), looks.values(), strict=True)))
     return figure
 
 
 def _agents(found: Sequence[Section]) -> list[str]:
     """Return the names of all agents, each once."""
-    return list(dict.fromkeys(result.agent for section in found for result in section.results))
+    agents: dict[str, None] = {}
+    for section in found:
+        agents |= dict.fromkeys(result.agent for result in section.results)
+    return list(agents)

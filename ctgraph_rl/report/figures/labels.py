@@ -10,7 +10,7 @@ from ctgraph_rl.log.escape import figure_text, terminal_text
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, left_out
 from ctgraph_rl.report.sections import Section
 from ctgraph_rl.report.style import figure_width, frames_axis, ink, new_figure, short
-from ctgraph_rl.runs.read import Run
+from ctgraph_rl.runs.read import Run, split_by
 
 MOST_STRIPS = 30
 """Runs that have a strip."""
@@ -56,7 +56,9 @@ def draw_labels(section: Section) -> Any:
     for start, _, tasks in blocks[1:]:
         if tasks != next(before for _, end, before in blocks if end == start):
             axes.axvline(start, color="black", linestyle=(0, (3, 2)), linewidth=0.6)
-    names = ["true task", *(figure_text(name) for name, _ in runs)]
+    names = ["true task"]
+    for name, _ in runs:
+        names.append(figure_text(name))
     axes.set(xlim=(0, max(section.ends[-1], 1)), ylim=(len(runs) + 0.6, -0.6), xlabel="frames")
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", length=0)
@@ -78,12 +80,12 @@ def _draw_strip(axes: Any, row: int, spans: Sequence[Span], blocks: Sequence[Any
 
 def _runs(section: Section) -> list[tuple[str, Run]]:
     """Return the finished runs with their own labels, each with agent and seed."""
-    found = [(result.agent, run) for result in section.results for run in result.finished]
-    return [
-        (f"{short(terminal_text(agent))}, seed {run.seed}", run)
-        for agent, run in found
-        if run.history and run.history.spans
-    ]
+    found = []
+    for result in section.results:
+        for run in result.finished:
+            if run.history and run.history.spans:
+                found.append((f"{short(terminal_text(result.agent))}, seed {run.seed}", run))
+    return found
 
 
 def _part(
@@ -110,9 +112,8 @@ def _colour(task: int | None) -> tuple[float, float, float]:
 
 def _tasks_of_labels(spans: Sequence[Span], blocks: Sequence[Any]) -> Iterator[tuple[int, int]]:
     """Yield each label with the task in most of whose frames it acted, of blocks that train one task."""
-    for label in {span.label for span in spans}:
+    for label, own in split_by(spans, lambda span: span.label).items():
         frames: dict[int, float] = {}
-        own = [span for span in spans if span.label == label]
         for start, end, tasks in blocks:
             if len(tasks) == 1:
                 shared = sum(max(0, min(end, span.end) - max(start, span.start)) for span in own)

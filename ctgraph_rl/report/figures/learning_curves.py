@@ -46,7 +46,7 @@ PLACES = 160
 
 def learning_curves(section: Section) -> CaptionedFigure | None:
     """Return the curves of all agents at evaluations; None without a finished run."""
-    if not any(result.finished for result in section.results):
+    if not section.finished:
         return None
     tasks = left_out(len(section.labels), MOST_TASKS, "tasks")
     caption = (
@@ -59,7 +59,7 @@ def learning_curves(section: Section) -> CaptionedFigure | None:
 
 def mean_curves(section: Section) -> CaptionedFigure | None:
     """Return the mean return over all tasks of all agents at evaluations; None without a finished run."""
-    if not any(result.finished for result in section.results):
+    if not section.finished:
         return None
     caption = (
         f"Mean return over all {len(section.labels)} tasks at every evaluation of all of them, over the frames learned "
@@ -116,7 +116,8 @@ def draw_means(axes: Any, section: Section, looks: Mapping[str, dict[str, Any]])
     _mark_blocks(axes, section, None)
     for result in section.results:
         if result.agent in looks:
-            seeds = [curve for run in result.finished if run.history for curve in [mean_curve(run.history)] if curve]
+            curves = [mean_curve(run.history) for run in result.finished if run.history]
+            seeds = list(filter(None, curves))
             points = over_seeds(seeds, result.bounds.of_returns)
             _draw(axes, looks[result.agent], [points], seeds if len(seeds) <= MOST_SEEDS else [])
 
@@ -130,26 +131,26 @@ def draw_training(section: Section) -> Any:
     places = max(4, PLACES // max(len(blocks), 1))
     for position, result in enumerate(section.results[:MOST_AGENTS]):
         pieces = _training(result, blocks, places)
-        few = len(result.finished) < FEWEST_FOR_BANDS
-        alone = [_training(replace(result, by_seed={run.seed: run}), blocks, places) for run in result.finished if few]
-        seeds = [[(point.frames, point.value) for point in piece] for each in alone for piece in each if piece]
+        seeds = []
+        for run in result.finished if len(result.finished) < FEWEST_FOR_BANDS else ():
+            for piece in _training(replace(result, by_seed={run.seed: run}), blocks, places):
+                seeds += [[(point.frames, point.value) for point in piece]] if piece else []
         _draw(axes, agent_style(position, result.agent), pieces, seeds)
     return _finished(grid, section, "return while training")
 
 
 def _training(result: Result, blocks: Sequence[tuple[int, tuple[int, int]]], places: int) -> list[list[Point]]:
     """Return the curve of each block."""
-    runs, bounds = result.finished, result.bounds.of_returns
-    return [
-        training_curve(runs, block, start=start, end=end, places=places, bounds=bounds)
-        for block, (start, end) in blocks
-    ]
+    curves = []
+    for block, (start, end) in blocks:
+        bounds = result.bounds.of_returns
+        curves.append(training_curve(result.finished, block, start=start, end=end, places=places, bounds=bounds))
+    return curves
 
 
 def has_training(section: Section) -> bool:
     """Return whether any run measured its return while training."""
-    finished = [run for result in section.results for run in result.finished]
-    return any(run.history is not None and run.history.training for run in finished)
+    return any(run.history is not None and run.history.training for run in section.finished)
 
 
 def _mark_blocks(axes: Any, section: Section, task: int | None) -> None:
@@ -169,12 +170,10 @@ def _draw(axes: Any, look: Mapping[str, Any], pieces: Sequence[list[Point]], see
             axes.plot(*zip(*curve, strict=True), color=look["color"], linestyle="-", linewidth=0.4, marker="", zorder=1)
     for points in pieces:
         if points:
-            frames = [point.frames for point in points]
-            values = [point.value for point in points]
+            frames, values, lows, highs, _ = zip(*points, strict=True)
             axes.plot(frames, values, markevery=1 + len(points) // 8, zorder=3, **look)
-        if points and points[0].low is not None:
-            lows, highs = zip(*((point.low, point.high) for point in points), strict=True)
-            axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
+            if lows[0] is not None:
+                axes.fill_between(frames, lows, highs, color=look["color"], alpha=0.18, linewidth=0, zorder=2)
 
 
 def _finished(grid: Any, section: Section, ylabel: str) -> Any:
@@ -196,8 +195,10 @@ def _finished(grid: Any, section: Section, ylabel: str) -> Any:
         row[0].set_ylabel(ylabel)
     figure = grid[0, 0].figure
     figure.supxlabel("frames", fontsize=8)
-    shown = enumerate(section.results[:MOST_AGENTS])
-    agents_legend(figure, [(named(result), agent_style(i, result.agent)) for i, result in shown])
+    shown = []
+    for position, result in enumerate(section.results[:MOST_AGENTS]):
+        shown.append((named(result), agent_style(position, result.agent)))
+    agents_legend(figure, shown)
     return figure
 
 
