@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from baselines.parts.catalogue import catalogue
+from baselines.parts.catalogue import catalogue, config_dir_of
 
 NOTE = (
     "cell= is what an agent with memory remembers with. Without memory, or with cell=none, an agent acts on the\n"
@@ -16,13 +14,14 @@ NOTE = (
 
 def main() -> None:
     """Print a line for every agent, and for every cell that agents with memory can have."""
-    argparse.ArgumentParser(prog="ctgraph-rl agents", description=main.__doc__).parse_args()
+    config_dir = config_dir_of("agents", main.__doc__)
     print("agent=NAME   memory  can solve in principle")
-    for agent in catalogue("agent"):
-        print(f"{agent.name:<12} {'yes' if agent.facts['memory'] else 'no':<7} {agent.facts['solves']}")
+    for agent in catalogue("agent", config_dir):
+        memory = {True: "yes", False: "no"}.get(agent.facts.get("memory"), "-")
+        print(f"{agent.name:<12} {memory:<7} {agent.facts.get('solves', agent.comment)}")
     print("\ncell=NAME      can hold")
-    for cell in catalogue("cell"):
-        print(f"{cell.name:<14} {cell.facts['holds']}")
+    for cell in catalogue("cell", config_dir):
+        print(f"{cell.name:<14} {cell.facts.get('holds', cell.comment)}")
     print(f"\n{NOTE}")
 
 

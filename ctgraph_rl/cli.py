@@ -40,7 +40,7 @@ COMMANDS = {
     "profile": Command("ctgraph_rl.profile.__main__", "score an agent on ten learning properties"),
     "report": Command("ctgraph_rl.report.__main__", "make a page of figures and tables of runs"),
     "results": Command("ctgraph_rl.report.results", "print a table of runs over seeds"),
-    "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that anybody can check"),
+    "submit": Command("ctgraph_rl.board.submit", "make a submission of runs, a folder that others can check"),
     "verify": Command("ctgraph_rl.board.verify", "check a submission by its files, reruns and held-out seeds"),
 }
 """Commands by name, each with its module and a line about it."""

@@ -32,6 +32,9 @@ AGENT, FRAMES_PER_SECOND = "lstm_ppo", 18_000
 SECONDS_OF_AN_ID = 4e-8
 """Further seconds a frame for each number of a one-hot task id, which the agent reads, too."""
 
+SECONDS_OF_A_STEP, SECONDS_OF_A_ROW = 5e-3, 1.3e-5
+"""What a step of an evaluation takes of this agent: in all, and for each episode that is played at once."""
+
 UNKNOWN = "-"
 
 SIZES = ("states", "ends")
@@ -73,7 +76,7 @@ OBSERVATION_NOTES = (
     "states: how many wait, decision and end states may show one and the same observation.",
     "H: entropy of the state given the observation, in bits, as a random, a navigating and the optimal policy meet "
     "them; a navigating policy waits when it must and decides at random.",
-    "read noise, read rotation: what is added to each pixel, and the rotation, whenever an image is read.",
+    "noise, rotation: what is added to each pixel, and the rotation, whenever an image is read.",
 )
 
 TABLE_2 = ((2, 1, 0.0), (2, 2, 0.9), (3, 2, 0.9), (2, 4, 0.9), (3, 10, 0.9), (2, 16, 0.5))
@@ -127,9 +130,10 @@ def _overview(curriculum: Curriculum, frames_per_second: float | None) -> Sheet:
 def _of_graphs(curriculum: Curriculum, frames_per_second: float | None) -> dict[str, str]:
     """Return what CT-graphs need of memory and time."""
     bank, per_row = memory(curriculum)
+    evaluating = _duration(_evaluating(curriculum))
     return {
         "memory": f"{bank:,} bytes of images, and {per_row:,} for each row",
-        "time": f"{_time(curriculum, frames_per_second)}, an estimate without evaluations",
+        "time": f"{_time(curriculum, frames_per_second)}; {evaluating} for evaluations, estimated",
     }
 
 
@@ -138,14 +142,24 @@ def _graphs(curriculum: Curriculum) -> Sequence[Task]:
 
 
 def _time(curriculum: Curriculum, frames_per_second: float | None) -> str:
-    """Return how long the frames take at a rate; None: at the rate of `AGENT`, which is then named."""
+    """Return how long learning takes at a rate; None: at the rate of `AGENT`, which is then named."""
     if frames_per_second is not None:
         return f"{_duration(curriculum.num_frames / frames_per_second)} at {frames_per_second:,.0f} frames/s"
     protocol = curriculum.protocol
     length = protocol.length(len(curriculum.tasks)) if protocol.task_id == "one_hot" else 0
     rate = 1 / (1 / FRAMES_PER_SECOND + SECONDS_OF_AN_ID * length)
     seconds = curriculum.num_frames / rate
-    return f"{_duration(seconds)} at {rate:,.0f} frames/s, the rate of agent={AGENT} on one core"
+    return f"{_duration(seconds)} at {rate:,.0f} frames/s, the rate of agent={AGENT} on one core (--frames-per-second)"
+
+
+def _evaluating(curriculum: Curriculum) -> float:
+    """Return about how many seconds all evaluations take on one core."""
+    how = curriculum.evaluation
+    moments = how.before + (curriculum.num_frames // how.every if how.every else len(curriculum.ends))
+    tasks = len(curriculum.tasks) / (2 if how.tasks == "seen" else 1) + len(how.held_out)
+    rows = tasks * how.num_episodes / how.episodes_per_row
+    steps = how.row_episodes * max(task.graph.expected_episode_length for task in _graphs(curriculum))
+    return moments * steps * (SECONDS_OF_A_STEP + SECONDS_OF_A_ROW * rows)
 
 
 def protocol_in_words(protocol: Protocol, num_tasks: int) -> str:
@@ -272,7 +286,7 @@ def _observations(curriculum: Curriculum) -> Sheet:
         x = task.observations
         varied = (_up_to(x.read_noise), f"{_up_to(x.read_rotation)} deg", f"{task.reward_std:g}")
         rows.append((label, *known, *varied))
-    columns = ("states", *(f"H {policy}" for policy in POLICIES), "read noise", "read rotation", "reward std")
+    columns = ("states", *(f"H {policy}" for policy in POLICIES), "noise", "rotation", "reward std")
     notes = (*OBSERVATION_NOTES, *dict.fromkeys(reasons))
     return Sheet("Observations", {"task": "l", **dict.fromkeys(columns, "r")}, tuple(rows), notes)
 

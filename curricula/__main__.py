@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctgraph_rl.log.refuse import refused_by
-from ctgraph_rl.log.sheets import FORMATS, LISTED, Sheet, show
+from ctgraph_rl.log.sheets import FORMATS, LISTED, Sheet, show, with_numbers
 from curricula import listed
 
 
@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv, argparse.Namespace(format="text", config_dir=None))
     with refused_by(parser):
         if arguments.command in (None, "list") and arguments.config_dir is None:
-            show([Sheet("Curricula", LISTED, listed())], arguments.format)
+            _show_list(listed(), arguments.format)
         else:
             _compute(arguments)
 
@@ -34,7 +34,13 @@ def _compute(arguments: argparse.Namespace) -> None:
         describe.write(curriculum, arguments.figure, arguments.similarity, arguments.json)
     else:
         own = describe.listing(describe.own_curricula(arguments.config_dir))
-        show([Sheet("Curricula", LISTED, (*listed(), *own.rows))], arguments.format)
+        _show_list((*listed(), *own.rows), arguments.format)
+
+
+def _show_list(rows: tuple[tuple[str, ...], ...], form: str) -> None:
+    """Print a line for each curriculum; on a terminal the sources stand below."""
+    sheet = Sheet("Curricula", LISTED, rows)
+    show([with_numbers(sheet) if form == "text" else sheet], form)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("probabilities", help="print the paper's Table 2, with its misprints corrected", parents=[form])
     one = commands.add_parser("describe", help="describe one", parents=[form])
     one.add_argument("name", help="a name of the list, or a curriculum as a JSON file")
-    one.add_argument("--frames-per-second", type=float, help="for the estimated time")
+    one.add_argument("--frames-per-second", type=float, help="of your agent, for the estimated time; a run shows it")
     one.add_argument("--figure", type=Path, help="draw graphs and goals into this file (.png, .pdf, .svg)")
     one.add_argument("--similarity", type=Path, help="draw how alike the tasks are into this file")
     one.add_argument("--json", type=Path, help="write the curriculum into this file, a new one")

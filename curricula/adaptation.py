@@ -32,7 +32,7 @@ def swoks_2x4(num_frames: int = 384_000) -> Curriculum:
     """Statistical context detection: the four goals of a depth-2 graph in reverse order, twice, unannounced.
 
     A stay is 750 iterations of 4 workers x 128 steps; a configuration file of the repository has 16 workers instead.
-    Episodes were cut at every iteration there, which is not done here. How the authors evaluated is not known: our
+    Episodes were cut at every iteration there, which is not done here. The evaluation of the authors is not known: our
     defaults.
 
     Args:

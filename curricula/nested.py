@@ -83,7 +83,7 @@ def ct28_random_skips_d5(num_frames: int = 51_200) -> Curriculum:
 def ct28_mosaic_skips_d5(num_frames: int = 102_400, seed_set: int = 1, agent: int | None = None) -> Curriculum:
     """CT28 of MOSAIC; its fourth family skips depth 5, an inconsistency.
 
-    There 28 agents that exchange what they know had one task each. Whether they saw task ids is not known. Fifty
+    There 28 agents that exchange what they know had one task each. It is unknown whether they saw task ids. Fifty
     episodes evaluated a task; when is not known, and greedy actions are our choice.
 
     Args:

@@ -2,8 +2,8 @@
 
 Nath et al. 2023 (CoLLAs), repository DMIU-ShELL/L2D2-C. Fully observable graphs of depth 2; a task is an image seed and
 one of four goals, and its id counts both: 4 (seed - 1) + goal. A separate agent evaluated 25 episodes; when, and
-whether actions were greedy, is not known: block ends and greedy actions are our choice. Whether agents saw the task
-ids of the files is not known either.
+whether actions were greedy, is not known: block ends and greedy actions are our choice. It is also unknown whether
+agents saw the task ids of the files.
 """
 
 from __future__ import annotations

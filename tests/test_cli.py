@@ -49,7 +49,8 @@ def test_without_a_word_all_curricula_are_listed(call, words):
     su_b1 = curricula.load("su_b1_4tasks")
     assert (code, err) == (0, "")
     assert all(name in out for name in curricula.names())
-    assert re.search(rf"su_b1_4tasks +│ +1 │ +4 │ +819,200 │ {su_b1.fingerprint} │ Soltoggio", out)
+    assert re.search(rf"su_b1_4tasks +│ +1 │ +4 │ +819,200 │ {su_b1.fingerprint} │ 2 ", out)
+    assert "\n2: Soltoggio et al. 2023" in out
 
 
 @pytest.mark.parametrize("form", ["text", "markdown", "latex"])
@@ -84,10 +85,18 @@ def test_figures_are_written(call, tmp_path):
 
 def test_the_estimate_of_time_follows_the_rate_and_names_the_agent_of_its_own(call):
     assert FRAMES_PER_SECOND == 18_000
-    _, own, _ = call(curricula_main, "describe", "su_b1_4tasks")
-    assert "45.5 seconds at 18,000 frames/s, the rate of agent=lstm_ppo on one core, an estimate" in own
+    _, own, _ = call(curricula_main, "describe", "su_b1_4tasks", "--format", "markdown")
+    assert "45.5 seconds at 18,000 frames/s, the rate of agent=lstm_ppo on one core (--frames-per-second)" in own
     _, out, _ = call(curricula_main, "describe", "su_b1_4tasks", "--frames-per-second", "1000")
-    assert "13.7 minutes at 1,000 frames/s, an estimate" in out
+    assert "13.7 minutes at 1,000 frames/s; 0.306 seconds for evaluations, estimated" in out
+
+
+@pytest.mark.parametrize("words", [(), ("describe", "ct8"), ("describe", "co_hard")])
+def test_tables_fit_100_characters_where_no_terminal_says_how_many_there_are(call, words):
+    _, out, _ = call(curricula_main, *words)
+
+    assert max(map(len, out.splitlines())) <= 100
+    assert "…" not in out
 
 
 @pytest.mark.parametrize(

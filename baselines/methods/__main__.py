@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import argparse
-
-from baselines.parts.catalogue import CatalogueEntry, catalogue
+from baselines.parts.catalogue import CatalogueEntry, catalogue, config_dir_of
 
 
 def needs_ids(method: CatalogueEntry) -> str:
-    """Return when a method needs task ids: ``yes``, ``no`` or with which setting."""
+    """Return when a method needs task ids: ``yes``, ``no``, with which setting, or ``-`` of one of yours."""
+    if not method.facts:
+        return "-"
     return "yes" if method.facts["needs_task_id"] else "heads=multi" if "heads" in method.settings else "no"
 
 
 def main() -> None:
     """Print a line for every method, and for every detector that gives methods the ids and boundaries they need."""
-    argparse.ArgumentParser(prog="ctgraph-rl methods", description=main.__doc__).parse_args()
+    config_dir = config_dir_of("methods", main.__doc__)
     print("method=NAME  needs ids    boundaries  what it is")
-    for method in catalogue("method"):
-        boundaries = "yes" if method.facts["needs_boundaries"] else "no"
+    for method in catalogue("method", config_dir):
+        boundaries = {True: "yes", False: "no"}.get(method.facts.get("needs_boundaries"), "-")
         print(f"{method.name:<12} {needs_ids(method):<12} {boundaries:<11} {method.comment}")
     print("\ndetector=NAME  reads                 what it is")
-    for detector in catalogue("detector"):
-        print(f"{detector.name:<14} {detector.facts['reads']:<21} {detector.comment}")
+    for detector in catalogue("detector", config_dir):
+        print(f"{detector.name:<14} {detector.facts.get('reads', '-'):<21} {detector.comment}")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+from argparse import ArgumentParser
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,20 +33,36 @@ class CatalogueEntry(NamedTuple):
 
     @property
     def facts(self) -> NamedValues:
-        """The constants among the attributes of the class, read from its source without importing it."""
-        return constants(self.target)
+        """The constants among the attributes of the class, read from its source without importing it; none of yours."""
+        return constants(self.target) if self.target.startswith("baselines.") else {}
 
 
-def catalogue(group: str) -> Iterator[CatalogueEntry]:
-    """Yield an entry for each yaml file in ``conf/GROUP``, except those that only change values of another one."""
-    for path in sorted(Path(conf_dir(), group).glob("*.yaml")):
+def config_dir_of(command: str, description: str | None) -> Path | None:
+    """Return the ``--config-dir`` of a command that lists, which has no other argument."""
+    parser = ArgumentParser(prog=f"ctgraph-rl {command}", description=description)
+    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="also lists those of this directory")
+    folder: Path | None = parser.parse_args().config_dir
+    if folder is not None and not folder.is_dir():
+        parser.error(f"--config-dir must be a directory, got {folder}")
+    return folder
+
+
+def catalogue(group: str, config_dir: Path | None = None) -> Iterator[CatalogueEntry]:
+    """Yield an entry for each yaml file in ``conf/GROUP``, except those that only change values of another one.
+
+    Args:
+        group: such as ``agent``.
+        config_dir: a further directory like ``conf``.
+    """
+    folders = [Path(conf_dir()), *filter(None, [config_dir])]
+    for path in chain(*(sorted(Path(folder, group).glob("*.yaml")) for folder in folders)):
         text = path.read_text(encoding="utf-8")
         settings = yaml.safe_load(text)
         if "_target_" in settings:
             target = settings.pop("_target_")
             settings.pop("_partial_", None)
-            comments = [line for line in text.splitlines() if not line.startswith("# @package")]
-            yield CatalogueEntry(path.stem, target, settings, comments[0].removeprefix("# "))
+            comments = [line for line in text.splitlines() if line[:1] == "#" and not line.startswith("# @package")]
+            yield CatalogueEntry(path.stem, target, settings, comments[0].removeprefix("# ") if comments else target)
 
 
 def constants(target: str) -> NamedValues:

@@ -135,7 +135,7 @@ class SeedGroup:
         return self._explored(outputs) if "action_value" in outputs else self._sampled(outputs)
 
     def _act(self, stack: Stack, data: Items) -> TensorsByName:
-        """Compute `Stack.outputs` by a graph of its operations, compiled where the agents say so.
+        """Compute `Stack.outputs` by a graph of its operations, compiled where the agents set it.
 
         Without it most of the time is spent on binding tensors and between operations.
         """
@@ -257,7 +257,7 @@ class SeedGroup:
         return {key: value for key, value in measured.items() if value.ndim == 1}
 
     def _step(self, stack: Stack, batch: Items) -> TensorsByName:
-        """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents say so."""
+        """Take the gradient step of a stack, compiled for minibatches of the usual size where the agents set it."""
         first = stack.learners[0]
         usual = batch["action"].shape[1] == first.minibatch_size
         function = first.compiled_step if usual and first.compiled_step is not None else update

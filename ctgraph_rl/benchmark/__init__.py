@@ -1,6 +1,6 @@
 """``python -m ctgraph_rl.benchmark``: how fast environments are, measured by `benchmarks.environments` of a checkout.
 
-A wheel has no ``benchmarks``; there an import of a name from here says so.
+A wheel has no ``benchmarks``; there an import of a name from here names the missing package.
 """
 
 from __future__ import annotations

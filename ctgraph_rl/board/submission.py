@@ -1,4 +1,4 @@
-"""A submission: a folder of files by which anybody can check what a method reached.
+"""A submission: a folder of files with which you can check what a method reached.
 
 - ``method.yaml``: about the method, see `ctgraph_rl.board.method`.
 - ``config.yaml``: the configuration that all runs share, without the seed; ``versions.txt``: the versions that computed

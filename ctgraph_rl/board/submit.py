@@ -1,4 +1,4 @@
-"""The command ``ctgraph-rl submit``: finished runs become a folder of files that anybody can check."""
+"""The command ``ctgraph-rl submit``: finished runs become a folder of files that others can check."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _checked(runs: list[Run], method: ReadOnlyValues, of_track: Track | None) ->
     rules += [entry_rule(config, method["entry_point"]), oracle_rule(config)]
     curricula = [run.path / CURRICULUM for run in runs]
     unwritten = list(filterfalse(Path.exists, curricula))
-    message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a curriculum of ours"
+    message = f"{listed(unwritten)} is missing, as of curricula with classes of your own: submit a named curriculum"
     rules.append((not unwritten, message))
     first = None if unwritten else Curriculum.from_json(curricula[0])
     if first is not None:

@@ -355,7 +355,7 @@ def verify(submission: Submission, arguments: argparse.Namespace) -> list[Check]
 
 @contextmanager
 def _ended_by_signals(message: str) -> Iterator[None]:
-    """Leave by an exception when asked to stop, so that processes are ended on the way, and say so."""
+    """Leave by an exception when asked to stop, so that processes are ended on the way, and print why."""
 
     try:
         with sigterm_exits():

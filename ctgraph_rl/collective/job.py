@@ -106,7 +106,7 @@ def run_collective(cfg: Any, run_dir: Path) -> None:
 
 def _is_finished(runs: Runs, run_dir: Path) -> bool:
     """Return whether all members' results and the collective's are there."""
-    with redirect_stdout(io.StringIO()):  # each would say so
+    with redirect_stdout(io.StringIO()):  # each would print it
         finished = [is_finished(cfg, folder) for cfg, folder in runs]
     return all(finished) and (run_dir / METRICS).exists()
 

@@ -168,7 +168,7 @@ def _cache_folder() -> Path:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        fix = "name a folder of yours in the environment variable XDG_CACHE_HOME"
+        fix = "name your folder in the environment variable XDG_CACHE_HOME"
         message = f"the compiled kernel is kept in {folder}, which cannot be made ({error}); {fix}"
         raise ValueError(message) from error
     _require_own(folder)

@@ -282,7 +282,7 @@ class Evaluator:
         self.curriculum, self.seed, self.log, self.device = curriculum, seed, log, device
 
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
-        """Evaluate an agent if the curriculum says so after ``frames`` frames of the run."""
+        """Evaluate an agent where the curriculum evaluates after ``frames`` frames of the run."""
         moment = self.curriculum.moment(frames)
         if moment is not None:
             policy = self._policy(agent, self.tasks_at(frames), frames)

@@ -269,7 +269,7 @@ class Lockstep:
         )
 
     def _evaluate(self, frames: int) -> None:
-        """Evaluate those that have not failed, if the curriculum says so after ``frames`` frames."""
+        """Evaluate those that have not failed, where the curriculum evaluates after ``frames`` frames."""
         for number, (evaluator, agent) in enumerate(zip(self.evaluators, self.group.agents, strict=True)):
             if number not in self.failed:
                 evaluator.evaluate_if_due(agent, frames)

@@ -56,7 +56,7 @@ _CHECKS: dict[str, Callable[[Path], bool]] = {
 
 
 def _is_readable(path: Path, check: Callable[[Path], bool]) -> bool:
-    """Return whether a file passes a check; all but the log may be missing, as others than a run of ours write none."""
+    """Return whether a file passes a check; all but the log may be missing, as only our runs write them."""
     try:
         return path.is_file() and check(path) if path.exists() or path.name == LOG else True
     except (OSError, ValueError, RecursionError):

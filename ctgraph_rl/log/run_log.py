@@ -170,7 +170,7 @@ class RunLog:
     def _write(file: BinaryIO, path: Path, line: bytes) -> None:
         try:
             written = file.write(line)
-            while written < len(line):  # a full disk takes a part, and says so at the next attempt
+            while written < len(line):  # a full disk takes a part, and fails at the next attempt
                 written += file.write(line[written:])
         except OSError as error:
             raise cannot_write(path, len(line), error) from error

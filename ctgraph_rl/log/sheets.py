@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rich.console import Console
 from rich.table import Table
@@ -28,6 +28,10 @@ WIDE = 60
 """Characters from which on a column of a LaTeX table is broken into lines."""
 
 
+WIDTH = 100
+"""Characters of a line where no terminal says how many there are."""
+
+
 @dataclass(frozen=True)
 class Sheet:
     """A table in no particular format.
@@ -46,15 +50,15 @@ class Sheet:
 
 
 def print_sheet(sheet: Sheet, console: Console | None = None) -> None:
-    """Print a table on the terminal; into a pipe 200 characters wide."""
+    """Print a table on the terminal; into a pipe `WIDTH` characters wide, or as wide as numbers and names need."""
     console = Console() if console is None else console
-    if not console.is_terminal:
-        console.width = 200
     table = Table(title=_shown(sheet.title), title_justify="left", caption_justify="left")
     for i, (name, side) in enumerate(sheet.columns.items()):
         table.add_column(_shown(name), justify="right" if side == "r" else "left", no_wrap=i == 0 or side == "r")
     for row in sheet.rows:
         table.add_row(*map(_shown, row))
+    if not console.is_terminal:
+        console.width = max(WIDTH, Console(width=10**6).measure(table).minimum)
     console.print(table)
     for note in sheet.notes:
         console.print(_shown(note))
@@ -91,6 +95,13 @@ def _latex_side(column: int, side: str, rows: Sequence[Sequence[str]]) -> str:
 
 FORMATS: dict[str, Callable[[Sheet], str]] = {"markdown": to_markdown, "latex": to_latex}
 """What makes a text of a table, by the name of the format; ``text`` is the terminal's."""
+
+
+def with_numbers(sheet: Sheet) -> Sheet:
+    """Return a table whose last column, of long texts that repeat, has their numbers; notes below it have the texts."""
+    texts = list(dict.fromkeys(row[-1] for row in sheet.rows))
+    rows = tuple((*row[:-1], str(texts.index(row[-1]) + 1)) for row in sheet.rows)
+    return replace(sheet, rows=rows, notes=tuple(f"{number}: {text}" for number, text in enumerate(texts, 1)))
 
 
 def show(sheets: Sequence[Sheet], form: str) -> None:

@@ -115,7 +115,7 @@ def frames_not_learned(labelling: Labelling) -> Tensor:
 
 @defined("ctgraph_rl/frames-rolled-back", "frames whose learning was undone", HERE, bounds=not_negative)
 def frames_rolled_back(labelling: Labelling) -> Tensor:
-    """Return the number of frames that were learned from in vain, as an alarm restored what was learned before."""
+    """Return the number of frames whose learning an alarm undid: it restored what was learned before."""
     return labelling.rolled_back.sum().double().view(1)
 
 

@@ -6,7 +6,7 @@ here. l2metrics first smooths training and scales each task to 1..101: `prepare`
 ranges are given, and its offset of 1 makes ratios: from 0 to half of the range is a "forward transfer" of 51. Give
 ranges, and read ratios of sparse rewards with care, or take contrasts of unscaled performance.
 
-Means leave out tasks and pairs without a value as l2metrics does; here they are counted. Deviations, on purpose:
+Means leave out tasks and pairs without a value as l2metrics does; here they are counted. Deliberate deviations:
 
 - Where other tasks are trained between the two evaluations of a transfer, its cause is not known. l2metrics
   keeps the last of them, direct learning included; here there is no value.

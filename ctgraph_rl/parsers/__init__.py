@@ -137,13 +137,13 @@ def profile() -> ArgumentParser:
     Settings are those of ctgraph-rl -m, such as agent=lstm_ppo seed=range(5). Cells use all cores, and the same command
     resumes. Runs go to runs/profile, and the page shows every agent there. Folders in place of settings only score the
     runs in them, those of a Recorder, too. A score is 0 at the floor of an agent without the property and 1 at the
-    optimum. The exit code is 1 if cells are not done.
+    optimum. One seed of agent=ppo takes about 154 CPU seconds in all. The exit code is 1 if cells are not done.
     """
     parser = _parser(profile)
     parser.add_argument("words", nargs="+", metavar="SETTING=VALUE|FOLDER", help="what to train, or runs to score")
     _add(parser, "--config-dir", "a folder with an agent of your own, agent/NAME.yaml")
     _add(parser, "--out", "where the page goes (default: profile/ within the first folder)")
-    _add_agent(parser)
+    _add_agent(parser, "order and rename agents of the page, as in results; agent=NAME is what to train; repeatable")
     return parser
 
 
@@ -190,7 +190,7 @@ def results() -> ArgumentParser:
 
 
 def submit() -> ArgumentParser:
-    """Make a submission of finished runs: a folder of files that anybody can check.
+    """Make a submission of finished runs: a folder of files that others can check.
 
     --template > method.yaml prints what an author says about a method, to fill in once.
     """
@@ -241,11 +241,9 @@ def _add(parser: Any, name: str, help: str, type: Any = Path, **how: Any) -> Non
     parser.add_argument(name, help=help, type=type, **how)
 
 
-def _add_agent(parser: ArgumentParser) -> None:
+def _add_agent(parser: ArgumentParser, about: str = "order and rename agents; repeatable") -> None:
     """Add the names and the order of agents."""
-    parser.add_argument(
-        "--agent", action="append", default=[], metavar="NAME[=SHOWN]", help="order and rename agents; repeatable"
-    )
+    parser.add_argument("--agent", action="append", default=[], metavar="NAME[=SHOWN]", help=about)
 
 
 def _add_task(parser: ArgumentParser) -> None:
@@ -273,12 +271,19 @@ def existing(text: str) -> Path:
     return path
 
 
-def decisions(text: str) -> tuple[int, ...]:
+class Decisions(tuple[int, ...]):
+    """A goal of the command line, which is written as there: 1.2."""
+
+    def __repr__(self) -> str:
+        return ".".join(map(str, self))
+
+
+def decisions(text: str) -> Decisions:
     """Read ``1.2``, or ``1,2``, as a goal."""
     parts = text.replace(",", ".").split(".")
     if not all(part.isdecimal() for part in parts):
         raise argparse.ArgumentTypeError(f"a goal is the decisions on the way to it, such as 1.2, got {text!r}")
-    return tuple(map(int, parts))
+    return Decisions(map(int, parts))
 
 
 def _setting(text: str) -> tuple[str, Any]:

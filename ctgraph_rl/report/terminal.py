@@ -26,10 +26,10 @@ from ctgraph_rl.runs.settings import as_before
 
 ALWAYS = ("average_performance", "forward_transfer", "backward_transfer", "forgetting")
 LIFELONG = {
-    "forward_transfer_ratio": "forward transfer, Baker et al. 2023",
-    "backward_transfer_ratio": "backward transfer, Baker et al. 2023",
+    "forward_transfer_ratio": "forward transfer ratio",
+    "backward_transfer_ratio": "backward transfer ratio",
 }
-"""Transfer as ratios of terminal performance around a training, under its authors' name."""
+"""Transfer as ratios, of which 1 means none, beside the differences in `ALWAYS`, of which 0 means none."""
 WITH_EXPERTS = ("continual_world_forward_transfer", "relative_performance", "sample_efficiency")
 OF_DETECTION = ("detection_delay", "false_alarms", "labels_per_task", "label_agreement")
 """Metrics that are shown; the others are in the file."""
@@ -182,7 +182,8 @@ def metrics_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:
             continue
         metric = metrics[name]
         value = "undefined" if metric["value"] is None else f"{metric['value']:z.2f}"
-        table.add_row(LIFELONG.get(name, measure_name(name)), value, _text(metric["undefined"] or metric["formula"]))
+        neutral = "1 is neutral: " if name in LIFELONG else ""
+        table.add_row(measure_name(name), value, _text(neutral + (metric["undefined"] or metric["formula"])))
     return table
 
 

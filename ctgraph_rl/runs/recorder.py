@@ -37,7 +37,7 @@ from ctgraph_rl.tasks.curriculum import Curriculum
 
 
 class Recorder:
-    """Evaluates policies by the protocol of a curriculum, when its user's own loop says so, and keeps a run log.
+    """Evaluates policies by the protocol of a curriculum, when its user's own loop asks for it, and keeps a run log.
 
     A policy is one of
 
@@ -47,7 +47,7 @@ class Recorder:
       the protocol shows none;
     - a function ``(observation, state, episode_start)`` that returns ``(actions, state)``, for memory: the first state
       is None, and ``episode_start``, bool [n], says which rows start an episode;
-    - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol says so;
+    - an object with ``predict``, such as a model of Stable-Baselines3, greedy where the protocol is;
     - a plain ``torch.nn.Module`` that maps observations to logits, see `ctgraph_rl.learn.evaluate.LogitsPolicy`;
     - a TensorDict module without recurrent state, or a class of `ctgraph_rl.policies`.
 

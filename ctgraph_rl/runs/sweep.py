@@ -107,7 +107,7 @@ class Sweeper(Base):
     def sweep(self, arguments: list[str]) -> None:
         """Run the cells that are not done, then report the status of all.
 
-        Cells that were run with other code are stale: unless ``overwrite`` says so they are not run again, and nothing
+        Cells that were run with other code are stale. They are run again only with ``overwrite``; without it nothing
         is run then.
 
         Raises:

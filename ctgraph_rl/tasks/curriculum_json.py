@@ -105,13 +105,13 @@ def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Ca
         curriculum = make(**_parts(content))
         stated = content["fingerprint"]
         found = curriculum.fingerprint
-        fix = f"if it was changed on purpose, write {found!r} there, and a new version and name"
+        fix = f"if the change is intended, write {found!r} there, and a new version and name"
         require((stated == found, f"fingerprint is {stated!r}, but the content has {found!r}; {fix}"))
     return curriculum
 
 
 def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
-    """A value of ours as JSON, tasks by their places where these are given."""
+    """One of our values as JSON, tasks by their places where these are given."""
     if places and value in places:
         return places[value]
     if isinstance(value, tuple):
@@ -137,7 +137,7 @@ def type_name(kind: type) -> str:
 
 
 def _names(kind: type) -> list[str]:
-    """The fields that a class of ours is made of."""
+    """The fields that one of our classes is made of."""
     return [field.name for field in fields(kind) if field.init]
 
 
@@ -266,7 +266,7 @@ def _each(name: str, content: Any, read: Callable[[Any], Any]) -> list[Any]:
 
 
 def _built(kind: type, content: Any, readers: Mapping[str, Callable[[Any], Any]]) -> Any:
-    """An object of a class of ours from its fields; ``readers`` turn some of them into parts first."""
+    """An object of one of our classes from its fields; ``readers`` turn some of them into parts first."""
     added = [field.name for field in fields(kind) if field.metadata.get("added")]
     _check_keys(content, [name for name in _names(kind) if name not in added], added)
     arguments = dict(content)

@@ -24,6 +24,7 @@ from ctgraph_rl.checks import (
 )
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import Needle, RewardFn
+from ctgraph_rl.parsers import Decisions
 from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
@@ -112,7 +113,8 @@ class Task:
     def __post_init__(self) -> None:
         make_fields_plain(self)
         self._check_parts()
-        object.__setattr__(self, "goal", as_tuple(self.goal))
+        if not isinstance(self.goal, Decisions):
+            object.__setattr__(self, "goal", as_tuple(self.goal))
         object.__setattr__(self, "goal_change", as_tuple(self.goal_change))
         swap = as_tuple(self.swapped_branches)
         object.__setattr__(self, "swapped_branches", tuple(map(as_tuple, swap)) if isinstance(swap, tuple) else swap)
@@ -232,9 +234,10 @@ class Task:
         d = self.graph.depth
         goal = self.goal
         holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
-        message = f"goal must be {d} decisions in 1..{b}, such as {(1,) * d}, got {goal!r}"
+        written = Decisions if isinstance(goal, Decisions) else tuple
+        message = f"goal must be {d} decisions in 1..{b}, such as {written((1,) * d)}, got {goal!r}"
         if not holds and isinstance(goal, tuple) and 0 in goal and all(is_int(branch, 0, b - 1) for branch in goal):
-            decisions = tuple(branch + 1 for branch in goal)
+            decisions = written(branch + 1 for branch in goal)
             message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
 

@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from ctgraph_rl.tasks.task import Task
 
 MAX_ENUMERATED_STATES = 2**21
-"""Largest graph whose states are visited one by one; needles are computed without it where their docstrings say so."""
+"""Largest graph whose states are visited one by one; larger needles have closed forms."""
 
 SUM_TOLERANCE = 1e-6
 """Largest distance of the sum of an observation's probabilities from 1, wide enough for float32 policies."""
 
 
 def optimal_value(task: Task, gamma: float) -> float:
-    """The best expected discounted return from the home state, of any policy; failing on purpose may be part of it.
+    """The best expected discounted return from the home state, of any policy; it may include deliberate failing.
 
     For the plain needle (goal 1, fail 0) it is gamma^-1 (gamma^2 (1 - p) / (1 - gamma p))^(d + 1). Needles take O(d),
     other rewards visit every state.
@@ -114,7 +114,7 @@ def memoryless_ceiling(task: Task, deterministic: bool = False) -> float:
         deterministic: consider only policies that map an id to one action.
 
     Raises:
-        ValueError: for other rewards, saying which; their best policies may fail on purpose or seek several end states.
+        ValueError: for other rewards, saying which; their best policies may fail or seek several end states.
     """
     b = task.graph.branching_factor
     shares_ids = task.observations.legacy_index and task.observations.unique_decisions and b > 2
@@ -395,6 +395,6 @@ def _needle_rules(task: Task, ceiling: str) -> list[Rule]:
     return [
         (is_needle(task), f"{only} the Needle reward, where one end state counts, got {name}"),
         (goal > 0, f"{only} goal_reward > 0, where the goal is worth reaching, got {goal}"),
-        (fail <= 0, f"{only} fail_reward <= 0, where failing on purpose never pays, got {fail}"),
+        (fail <= 0, f"{only} fail_reward <= 0, where deliberate failing never pays, got {fail}"),
         (step == 0, f"{only} step_reward = 0, where a longer episode is worth no more, got {step}"),
     ]

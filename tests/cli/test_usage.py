@@ -145,3 +145,17 @@ def test_the_facts_of_a_list_are_those_of_the_classes(group, names):
     assert len(entries) > 5
     for entry in entries:
         assert {name: entry.facts[name] for name in names} == {name: getattr(entry.kind, name) for name in names}
+
+
+def test_lists_have_the_agents_and_methods_of_a_configuration_directory(call, tmp_path):
+    for group, text in {"agent": "# Mine.\n_target_: my.Agent\n", "method": "_target_: my.Method\n"}.items():
+        (tmp_path / group).mkdir()
+        (tmp_path / group / "mine.yaml").write_text(text)
+
+    _, agents, _ = call("agents", "--config-dir", str(tmp_path))
+    _, methods, _ = call("methods", "--config-dir", str(tmp_path))
+    code, _, refused = call("agents", "--config-dir", str(tmp_path / "none"))
+
+    assert ["mine", "-", "Mine."] in [line.split() for line in agents.splitlines()]
+    assert ["mine", "-", "-", "my.Method"] in [line.split() for line in methods.splitlines()]
+    assert (code, "--config-dir must be a directory, got" in refused) == (2, True)

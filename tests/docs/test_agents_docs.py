@@ -35,7 +35,7 @@ def test_the_page_shows_the_list_of_agents_as_it_is_printed(capsys, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["baselines"])
     main()
 
-    assert shown(capsys.readouterr().out, blocks("", TEXT)[0])
+    assert shown(capsys.readouterr().out, blocks("text", TEXT)[0])
 
 
 def test_every_agent_with_a_yaml_is_listed_under_its_name(compose):

@@ -67,3 +67,16 @@ def test_every_link_of_a_page_leads_to_a_file(page):
     links = [link for link in links if "generated/" not in link]  # the strict build checks those
 
     assert [link for link in links if not (folder / link).exists()] == []
+
+
+def test_pages_install_in_one_way():
+    """A checkout by ``pip install -c constraints.txt -e .``, extras by ``pip install 'ctgraph_rl[NAME]'``."""
+    pages = [*sources((".md", ".ipynb"))]
+    found = [
+        (page.name, each) for page in pages for each in re.findall(r"pip install [^`\n|&]+", page.read_text("utf-8"))
+    ]
+    ours = [each for each in found if "ctgraph_rl" in each[1] or "constraints" in each[1] or " ." in each[1]]
+    way = re.compile(r"pip install (-c constraints\.txt -e (\.|'\.\[\w+\]')|'ctgraph_rl\[[\w,]+\]')[ .]*")
+
+    assert len(ours) > 20
+    assert [each for each in ours if not way.fullmatch(each[1].partition(" first")[0].partition(" installs")[0])] == []

@@ -36,7 +36,7 @@ class Written(NamedTuple):
 
 
 def left_out(count: int, most: int, what: str) -> str:
-    """Return a sentence that says so where not all are shown; empty where all are."""
+    """Return a sentence on how many are shown; empty where all are."""
     return f" The first {most} of {count} {what} are shown." if count > most else ""
 
 
