@@ -234,19 +234,19 @@ def target(cfg: DictConfig, group: str) -> Callable[..., Any]:
     """
     given = [str(key) for key in cfg[group] if not str(key).startswith("_")]
     check_arguments(group, given, hydra.utils.get_object(cfg[group]["_target_"]))
-    with _allowed_targets(OmegaConf.to_yaml(cfg[group])):
+    with _allowed_targets(cfg[group]):
         return hydra.utils.instantiate(cfg[group], _partial_=True, _convert_="all")
 
 
-def _allowed_targets(group: str) -> AbstractContextManager[Any]:
+def _allowed_targets(group: DictConfig) -> AbstractContextManager[Any]:
     """Let Hydra 1.4 call what is of any package but Python's standard library, which has functions that do harm.
 
     Args:
-        group: a group of the configuration as yaml, whose targets may be of modules that are not imported yet.
+        group: a group of the configuration, whose targets may be of modules that are not imported yet.
     """
     if not IS_NEXT_HYDRA:
         return nullcontext()  # it refuses what it knows to do harm
-    packages = {name.partition(".")[0] for name in sys.modules} | set(_PACKAGE.findall(group))
+    packages = {name.partition(".")[0] for name in sys.modules} | set(_PACKAGE.findall(OmegaConf.to_yaml(group)))
     allowed: Callable[[list[str]], Any] = vars(hydra.utils)["execution_whitelist"]  # type checkers read Hydra 1.3
     return allowed([f"{name}.*" for name in packages - sys.stdlib_module_names])
 

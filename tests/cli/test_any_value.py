@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import math
+import pickle
 import random
 from collections.abc import Callable, Container
 from pathlib import Path
@@ -25,9 +25,13 @@ from ctgraph_rl.runs.job import Job
 SECONDS = 120
 """For one case; most take a hundredth of a second."""
 
-VALUES: tuple[Any, ...] = (
-    *("", "text", math.nan, math.inf, 1.5, -1, 0, 1e-9, 1e30, 2**63, True, None, {"a": 1}, [1, 2], [], "a\nb"),
+ALIKE: tuple[tuple[Any, ...], ...] = (
+    *(("", "text", "a\nb"), (math.nan, math.inf), (1.5, 1e-9), (1e30, 2**63), ([1, 2], [])),
+    *((-1,), (0,), (True,), (None,), ({"a": 1},)),
 )
+"""Values by what may be wrong with them."""
+
+VALUES = [value for values in ALIKE for value in values]
 
 OVER = {
     "agent": (),
@@ -119,7 +123,7 @@ def differs_in_kind(value: Any, usual: Any) -> bool:
 def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
     """What is wrong with the way in which a setting is answered; None if it works or is refused in one line."""
     usual = OmegaConf.select(cfg, name)
-    changed = copy.deepcopy(cfg)
+    changed = pickle.loads(pickle.dumps(cfg))  # OmegaConf takes six times as long to copy it
     OmegaConf.update(changed, name, value, merge=False)
     case = f"{name}={value!r}"
     try:
@@ -138,13 +142,16 @@ def fault(cfg: DictConfig, name: str, value: Any) -> str | None:
 
 
 def faults(compose: Callable[..., DictConfig], file: str, num_cases: int, new: Container[str] = ()) -> list[str]:
-    """The faults of all cases of new settings of a file, and of so many others that are drawn."""
+    """The faults of new settings of a file with a value of each kind, and of so many other cases that are drawn."""
     cfg = small(compose, file)
+    draw = random.Random(file)
     of_new, others = [], []
     for name in settings_of(cfg, file):
-        cases = of_new if name.rpartition(".")[2] in new else others
-        cases += [(name, value) for value in VALUES]
-    chosen = [*of_new, *random.Random(file).sample(others, min(num_cases, len(others)))]
+        if name.rpartition(".")[2] in new:
+            of_new += [(name, draw.choice(values)) for values in ALIKE]
+        else:
+            others += [(name, value) for value in VALUES]
+    chosen = [*of_new, *draw.sample(others, min(num_cases, len(others)))]
     return [found for case in chosen if (found := fault(cfg, *case)) is not None]
 
 
@@ -172,8 +179,8 @@ def test_some_values_of_some_files_work_or_are_refused_in_one_line(compose, file
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", FILES)
-def test_all_values_of_new_settings_and_some_of_others_work_or_are_refused_in_one_line(compose, file):
-    assert faults(compose, file, 24, NEW[file]) == []
+def test_values_of_every_kind_of_new_settings_and_some_of_others_work_or_are_refused_in_one_line(compose, file):
+    assert faults(compose, file, 6, NEW[file]) == []
 
 
 @pytest.mark.parametrize(

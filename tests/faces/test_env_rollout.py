@@ -73,7 +73,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 }
 
 
-@every_env
+@pytest.mark.parametrize("options", [{"kernel": "off", "info": True}, {"kernel": "auto", "info": False}], ids=str)
 @pytest.mark.parametrize(("name", "max_steps"), [*((name, 15) for name in ARGUMENTS), ("never ends", 1)])
 def test_rollout_gives_the_data_of_the_stock_method(options, name, max_steps):
     stock, found = both(max_steps, options=options, **ARGUMENTS[name])

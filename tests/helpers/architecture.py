@@ -133,13 +133,13 @@ class _Reader(ast.NodeVisitor):
             self.private.append(f"{module}.{name}")
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
-        module = self.modules.get(ast.unparse(node.value))
-        if module is not None and is_private(node.attr):
+        module = self.modules.get(_dotted(node.value)) if is_private(node.attr) else None
+        if module is not None:
             self.private.append(f"{module}.{node.attr}")
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:
-        called = ast.unparse(node.func)
+        called = _dotted(node.func)
         self.calls.append((called, len(node.args)))
         if called.rpartition(".")[2] in BY_NAME:
             self.by_name.append(_beginning(node.args[0]) if node.args else None)
@@ -150,6 +150,15 @@ def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
 
 
+def _dotted(node: ast.expr) -> str:
+    """The source text of a name and its attributes, for which ``ast.unparse`` is slow; of others without brackets."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute):
+        return f"{_dotted(node.value)}.{node.attr}"
+    return ast.unparse(node)
+
+
 def _beginning(argument: ast.expr) -> str | None:
     """The constant text that an argument begins with."""
     if isinstance(argument, ast.JoinedStr) and argument.values:
@@ -157,14 +166,18 @@ def _beginning(argument: ast.expr) -> str | None:
     return argument.value if isinstance(argument, ast.Constant) and isinstance(argument.value, str) else None
 
 
-def read(sources: Mapping[str, str]) -> list[Module]:
+def read(sources: Mapping[str, str], with_bodies: bool = True) -> list[Module]:
     """The modules of source texts, by their names; that of a folder's ``__init__`` ends with ``.__init__``.
 
     What a folder imports for type checkers only is what it exports lazily: who imports it from there, imports it from
     where it is.
+
+    Args:
+        sources: texts by the names of their modules.
+        with_bodies: whether to measure functions and to look for starred dicts and public classes, too.
     """
     names = {name.removesuffix(".__init__") for name in sources}
-    modules = [_module(name, text, names.__contains__) for name, text in sources.items()]
+    modules = [_module(name, text, names.__contains__, with_bodies) for name, text in sources.items()]
     homes = {
         (module.name, one.name): one.module
         for module in modules
@@ -181,11 +194,11 @@ def read(sources: Mapping[str, str]) -> list[Module]:
     ]
 
 
-def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
+def _module(name: str, text: str, is_module: Callable[[str], bool], with_bodies: bool) -> Module:
     tree, lines = ast.parse(text), text.splitlines()
     reader = _Reader(lines, is_module)
     reader.visit(tree)
-    return Module(
+    found = Module(
         name.removesuffix(".__init__"),
         name.endswith(".__init__"),
         len(lines),
@@ -194,6 +207,11 @@ def _module(name: str, text: str, is_module: Callable[[str], bool]) -> Module:
         calls=tuple(reader.calls),
         by_name=tuple(reader.by_name),
         private=tuple(reader.private),
+    )
+    if not with_bodies:
+        return found
+    return replace(
+        found,
         functions=tuple(_sizes_of_functions(tree, text)),
         starred=tuple(_starred_dicts(tree)),
         classes=tuple(_public_classes(tree)),
@@ -206,6 +224,8 @@ def _starred_dicts(tree: ast.Module) -> Iterator[str]:
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             nodes = list(ast.walk(function))
             made = {name for node in nodes for name in _literal_dicts(node)}
+            if not made:
+                continue
             starred = {
                 ast.unparse(each.value)
                 for node in nodes
@@ -276,8 +296,8 @@ def modules_of_results() -> list[Module]:
 
 @cache
 def modules_of_tests() -> list[Module]:
-    """The modules of the tests."""
-    return read(sources_of("tests"))
+    """The modules of the tests, without the bodies of their functions."""
+    return read(sources_of("tests"), with_bodies=False)
 
 
 # The rules

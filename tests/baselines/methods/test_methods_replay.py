@@ -47,9 +47,7 @@ OF_EWC = {"coeff": 10.0, "online": False, "alpha": 0.5, "fisher": "policy", "num
 
 OFFERS = {
     "one by one": [1] * 12,
-    "less than there is room for, then more": [2, 6, 4],
     "more than there is room for": [12],
-    "twice more than there is room for": [5, 7],
     "odd sizes": [3, 1, 4, 2, 2],
 }
 
@@ -59,7 +57,7 @@ OFFERS = {
 def test_every_item_is_kept_with_the_same_chance_and_every_pair_too(offers):
     """12 items and 3 places: an item is kept with chance 1/4, a pair with 3/12 * 2/11."""
     torch.manual_seed(0)
-    trials, capacity, total = 2500, 3, 12
+    trials, capacity, total = 1000, 3, 12
     kept, early = torch.zeros(total), []
 
     for _ in range(trials):
@@ -346,9 +344,9 @@ def test_the_step_that_is_compiled_does_with_a_method_what_the_eager_one_does(co
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "backend"), [("packnet", "eager"), ("mask_lc", "aot_eager")])
-def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, compile_by, name, backend):
-    compile_by(backend)
+@pytest.mark.parametrize("name", ["packnet", "mask_lc"])
+def test_a_compiled_agent_with_a_method_goes_on_from_a_saved_state(compose, compile_by, name):
+    compile_by("eager")
     whole, resumed = (with_method(compose, "ppo", COMPILED[name](), TASKS, "agent.compile=true") for _ in range(2))
     torch.manual_seed(1)
     stay(whole, 0)
@@ -386,9 +384,9 @@ def test_tasks_and_agents_of_one_structure_share_a_compiled_step(compose, compil
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "backend"), [("clear", "inductor"), ("mask_lc", "aot_eager")])
-def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(compose, compile_by, name, backend):
-    compile_by(backend)
+@pytest.mark.parametrize("name", ["clear", "mask_lc"])
+def test_compiled_steps_with_a_method_equal_eager_ones_but_for_rounding(compose, compile_by, name):
+    compile_by("aot_eager")
     eager, compiled = two_tasks(compose, name), two_tasks(compose, name, "agent.compile=true")
 
     assert compiled.agent.compiled_step is not None
