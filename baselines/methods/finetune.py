@@ -28,6 +28,10 @@ class Finetune(Method):
 
     needs_boundaries = False
 
+    learned: Tensor
+    kept: Tensor
+    in_heads: Tensor
+
     def __init__(self, trunk: str = "trained") -> None:
         super().__init__()
         require((trunk in ("trained", "kept"), f"trunk must be trained or kept, got {trunk!r}"))
