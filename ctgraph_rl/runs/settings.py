@@ -216,6 +216,7 @@ def as_typed(message: str, settings: ReadOnlyValues, typed: Iterable[str]) -> st
     """Return a message about values with the names of settings that are typed: ``curriculum.depth`` for ``depth``.
 
     A word that is no name elsewhere is one only where a rule begins, as in ``depth must be``, and before a ``=``.
+    After a ``=`` it is a value.
 
     Args:
         message: that objects gave, which do not know by which setting they were made.
@@ -229,7 +230,7 @@ def as_typed(message: str, settings: ReadOnlyValues, typed: Iterable[str]) -> st
     for key, names in homes.items():
         meant = names if len(names) == 1 else [name for name in names if name in given]
         if len(meant) == 1:
-            name = rf"(?<![\w.'\"/(-]){re.escape(key)}"
+            name = rf"(?<![\w.'\"/(=-]){re.escape(key)}"
             word = rf"{name}(?==)|(?:(?<=^)|(?<=; )){re.escape(key)}(?= must )"
             message = re.sub(rf"{name}(?![\w.'\"/(-])" if "_" in key else word, meant[0], message)
     return message

@@ -36,7 +36,7 @@ from ctgraph_rl.runs.settings import as_typed, in_digits
         ("seed=1 report", "cannot read 'report': settings are written as in seed=1"),
         (
             "-m method=finetune,ewc method.coeff=1,2",
-            "with method=finetune: unknown setting 'method.coeff': choices: none",
+            "with method=finetune: unknown setting 'method.coeff': choices: method.trunk",
         ),
     ],
 )
@@ -99,7 +99,7 @@ def test_a_run_takes_frames_with_an_exponent(monkeypatch, learned):
 
 SETTINGS = {
     "seed": 0,
-    "curriculum": {"depth": 2, "seed": 0, "num_frames": 8},
+    "curriculum": {"depth": 2, "seed": 0, "num_frames": 8, "one_hot": True},
     "agent": {"num_envs": 4, "gamma": 0.9, "sizes": 1},
     "evaluation": {"tasks": None},
 }
@@ -119,6 +119,7 @@ SETTINGS = {
         ("seed must be an integer", ["curriculum.seed"], "curriculum.seed must be an integer"),
         ("seed must be an integer", ["curriculum.seed", "seed"], "seed must be an integer"),
         ("all tasks must differ in depth", [], "all tasks must differ in depth"),
+        ("set task_id=one_hot or hidden", [], "set task_id=one_hot or hidden"),
         ("make(num_envs=4) and curriculum.num_frames", [], "make(num_envs=4) and curriculum.num_frames"),
     ],
 )
