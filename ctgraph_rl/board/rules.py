@@ -204,7 +204,7 @@ def _kind(part: str, name: str) -> type | None:
 
 
 def _part(kind: type, settings: ReadOnlyValues) -> object:
-    """Return what a group of a configuration builds of a class of ours; None for settings of another version."""
+    """Return what a group of a configuration builds of one of our classes; None for settings of another version."""
     try:
         return kind(**{key: value for key, value in with_added(settings).items() if not key.startswith("_")})
     except (TypeError, ValueError):
