@@ -204,7 +204,7 @@ def tasks_learned(curves: Curves, threshold: Tensor | float = MASTERED) -> Tenso
 
 @defined(
     "ctgraph_rl/frames-to-mastery",
-    "mean over tasks j that have a block without others, of the frames from the start of j's first block to p_j >= threshold_j",
+    "mean over tasks j, each with its block, of the frames from the start of j's first block to p_j >= threshold_j",
     HERE,
     missing="a task was not mastered in its block",
     inputs={"threshold": "mastered_returns"},
