@@ -1,4 +1,4 @@
-"""How fast the environment runs, with --device cuda on a GPU, and with --sizes what reading costs.
+"""How fast the environment runs, with --device cuda on a GPU.
 
 Every round measures each way to step once, one after the other, so what slows the machine down slows all of them; the
 table has the medians of the rounds, and an observation is one row for one step. The yardsticks are memset and memcpy of
@@ -28,7 +28,6 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from benchmarks import environment_ladder as ladder
-from benchmarks import sizes
 from ctgraph_rl.batch.rollout import Steps, rollout
 from ctgraph_rl.batch.rows import Rows
 from ctgraph_rl.checks import at_least_one, positive, require
@@ -116,9 +115,9 @@ class Counter(EnvBase):
         pass
 
 
-def _num_steps(num_rows: int, size: int = 144) -> int:
-    """Steps in a buffer of observations."""
-    return max(4, min(512, MAX_BUFFER // (num_rows * size)))
+def _num_steps(num_rows: int) -> int:
+    """Steps in a buffer of observations of 144 bytes."""
+    return max(4, min(512, MAX_BUFFER // (num_rows * 144)))
 
 
 def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
@@ -136,7 +135,8 @@ def _memory(num_rows: int) -> Iterator[tuple[str, Callable[[], int]]]:
 
 
 def _fast(task: Task, num_rows: int, ways: tuple[str, ...]) -> Iterator[tuple[str, Callable[[], int]]]:
-    rows, banked = (Rows([task] * num_rows, noise_bank=size) for size in (0, NOISE_BANK))
+    rows = Rows([task] * num_rows)
+    banked = Rows([task] * num_rows, noise_bank=NOISE_BANK)
     steps = Steps.empty(rows, _num_steps(num_rows))
     actions = torch.randint(0, 3, steps.action.shape, device="cpu")
 
@@ -293,7 +293,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=0.2, help="least time of a measurement")
     parser.add_argument("--skip-kernel", action="store_true", help="leave out the C kernel, which needs a compiler")
     parser.add_argument("--threads", type=int, default=None, help="threads of torch")
-    parser.add_argument("--sizes", type=int, nargs="*", help="instead: readers of curricula and logs, by tasks")
+
     parser.add_argument("--device", default=None, help="instead: the ladder of the tensor engine there, such as cuda")
     parser.add_argument("--limit", type=float, default=600.0, help="seconds after which no measurement begins")
     options = parser.parse_args(arguments)
@@ -304,10 +304,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """Measure and print the table."""
     options = _options(arguments)
-    if options.sizes is not None:
-        require(*at_least_one(**{f"sizes[{i}]": n for i, n in enumerate(options.sizes)}))
-        print(f"{machine()}\n\n{sizes.table(sizes.measured(options.sizes or sizes.SIZES))}")
-        return
+
     require(
         *at_least_one(rounds=options.rounds, **{f"rows[{i}]": n for i, n in enumerate(options.rows)}),
         *positive(seconds=options.seconds, limit=options.limit),

@@ -112,22 +112,24 @@ def _log(path: Path) -> RunLog:
 
 def _verdict(found: Sequence[Sequence[LogLine]], bound: float) -> tuple[int, str]:
     """Return the exit code and a sentence about the measurements."""
-    pairs = list(zip(*found, strict=False))
-    unequal = next((number for number, pair in enumerate(pairs) if pair[0] != pair[1]), None)
-    lengths = [len(lines) for lines in found]
+    scale = _scale(found)
+    lengths = list(map(len, found))
+    unequal = None
+    beyond = None
+    for pair in zip(*found, strict=False):
+        if pair[0] != pair[1] and beyond is None:
+            unequal = unequal or pair
+            is_rounding = all(_close(*field, bound, scale) for field in _fields(*pair))
+            beyond = None if is_rounding else pair
     if unequal is None and lengths[0] == lengths[1]:
         return EQUAL, f"equal: all {lengths[0]} measurements, bit for bit"
     if unequal is None:
         return DIFFERENT, f"different: equal as far as both go, {min(lengths)} of {lengths[0]} and {lengths[1]} lines"
-    scale = _scale(found)
-    beyond = next(
-        (i for i, pair in enumerate(pairs) if not all(_close(*p, bound, scale) for p in _fields(*pair))), None
-    )
-    since = f"{_where(pairs[unequal][0])}: {_changes(pairs[unequal][0], pairs[unequal][1], 3)}"
+    since = f"{_where(unequal[0])}: {_changes(unequal[0], unequal[1], 3)}"
     if beyond is None and lengths[0] == lengths[1]:
         within = f"all measurements agree within {bound:g} of their field's largest value"
         return ROUNDING, f"equal up to rounding: {within}; they diverge at {since}"
-    more = "" if beyond in (unequal, None) else f"; beyond rounding ({bound:g}) at {_where(pairs[beyond][0])}"
+    more = "" if beyond is None or beyond is unequal else f"; beyond rounding ({bound:g}) at {_where(beyond[0])}"
     return DIFFERENT, f"different since {since}{more}"
 
 
@@ -169,11 +171,11 @@ def _changes(one: ReadOnlyValues, other: ReadOnlyValues, most: int) -> str:
 
 def _weights(one: Path, other: Path) -> str:
     """Return how the weights of the agents compare."""
-    files = [path / AGENT for path in (one, other)]
-    missing = [str(file.parent) for file in files if not file.exists()]
+    missing = [str(path) for path in (one, other) if not (path / AGENT).exists()]
     if missing:
         return terminal_text(f"not compared, {' and '.join(missing)} has no {AGENT}")
-    state, others = (dict(flat(_state(file))) for file in files)
+    state = dict(flat(_state(one / AGENT)))
+    others = dict(flat(_state(other / AGENT)))
     if list(state) != list(others):
         return "different: the agents have other parts"
     unequal = [key for key in state if not _same(state[key], others[key])]

@@ -15,7 +15,6 @@ import os
 import re
 import stat
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -24,7 +23,7 @@ from typing import Any
 
 import yaml
 
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_shallow, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_shallow, repeated, require
 from ctgraph_rl.disk import read_regular
 
 MAX_NESTING = 32
@@ -119,11 +118,9 @@ def json_object(
 
 def _unique(pairs: list[tuple[str, Any]]) -> NamedValues:
     """Return an object; refuse one that has a key twice."""
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        counts = Counter(key for key, _ in pairs)
-        raise ValueError(f"key {next(key for key in counts if counts[key] > 1)!r:.80} occurs twice in one object")
-    return found
+    twice = repeated(key for key, _ in pairs)
+    require((not twice, f"key {''.join(twice[:1])!r:.80} occurs twice in one object"))
+    return dict(pairs)
 
 
 def _integer(digits: str) -> int:
@@ -233,12 +230,14 @@ def csv_rows(
     require((len(rows) <= most + 1, f"has more than {most:,} rows, the limit"))
     wrong = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
     require((wrong is None, f"must have {len(columns)} cells in every line, line {wrong} has others"))
-    found = [dict(zip(columns, map(read, row), strict=True)) for row in rows[1:]]
+    found = []
     lines: dict[tuple[str, ...], int] = {}
-    for number, row in enumerate(found, 2):
-        first = lines.setdefault(tuple(row[name] for name in key), number)
-        same = f"lines {first} and {number} are both of {', '.join(row[name] for name in key):.200}"
-        require((first == number, f"{same}: leave one out"))
+    for number, cells in enumerate(rows[1:], 2):
+        row = dict(zip(columns, map(read, cells), strict=True))
+        values = tuple(row[name] for name in key)
+        first = lines.setdefault(values, number)
+        require((first == number, f"lines {first} and {number} are both of {', '.join(values):.200}: leave one out"))
+        found.append(row)
     return found
 
 
@@ -296,10 +295,13 @@ def _check_table(given: Any, wanted: Any) -> None:
     """Refuse a Parquet file of another form than was wanted, by what it says of itself."""
     rows = given.num_rows
     require((rows <= wanted.num_rows, f"it has {rows:,} rows, the logs give {wanted.num_rows:,}"))
-    columns, known = ([_form(each.schema.column(i)) for i in range(each.num_columns)] for each in (given, wanted))
+    columns = _forms(given)
+    known = _forms(wanted)
     require((columns == known, f"it has the columns {_listed(columns)}, the logs give {_listed(known)}"))
     groups = [given.row_group(number) for number in range(min(given.num_row_groups, rows + 1))]
-    parts = [group.column(i) for group in groups for i in range(group.num_columns)]
+    parts: list[Any] = []
+    for group in groups:
+        parts += map(group.column, range(group.num_columns))
     require((not _ends_process(lambda: [part.compression for part in parts]), "its compression is unknown"))
     require(
         (given.num_row_groups <= rows + 1, f"it has {given.num_row_groups:,} groups of {rows:,} rows"),
@@ -326,9 +328,12 @@ def _ends_process(look: Callable[[], object]) -> bool:
     return os.waitpid(child, 0)[1] != 0
 
 
-def _form(column: Any) -> tuple[str, str, str, int]:
-    """Return the name and the type of a column; that of a list has a longer path and deeper levels."""
-    return column.path, column.physical_type, str(column.logical_type), column.max_repetition_level
+def _forms(table: Any) -> list[tuple[str, str, str, int]]:
+    """Return the name and the type of each column; that of a list has a longer path and deeper levels."""
+    forms = []
+    for column in map(table.schema.column, range(table.num_columns)):
+        forms.append((column.path, column.physical_type, str(column.logical_type), column.max_repetition_level))
+    return forms
 
 
 def _listed(columns: Sequence[tuple[str, str, str, int]]) -> str:

@@ -35,7 +35,6 @@ WRITING = {
 """Functions and methods that write files or make folders, unless what they write into is in memory."""
 
 ALLOWED = {
-    ("benchmarks.sizes", "TemporaryDirectory"): "a folder of its own",
     ("ctgraph_rl.board.isolate", "os.open"): "reads a folder",
     ("ctgraph_rl.board.submit", "yaml.dump"): "into a text",
     ("ctgraph_rl.board.relearn", "run_dir.mkdir"): "in the folder of a process",

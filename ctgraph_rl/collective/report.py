@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from operator import itemgetter
 from pathlib import Path
+from statistics import fmean
 from typing import Any
+
+import numpy as np
 
 from ctgraph_rl.checks import require
 from ctgraph_rl.collective.summary import COLLECTIVE, RUN, WHAT, Collective, read_collective, tables
 from ctgraph_rl.disk import made_folder, write_whole
-from ctgraph_rl.log.escape import csv_text, markdown_text
+from ctgraph_rl.log.escape import csv_text, markdown_table, markdown_text
 from ctgraph_rl.metrics.record import MASTERED
 from ctgraph_rl.report.figures.gallery import CaptionedFigure, Gallery
 from ctgraph_rl.report.style import MOST_AGENTS, WIDTH, agent_style, new_figure, require_packages, short
@@ -72,23 +75,15 @@ def write_report(paths: Sequence[Path | str], folder: Path) -> Path:
     for name, columns, rows in tables(found):
         write_whole(folder / name, csv_text([columns, *rows]))
     measured = [_row(each) for each in found]
-    cells = [[row[name] for name in COLUMNS] for row in measured]
-    write_whole(folder / "collectives.csv", csv_text([list(COLUMNS), *cells]))
-    parts = ["# Collectives", _table(measured), MEANING]
+    cells = map(itemgetter(*COLUMNS), measured)
+    write_whole(folder / "collectives.csv", csv_text([COLUMNS, *cells]))
+    shown = [[markdown_text(_shown(row[name])) for name in SHOWN] for row in measured]
+    parts = ["# Collectives", markdown_table(SHOWN, shown), MEANING]
     for each in gallery.write((), _figures(found)):
         parts.append(f"![{each.alt}]({each.path})\n\n{each.caption}")
     page = folder / "collectives.md"
     write_whole(page, "\n\n".join(parts) + "\n")
     return page
-
-
-def _table(measured: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page's table, in Markdown."""
-    lines = [f"| {' | '.join(SHOWN)} |", "|" + "---|" * len(SHOWN)]
-    for row in measured:
-        cells = [markdown_text(_shown(row[name])) for name in SHOWN]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
 
 
 def _row(collective: Collective) -> dict[str, Any]:
@@ -138,7 +133,7 @@ def _draw_times(found: Sequence[Collective]) -> Any:
     for position, (name, times) in enumerate(list(lines.items())[:MOST_AGENTS]):
         numbers = sorted(times)
         look = agent_style(position)
-        means = [math.fsum(times[number]) / len(times[number]) for number in numbers]
+        means = [fmean(times[number]) for number in numbers]
         axes.plot(numbers, means, label=short(name), **look)
         axes.plot(numbers, [means[0] * numbers[0] / number for number in numbers], ":", color=look["color"])
         pairs = [(number, time) for number in numbers for time in times[number]]
@@ -152,10 +147,11 @@ def _draw_times(found: Sequence[Collective]) -> Any:
 def _draw_helps(collective: Collective) -> Any:
     """Draw how often each member has helped each other."""
     count = collective.about["num_members"]
-    by_pair = collective.by_pair
     figure = new_figure(0.6 * WIDTH, 0.5 * WIDTH)
     axes = figure.subplots()
-    cells = [[by_pair[sender, receiver] for sender in range(count)] for receiver in range(count)]
+    cells = np.zeros((count, count))
+    for (sender, receiver), times in collective.by_pair.items():
+        cells[receiver, sender] = times
     image = axes.imshow(cells, cmap="viridis", vmin=0, interpolation="none")
     figure.colorbar(image, ax=axes, label="masks taken over")
     axes.set(xlabel="sender", ylabel="receiver")

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 from ctgraph_rl.checks import ReadOnlyValues, require
@@ -21,6 +22,7 @@ from ctgraph_rl.log.escape import csv_text
 from ctgraph_rl.log.files import LOG, METRICS, member_folder
 from ctgraph_rl.log.run_log import RunLog, write_metrics
 from ctgraph_rl.metrics.record import HERE, MASTERED, Metric
+from ctgraph_rl.runs.read import split_by
 
 COLLECTIVE = "collective.jsonl"
 """The log of a collective."""
@@ -73,7 +75,7 @@ class Collective:
     def learning_time(self) -> float:
         """Mean frames that a member needs to learn a block; what was not learned counts with all of its frames."""
         times = [each.frames if each.frames_to_learn is None else each.frames_to_learn for each in self.learned]
-        return math.fsum(times) / len(times)
+        return fmean(times)
 
     @property
     def share_learned(self) -> float:
@@ -126,17 +128,15 @@ def _learned(path: Path, number: int, about: ReadOnlyValues) -> Iterator[Learned
     """Yield what a member learned in each of its blocks."""
     log = RunLog.read(member_folder(path, number) / LOG)
     trained = log.of_kind("run")[0]["trained"]
-    lines: dict[int, list[dict[str, Any]]] = {}
-    for line in log.of_kind("training"):
-        lines.setdefault(line["block"], []).append(line)
+    lines = split_by(log.of_kind("training"), lambda line: line["block"])
     start = 0
     for block, own in sorted(lines.items()):
-        known = [(line["frames"], line["return_mean"]) for line in own if line["return_mean"] is not None]
-        reached = [frames - start for frames, value in known if value >= MASTERED]
-        last = [value for _, value in known[-LAST:]]
+        known = [line for line in own if line["return_mean"] is not None]
+        reached = [line["frames"] - start for line in known if line["return_mean"] >= MASTERED]
+        last = [line["return_mean"] for line in known[-LAST:]]
         label = " ".join(about["labels"][task - 1] for task in trained[block - 1])
         end = own[-1]["frames"]
-        final = math.fsum(last) / len(last) if last else math.nan
+        final = fmean(last) if last else math.nan
         yield Learned(
             number,
             about["seed"],
@@ -175,7 +175,10 @@ def write_summary(run_dir: Path) -> None:
 
 def tables(collectives: Sequence[Collective]) -> Iterator[tuple[str, list[str], list[list[Any]]]]:
     """Yield the name, the columns and the rows of each tidy table, of one or of several collectives."""
-    rows = [[*_run(each), *_plain(row)] for each in collectives for row in each.learned]
+    rows = []
+    for each in collectives:
+        for row in each.learned:
+            rows.append([*_run(each), *_plain(row)])
     yield "members.csv", [*RUN, *Learned._fields], rows
     yield _table(collectives, "messages", ["round", "frames", "message", *WHAT, "bytes"])
     columns = ["round", "receiver", "sender", "block", "frames"]
@@ -186,7 +189,7 @@ def tables(collectives: Sequence[Collective]) -> Iterator[tuple[str, list[str], 
 
 
 def _run(collective: Collective) -> list[Any]:
-    return [collective.about[name] for name in RUN]
+    return list(map(collective.about.get, RUN))
 
 
 def _plain(row: Learned) -> list[Any]:

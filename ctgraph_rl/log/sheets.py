@@ -72,10 +72,10 @@ def to_markdown(sheet: Sheet) -> str:
     """A table in Markdown, with its title as a heading."""
     sides = ["--:" if side == "r" else ":--" for side in sheet.columns.values()]
     lines = ["| " + " | ".join(map(markdown_text, row)) + " |" for row in (tuple(sheet.columns), *sheet.rows)]
-    notes = [line for note in sheet.notes for line in ("", f"{markdown_text(note)}")]
-    return "\n".join(
-        [f"## {markdown_text(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:], *notes, ""]
-    )
+    text = [f"## {markdown_text(sheet.title)}", "", lines[0], f"| {' | '.join(sides)} |", *lines[1:]]
+    for note in sheet.notes:
+        text += ["", markdown_text(note)]
+    return "\n".join([*text, ""])
 
 
 def to_latex(sheet: Sheet) -> str:

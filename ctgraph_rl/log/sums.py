@@ -32,8 +32,11 @@ RESULTS = (LOG, CURRICULUM, AGENT, *TABLES, SUMS, METRICS)
 
 def write_sums(run_dir: Path, metrics: bytes) -> None:
     """Write the sums of the results in a directory, and of the metrics that are about to be written."""
-    there = [name for name in RESULTS if name not in (SUMS, METRICS) and (run_dir / name).exists()]
-    files = {**{name: sum_of((run_dir / name).read_bytes()) for name in there}, METRICS: sum_of(metrics)}
+    files = {}
+    for name in RESULTS:
+        if name not in (SUMS, METRICS) and (run_dir / name).exists():
+            files[name] = sum_of((run_dir / name).read_bytes())
+    files[METRICS] = sum_of(metrics)
     write_whole(run_dir / SUMS, (json.dumps({"run": uuid4().hex, "files": files}, indent=2) + "\n").encode())
 
 
@@ -42,7 +45,10 @@ def is_complete(run_dir: Path) -> bool:
 
     Without sums, files must not be empty. No file but the sums is read, as a sweep asks this of every cell.
     """
-    sizes = {name: path.stat().st_size for name in RESULTS if (path := run_dir / name).exists()}
+    sizes = {}
+    for name in RESULTS:
+        if (run_dir / name).exists():
+            sizes[name] = (run_dir / name).stat().st_size
     if METRICS not in sizes or SUMS not in sizes:
         return METRICS in sizes and all(sizes.values())
     sums = stored_sums(run_dir)

@@ -100,11 +100,14 @@ def evaluations_parquet(logs: Iterable[RunLog]) -> bytes:
         ModuleNotFoundError: without pyarrow; names the extra to install.
         ValueError: for more columns than a table may have.
     """
-    arrow, logs = _pyarrow(needed=True), list(logs)
+    logs = list(logs)
     types: dict[str, str] = {}
     for log in logs:
         types |= _types(log, "evaluation", EVALUATIONS)
-    return _parquet(arrow, types, [row for log in logs for row in _rows(log, "evaluation", list(types))])
+    rows: list[list[Any]] = []
+    for log in logs:
+        rows += _rows(log, "evaluation", list(types))
+    return _parquet(_pyarrow(needed=True), types, rows)
 
 
 def check_table(path: Path) -> None:
@@ -133,8 +136,10 @@ def write_evaluations(path: Path, runs: Sequence[tuple[str, str, RunLog]]) -> No
     types: dict[str, str] = {}
     for _, _, log in runs:
         types |= _types(log, "evaluation", EVALUATIONS)
-    names = list(types)
-    rows = [[agent, place, *row] for agent, place, log in runs for row in _rows(log, "evaluation", names)]
+    rows = []
+    for agent, place, log in runs:
+        for row in _rows(log, "evaluation", list(types)):
+            rows.append([agent, place, *row])
     columns = {"agent": "string", "run": "string", **types}
     if path.suffix == ".csv":
         write_named(path, csv_text([list(columns), *rows]))

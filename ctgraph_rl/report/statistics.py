@@ -21,6 +21,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ def mean(values: Values, level: float = LEVEL, bounds: LowHigh = UNBOUNDED) -> E
     method = f"mean, {'Gaffke' if bounded else 'Student t'} {level:.0%}"
     if len(known) == 0:
         return _nothing(missing, method)
-    centre = math.fsum(known) / len(known)
+    centre = fmean(known)
     reason = None if within else f"a value is outside [{limits.low:g}, {limits.high:g}]"
     low: float | None = None
     high: float | None = None
@@ -164,7 +165,7 @@ def mean_and_std(values: Values) -> Estimate:
         return _nothing(missing, method)
     std = float(np.std(known, ddof=1)) if len(known) > 1 else None
     reason = "one seed has no standard deviation" if std is None else None
-    centre = math.fsum(known) / len(known)
+    centre = fmean(known)
     return Estimate(centre, None, None, len(known), missing, method=method, reason=reason, std=std)
 
 
@@ -219,7 +220,8 @@ def solved_rate(solved: Sequence[bool | None], level: float = LEVEL) -> Estimate
     """
     require(*fraction(level=level))
     known = [float(each) for each in solved if each is not None]
-    missing, method = len(solved) - len(known), f"share, Clopper-Pearson {level:.0%}"
+    missing = len(solved) - len(known)
+    method = f"share, Clopper-Pearson {level:.0%}"
     if not known:
         return Estimate(None, None, None, 0, missing, method=method, reason="no seed has a result")
     low, high = gaffke(known, Bounds(0.0, 1.0), level)
@@ -240,14 +242,22 @@ def median_time(times: Values, level: float = LEVEL) -> Estimate:
     require(*fraction(level=level))
     known, missing = _known(times)
     require((min(known, default=0.0) >= 0, f"times must be >= 0, got {min(known, default=0.0)}"))
-    n, method = len(known), f"median, order statistics {level:.0%}"
+    n = len(known)
+    method = f"median, order statistics {level:.0%}"
     if n == 0:
         return _nothing(missing, method)
-    ordered, k = [0.0, *sorted(known), math.inf], median_ranks(n, level)
-    centre = (ordered[(n + 1) // 2] + ordered[n // 2 + 1]) / 2
+    ordered = [0.0, *sorted(known), math.inf]
+    k = median_ranks(n, level)
     reason = None if k else f"the range of the times covers {1 - 0.5 ** (n - 1):.0%}"
-    low, high = ordered[k], ordered[n + 1 - k]
-    return Estimate(centre, low=low, high=high, n=n, n_undefined=missing, method=method, reason=reason)
+    return Estimate(
+        median(known),
+        low=ordered[k],
+        high=ordered[n + 1 - k],
+        n=n,
+        n_undefined=missing,
+        method=method,
+        reason=reason,
+    )
 
 
 @takes_numbers
@@ -277,7 +287,8 @@ def interquartile_mean(
     if n < LEAST_FOR_BOOTSTRAP:
         reason = f"needs {LEAST_FOR_BOOTSTRAP} seeds of each task, got {n}"
         return Estimate(None, low=None, high=None, n=n, n_undefined=undefined, method=method, reason=reason)
-    rng, limits = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    limits = []
     for bound, tail in ((lowest, (1 - level) / 2), (highest, (1 + level) / 2)):
         added = [bound] if math.isfinite(bound) else []
         tasks = [[*task, *added] for task in known]
@@ -286,7 +297,8 @@ def interquartile_mean(
     pooled = np.sort(np.concatenate(known))
     cut = len(pooled) // 4
     value = float(pooled[cut : len(pooled) - cut].mean())
-    low, high = min(limits[0], value), max(limits[1], value)
+    low = min(limits[0], value)
+    high = max(limits[1], value)
     return Estimate(value, low=low, high=high, n=n, n_undefined=undefined, method=method)
 
 
@@ -312,16 +324,18 @@ def of_two_groups(
     """
     require(*fraction(level=level))
     lowest, highest, _ = _checked(bounds)
-    method, n = f"two groups, weighted {level:.0%}", min(len(first), len(second))
+    method = f"two groups, weighted {level:.0%}"
+    n = min(len(first), len(second))
     value = float(measure(first.mean(0), second.mean(0)))
     if n < 2:
         return Estimate(value, None, None, n, 0, method=method, reason="one seed has no interval")
-    rng, limits = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    limits = []
     for ends, tail in (((lowest, highest), (1 - level) / 2), ((highest, lowest), (1 + level) / 2)):
-        means = [
-            rng.dirichlet(np.ones(len(group) + 1), RESAMPLES) @ np.vstack([group, np.full(group.shape[1], end)])
-            for group, end in zip((first, second), ends, strict=True)
-        ]
+        means = []
+        for group, end in zip((first, second), ends, strict=True):
+            weights = rng.dirichlet(np.ones(len(group) + 1), RESAMPLES)
+            means.append(weights @ np.vstack([group, np.full(group.shape[1], end)]))
         limits.append(float(np.quantile(measure(*means), tail, method="lower" if tail < 0.5 else "higher")))
     return Estimate(value, low=limits[0], high=limits[1], n=n, n_undefined=0, method=method)
 
@@ -340,15 +354,16 @@ def compare(first: Values, second: Values, level: float = LEVEL, bounds: LowHigh
         ValueError: for different numbers of seeds.
     """
     require((len(first) == len(second), f"pairs need equally many seeds, got {len(first)} and {len(second)}"))
-    pairs = [(_number(a), _number(b)) for a, b in zip(first, second, strict=True)]
-    differences = [None if a is None or b is None else a - b for a, b in pairs]
+    differences = []
+    for a, b in zip(map(_number, first), map(_number, second), strict=True):
+        differences.append(None if a is None or b is None else a - b)
     known, _ = _known(differences)
     signs = [(each > 0) - (each < 0) for each in known]
-    std, p_value = (float(np.std(known, ddof=1)), _sign_flip(known)) if len(known) > 1 else (None, None)
-    wins, ties, losses = (signs.count(sign) for sign in (1, 0, -1))
+    std = float(np.std(known, ddof=1)) if len(known) > 1 else None
+    p_value = _sign_flip(known) if len(known) > 1 else None
     low, high, noisy = _checked(bounds)
     difference = mean(differences, level, Bounds(low - high, high - low, noisy))
-    return Comparison(difference, std, p_value, wins=wins, ties=ties, losses=losses)
+    return Comparison(difference, std, p_value, wins=signs.count(1), ties=signs.count(0), losses=signs.count(-1))
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -409,9 +424,8 @@ def _of_tasks(values: Sequence[Values], who: str, level: float, resamples: int) 
     """Return the values of each task, and the numbers of seeds with and without one; refuse what is out of range."""
     require(*fraction(level=level), (is_int(resamples, 100), f"resamples must be an integer >= 100, got {resamples!r}"))
     require((len(values) > 0, f"{who} needs the values of at least one task"))
-    found = [_known(task) for task in values]
-    known = [of_task for of_task, _ in found]
-    return known, min(map(len, known)), max(missing for _, missing in found)
+    known, missing = zip(*map(_known, values), strict=True)
+    return list(known), min(map(len, known)), max(missing)
 
 
 def _checked(bounds: LowHigh) -> Bounds:

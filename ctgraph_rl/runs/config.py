@@ -100,8 +100,10 @@ def run_name(*, _root_: DictConfig) -> str:
 def name_of(cfg: DictConfig, choices: Any) -> str:
     """Return the name of a configuration's run, given the chosen file of each group."""
     parts = {"cell": (None, "lstm"), "method": ("finetune",), "detector": (None,), "exchange": (None, "null")}
-    chosen = [choices.get(group) for group, usual in parts.items() if choices.get(group) not in usual]
-    learner = "-".join([choices.agent, *chosen])
+    learner = choices.agent
+    for group, usual in parts.items():
+        if choices.get(group) not in usual:
+            learner += f"-{choices.get(group)}"
     seed = re.sub(r"\W", "_", str(cfg.seed))  # one that is refused later must not lead elsewhere
     return f"{choices.curriculum}/{learner}-seed{seed}-{digest(plain(cfg))}"
 
@@ -167,10 +169,11 @@ def check_one_cell() -> None:
     if in_sweep():
         return
     chosen = HydraConfig.get()
-    given = {setting.partition("=")[0].lstrip("+") for setting in chosen.overrides.task}
-    together = {key: "..." for variant in chosen.sweeper.get("variants") or () for key in variant}
-    every = {**(chosen.sweeper.get("params") or {}), **together}
-    swept = {key: value for key, value in every.items() if key not in given}
+    swept = {**(chosen.sweeper.get("params") or {})}
+    for variant in chosen.sweeper.get("variants") or ():
+        swept |= dict.fromkeys(variant, "...")
+    for setting in chosen.overrides.task:
+        swept.pop(setting.partition("=")[0].lstrip("+"), None)
     shown = " ".join(f"{key}={value}" for key, value in swept.items())
     launcher = chosen.runtime.choices["hydra/launcher"]
     require(
@@ -323,14 +326,15 @@ def with_names(names: Mapping[str, str | None], config_dir: Path | None = None) 
     is_folder = config_dir is None or config_dir.is_dir()
     require((is_folder, f"config_dir must be a directory, got {config_dir}"))
     check_packages()
-    given = {group: name for group, name in names.items() if name is not None}
-    for group, name in given.items():
-        choices = [
-            each for folder in (conf_dir(), config_dir) if folder is not None for each in names_in(folder, group)
-        ]
-        require((name in choices, f"unknown {group} {name!r}: {did_you_mean(str(name), choices)}"))
+    settings = []
+    for group, name in names.items():
+        if name is not None:
+            own = [] if config_dir is None else names_in(config_dir, group)
+            choices = [*names_in(conf_dir(), group), *own]
+            require((name in choices, f"unknown {group} {name!r}: {did_you_mean(str(name), choices)}"))
+            settings.append(f"{group}={name}")
     try:
-        return composed([f"{group}={name}" for group, name in given.items()], config_dir)
+        return composed(settings, config_dir)
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(explain(error)) from None
 
@@ -341,10 +345,11 @@ def write_configuration(cfg: DictConfig, folder: Path) -> None:
     save_yaml(cfg, folder / "config.yaml")
     if HydraConfig.initialized():
         save_yaml(HydraConfig.instance().cfg, folder / "hydra.yaml")
-        own = {"seed": cfg.seed}  # the settings of a job for several seeds name the first and all
-        given = [setting.partition("=") for setting in HydraConfig.get().overrides.task]
-        given = [each for each in given if each[0] != "+seeds"]
-        settings = [f"{key}={own.get(key, value)}" if equals else key for key, equals, value in given]
+        settings = []
+        for setting in HydraConfig.get().overrides.task:  # those of a job for several seeds name the first and all
+            key = setting.partition("=")[0]
+            if key != "+seeds":
+                settings.append(f"seed={cfg.seed}" if key == "seed" else setting)
         save_yaml(settings, folder / "overrides.yaml")
 
 

@@ -118,24 +118,24 @@ def find_or_train(
         ValueError: before any training, for a block with several tasks.
     """
     alone = {i: expert_curriculum(curriculum, task) for i, task in enumerate(curriculum.tasks, 1)}
-    wanted = [*alone] if only is None else [only]
-    found = {
-        seed: [Expert(i, alone[i].fingerprint, folder / directory_name(alone[i], own)) for i in wanted]
-        for seed, own in settings.items()
-    }
+    found: dict[int, list[Expert]] = {seed: [] for seed in settings}
     failed: Failures = {}
-    for place, i in enumerate(wanted):
+    for i in alone if only is None else (only,):
         what = f"expert {i} of {len(alone)}, {curriculum.labels[i - 1]}"
-        run_dirs = {seed: experts[place].run_dir for seed, experts in found.items() if seed not in failed}
+        run_dirs = {}
+        for seed, experts in found.items():
+            run_dirs[seed] = folder / directory_name(alone[i], settings[seed])
+            experts.append(Expert(i, alone[i].fingerprint, run_dirs[seed]))
         left = _left(run_dirs, what, tell)
-        errors = _train(alone[i], learn, left, waiting)
-        failed |= {seed: FloatingPointError(f"{what}: {error}") for seed, error in errors.items()}
-    return {seed: experts for seed, experts in found.items() if seed not in failed}, failed
+        for seed, error in _train(alone[i], learn, left, waiting).items():
+            failed[seed] = FloatingPointError(f"{what}: {error}")
+            del found[seed]
+    return found, failed
 
 
 def _left(run_dirs: RunDirs, what: str, tell: Callable[[str], object]) -> dict[int, Path]:
     """Return those that are not trained, and tell of each."""
-    left = {seed: run_dir for seed, run_dir in run_dirs.items() if not _is_trained(run_dir)}
+    left = _untrained(run_dirs)
     for seed, run_dir in run_dirs.items():
         of_seed = f" of seed {seed}" if len(run_dirs) > 1 else ""
         tell(f"{what}{of_seed}: {'learns into' if seed in left else 'found in'} {run_dir}")
@@ -150,8 +150,7 @@ def _train(curriculum: Curriculum, learn: Learn, run_dirs: RunDirs, waiting: Cal
     with ExitStack() as stack:
         for run_dir in sorted(run_dirs.values()):  # one order, so that no two processes wait for each other
             stack.enter_context(locked(made_folder(run_dir), waiting))
-        left = {seed: run_dir for seed, run_dir in run_dirs.items() if not _is_trained(run_dir)}
-        for group in _groups(curriculum, left):
+        for group in _groups(curriculum, _untrained(run_dirs)):
             failed |= learn(curriculum, group)
     return failed
 
@@ -163,15 +162,14 @@ def _groups(curriculum: Curriculum, run_dirs: RunDirs) -> list[RunDirs]:
     """
     begun: dict[tuple[int, ...], dict[int, int]] = {}
     for seed, run_dir in run_dirs.items():
-        frames = Checkpoints(run_dir / CHECKPOINTS).newest_frames
-        if frames is not None:
-            begun.setdefault(tuple(begun_with(run_dir)) or (seed,), {})[seed] = frames
-    resumed: list[RunDirs] = [
-        {seed: run_dirs[seed] for seed in group if seed in frames}
-        for group, frames in begun.items()
-        if {*frames} == {*group} or {*frames.values()} == {curriculum.num_frames}
-    ]
-    new = {seed: run_dir for seed, run_dir in run_dirs.items() if not any(seed in group for group in resumed)}
+        newest = Checkpoints(run_dir / CHECKPOINTS).newest_frames
+        if newest is not None:
+            begun.setdefault(tuple(begun_with(run_dir)) or (seed,), {})[seed] = newest
+    resumed: list[RunDirs] = []
+    new = dict(run_dirs)
+    for group, frames in begun.items():
+        if {*frames} == {*group} or {*frames.values()} == {curriculum.num_frames}:
+            resumed.append({seed: new.pop(seed) for seed in group if seed in frames})
     for run_dir in new.values():
         shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)
     return [*resumed, new] if new else resumed
@@ -187,8 +185,13 @@ def begun_with(run_dir: Path) -> list[int]:
     return list((RunLog.begun(run_dir / LOG) or {}).get("together", ()))
 
 
-def _is_trained(run_dir: Path) -> bool:
-    return (run_dir / METRICS).exists() and not damaged(run_dir)
+def _untrained(run_dirs: RunDirs) -> dict[int, Path]:
+    """Return those that have no results, or damaged ones."""
+    left = {}
+    for seed, run_dir in run_dirs.items():
+        if not (run_dir / METRICS).exists() or damaged(run_dir):
+            left[seed] = run_dir
+    return left
 
 
 def directory_name(curriculum: Curriculum, settings: ReadOnlyValues) -> str:

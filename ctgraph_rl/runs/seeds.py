@@ -92,11 +92,12 @@ def run_as_one(runs: Sequence[JobAndPath], built: tuple[Job, torch.Generator] | 
     with ExitStack() as stack:
         for _, run_dir in runs:
             stack.enter_context(locked(run_dir))
-        finished = [is_finished(cfg, run_dir) for cfg, run_dir in runs]
-        left = [run for run, done in zip(runs, finished, strict=True) if not done]
-        for (_, run_dir), done in zip(runs, finished, strict=True):
-            if done:
+        left = []
+        for cfg, run_dir in runs:
+            if is_finished(cfg, run_dir):
                 shutil.rmtree(run_dir / CHECKPOINTS, ignore_errors=True)  # if it was killed at its very end
+            else:
+                left.append((cfg, run_dir))
         failed = _marked(left, built) if left else {}
     if failed:
         raise RuntimeError("; ".join(f"{type(error).__name__}: {error}" for error in failed.values()))
@@ -175,7 +176,8 @@ def train_experts(jobs: Sequence[Job], only: int | None = None) -> tuple[dict[in
     Returns:
         The experts of each seed, and the error of each seed with an expert that failed, which then has none.
     """
-    first, by_seed = jobs[0], {job.cfg.seed: job for job in jobs}
+    first = jobs[0]
+    by_seed = {job.cfg.seed: job for job in jobs}
 
     def learn(alone: Curriculum, run_dirs: RunDirs) -> Failures:
         [(seed, run_dir), *others] = run_dirs.items()
@@ -184,10 +186,9 @@ def train_experts(jobs: Sequence[Job], only: int | None = None) -> tuple[dict[in
                 return by_seed[seed].learn_alone(alone, run_dirs)
             except FloatingPointError as error:
                 return {seed: error}
-        members = [
-            SeedOfRun(*by_seed[seed].expert(alone, run_dir, [*run_dirs]), _generator())
-            for seed, run_dir in run_dirs.items()
-        ]
+        members = []
+        for seed, run_dir in run_dirs.items():
+            members.append(SeedOfRun(*by_seed[seed].expert(alone, run_dir, [*run_dirs]), _generator()))
         return _as_one(first, alone, members)
 
     folder = Path(first.cfg.experts_dir)

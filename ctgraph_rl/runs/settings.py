@@ -30,17 +30,27 @@ LSTM = {
 }
 """What stands behind the encoder of an agent with memory, unless ``cell=`` says otherwise."""
 
-WITH_CELL = ("lstm_ppo.LSTMPPO", "rl2.RL2", "drqn.DRQN", "qrdqn_lstm.QRDQNLSTM")
-
-POLICY_GRADIENT = ("a2c.A2C", "reinforce.Reinforce", "ppo.PPO", "ppo_count.PPOCount", "ppo_rnd.PPORND", *WITH_CELL[:2])
+_ENCODER: NamedValues = {"encoder": "mlp"}
+_DEDUPLICATE: NamedValues = {"deduplicate": False, **_ENCODER}
+_CELL: NamedValues = {"cell": LSTM, **_ENCODER}
+_BACKBONE: NamedValues = {"backbone_seed": None}
 
 ADDED: dict[str, NamedValues] = {
     "run": {"portable": False, "protocol.guide_frames": None, "evaluation.adapt_episodes": None},
-    **{f"baselines.{agent}": {"encoder": "mlp"} for agent in ("dqn.DQN", "mohqa.MOHQA")},
-    **{f"baselines.{agent}": {"deduplicate": False, "encoder": "mlp"} for agent in POLICY_GRADIENT},
-    **{f"baselines.{agent}": {"cell": LSTM, "encoder": "mlp"} for agent in WITH_CELL[2:]},
-    **{f"baselines.{agent}": {"cell": LSTM, "deduplicate": False, "encoder": "mlp"} for agent in WITH_CELL[:2]},
-    **{f"baselines.methods.mask_{name.lower()}.Mask{name}": {"backbone_seed": None} for name in ("RI", "LC", "BLC")},
+    "baselines.dqn.DQN": _ENCODER,
+    "baselines.mohqa.MOHQA": _ENCODER,
+    "baselines.a2c.A2C": _DEDUPLICATE,
+    "baselines.reinforce.Reinforce": _DEDUPLICATE,
+    "baselines.ppo.PPO": _DEDUPLICATE,
+    "baselines.ppo_count.PPOCount": _DEDUPLICATE,
+    "baselines.ppo_rnd.PPORND": _DEDUPLICATE,
+    "baselines.drqn.DRQN": _CELL,
+    "baselines.qrdqn_lstm.QRDQNLSTM": _CELL,
+    "baselines.lstm_ppo.LSTMPPO": {**_CELL, **_DEDUPLICATE},
+    "baselines.rl2.RL2": {**_CELL, **_DEDUPLICATE},
+    "baselines.methods.mask_ri.MaskRI": _BACKBONE,
+    "baselines.methods.mask_lc.MaskLC": _BACKBONE,
+    "baselines.methods.mask_blc.MaskBLC": _BACKBONE,
     "curricula.from_axes": {
         "read_noise": 0,
         "read_rotation": 0,
@@ -86,9 +96,10 @@ def flat(settings: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]
 def as_before(settings: ReadOnlyValues) -> NamedValues:
     """Return the settings of a run without those of `ADDED` that have the value for "as before"."""
     kept = _without(settings, ADDED.get("run", {}))
-    return {
-        key: _without(value, _added_to(value)) if isinstance(value, Mapping) else value for key, value in kept.items()
-    }
+    for key, value in kept.items():
+        if isinstance(value, Mapping):
+            kept[key] = _without(value, _added_to(value))
+    return kept
 
 
 def _without(settings: ReadOnlyValues, added: ReadOnlyValues, prefix: str = "") -> NamedValues:
@@ -130,10 +141,13 @@ def check_arguments(group: str, given: Sequence[str], function: Any) -> None:
     """
     parameters = parameters_of(function)
     choices = [name for name in parameters if name not in SPECS]
-    unknown = [name for name in given if name not in choices]
+    unknown = []
+    for name in given:
+        if name not in choices:
+            unknown.append(f"{group} has no {name}: {HINTS.get(name) or did_you_mean(name, choices)}")
     missing = [name for name in choices if name not in given and parameters[name].default is Parameter.empty]
     require(
-        *((False, f"{group} has no {name}: {HINTS.get(name) or did_you_mean(name, choices)}") for name in unknown),
+        (not unknown, "; ".join(unknown)),
         (not missing, f"{group} needs {', '.join(missing)}; name them in conf/{group} or on the command line"),
     )
 

@@ -59,8 +59,11 @@ SUBDIR = "${run_name:}"
 def swept(params: ReadOnlyValues) -> dict[str, list[str]]:
     """Return the choices of each swept setting as on a command line: ``seed=0``, ``seed=1`` of ``range(2)``."""
     parser = OverridesParser.create()
-    parsed = {key: parser.parse_override(f"{key}={value}") for key, value in params.items()}
-    return {key: [f"{key}={value}" for value in each.sweep_string_iterator()] for key, each in parsed.items()}
+    found = {}
+    for key, value in params.items():
+        parsed = parser.parse_override(f"{key}={value}")
+        found[key] = [f"{key}={choice}" for choice in parsed.sweep_string_iterator()]
+    return found
 
 
 class Sweeper(Base):
@@ -124,17 +127,23 @@ class Sweeper(Base):
         )
         if self.config.portable is True:
             become_portable()  # processes that a launcher starts have its variables
-        batch = [cell for variant in self.variants for cell in self._combined(variant, arguments)]
+        batch: list[list[str]] = []
+        for variant in self.variants:
+            batch += self._combined(variant, arguments)
         cells = self.cells(batch)
         again = cells if overwrite is True else self._stale
-        before = {folder: RunOutcome.of(folder) if folder in again else NOTHING for folder in cells}
-        done = {folder for folder in cells if status_of(folder, before[folder]).state == DONE}
-        left = [folder for folder in cells if folder not in done or (folder / CHECKPOINTS).exists()]  # to remove these
+        before = {}
+        left = {}
+        for folder, overrides in cells.items():
+            before[folder] = RunOutcome.of(folder) if folder in again else NOTHING
+            is_done = status_of(folder, before[folder]).state == DONE
+            if not is_done or (folder / CHECKPOINTS).exists():  # to remove these
+                left[folder] = overrides
         errors: dict[Path, str] = {}
         try:
             if left and not self.status and (overwrite or not self._stale):
                 with sigterm_exits(), SweepProgress(before):
-                    self._launch(self._jobs({folder: cells[folder] for folder in left}), errors)
+                    self._launch(self._jobs(left), errors)
         finally:
             found = {folder: self._status(folder, before[folder], errors.get(folder)) for folder in cells}
             if self._num_unknown:
@@ -197,12 +206,18 @@ class Sweeper(Base):
         composed: dict[tuple[Overrides, Overrides], DictConfig] = {}
         found: dict[Path, Overrides] = {}
         for overrides in batch:
-            values = {setting: self._value(setting) for setting in overrides}
-            choices = tuple(setting for setting, value in values.items() if value is None)
-            alike = choices, tuple(key for key, _ in filter(None, values.values()))
+            values = {}
+            choices = []
+            for setting in overrides:
+                changed = self._value(setting)
+                if changed is None:
+                    choices.append(setting)
+                else:
+                    values[changed[0]] = changed[1]
+            alike = tuple(choices), tuple(values)
             if alike not in composed:
                 composed[alike] = self._composed(overrides, choices)
-            for key, value in filter(None, values.values()):
+            for key, value in values.items():
                 OmegaConf.update(composed[alike], key, value)
             sweep = composed[alike].hydra.sweep
             folder = Path(sweep.dir).absolute() / sweep.subdir
@@ -268,17 +283,23 @@ class Sweeper(Base):
             return {tuple(overrides): [folder] for folder, overrides in cells.items()}
         groups: dict[Any, dict[str, Path]] = {}
         for folder, overrides in cells.items():
-            [seed] = [setting.partition("=")[2] for setting in overrides if _key(setting) == "seed"] or [""]
-            others = tuple(setting for setting in overrides if _key(setting) not in ("seed", "together"))
+            seed = ""
+            others = []
+            for setting in overrides:
+                key, _, value = setting.partition("=")
+                if key == "seed":
+                    seed = value
+                elif key != "together":
+                    others.append(setting)
             begun = self._begun.get(folder)
             alone = seed if begun == () or not seed else ""
-            groups.setdefault((others, begun, alone), {})[seed] = folder
+            groups.setdefault((tuple(others), begun, alone), {})[seed] = folder
         jobs: dict[Overrides, list[Path]] = {}
-        for (others, *_), group in groups.items():
+        for (shared, *_), group in groups.items():
             first = next(iter(group))
             own = [f"seed={first}"] if first else []
             own += ["together=true", f"+seeds=[{','.join(group)}]"] if len(group) > 1 else []
-            jobs[*others, *own] = list(group.values())
+            jobs[*shared, *own] = list(group.values())
         return jobs
 
     def _launch(self, jobs: Mapping[Overrides, Sequence[Path]], errors: dict[Path, str]) -> None:
@@ -296,12 +317,9 @@ class Sweeper(Base):
             except Exception as error:  # such as a worker that was killed: the cells' directories say how far they are
                 print(f"the launcher stopped: {type(error).__name__}: {terminal_text(error)}", file=sys.stderr)
                 return
-            failed = [pair for pair in zip(batch, returned, strict=True) if pair[1].status == JobStatus.FAILED]
-            errors.update({cell: why(job) for of_job, job in failed for cell in jobs[of_job]})
-
-
-def _key(setting: str) -> str:
-    return setting.partition("=")[0]
+            for of_job, job in zip(batch, returned, strict=True):
+                if job.status == JobStatus.FAILED:
+                    errors.update(dict.fromkeys(jobs[of_job], why(job)))
 
 
 @contextmanager
