@@ -48,11 +48,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="no C compiler"))
 
 
+def pytest_configure() -> None:
+    """Collect no garbage until all tests are collected: what imports make stays."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """Leave imports and collected tests out of garbage collections, and make all of these rarer."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
+    gc.enable()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -38,7 +38,7 @@ def sampled_successes(agent, task: Task, num_episodes: int = 2000) -> int:
     return int((episodes["outcome"] == OUTCOME_GOAL).sum())
 
 
-@pytest.mark.parametrize(("name", "goal"), [("a2c", (1, 1)), ("dqn", (1, 2)), ("lstm_ppo", (2, 1)), ("ppo", (2, 2))])
+@pytest.mark.parametrize(("name", "goal"), [("a2c", (1, 1)), ("dqn", (1, 2))])
 def test_agents_learn_goals_of_ct_fo_b1(build_agent, name, goal):
     _, found = learnt(build_agent, name, ct_fo_b1(goal))
 
@@ -53,7 +53,7 @@ def test_reinforce_learns_a_goal_of_ct_fo_b1(build_agent):
 
 @pytest.mark.parametrize(("name", "goal"), [("lstm_ppo", (1, 2)), ("drqn", (1, 2)), ("qrdqn_lstm", (2, 1))])
 def test_agents_with_memory_learn_ct_su_b1(build_agent, name, goal):
-    _, found = learnt(build_agent, name, ct_su_b1(goal))
+    _, found = learnt(build_agent, name, ct_su_b1(goal), 40_960)
 
     assert found == 1.0
 

@@ -228,9 +228,8 @@ def test_a_compiled_agent_learns_the_same_but_for_rounding(small_agent, name):
     assert parameters_equal(*agents)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "ppo" else pytest.param(name, marks=pytest.mark.slow) for name in COMPILED]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPILED)
 def test_an_agent_that_goes_on_from_a_saved_state_begins_with_a_compiled_step(small_agent, compile_by, name):
     compile_by("eager")
     agent, other = (small_agent(name, [ct_su_b1()], "agent.compile=true") for _ in range(2))

@@ -42,7 +42,9 @@ def play(rows: Rows, twin: Rows, made: list) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tasks", "num_calls"), [(TASKS, MAX_TICKS + 14), (VECTORS, 50), (PLAIN, 50)], ids=["images", "vectors", "plain"]
+    ("tasks", "num_calls"),
+    [(TASKS, MAX_TICKS + 14), pytest.param(VECTORS, 50, marks=pytest.mark.slow), (PLAIN, 50)],
+    ids=["images", "vectors", "plain"],
 )
 def test_draws_ahead_are_those_of_the_bare_core_through_hundreds_of_steps_with_resets(tasks, num_calls):
     rows, twin = (tensor_rows(tasks, seed=3, first_row=2) for _ in range(2))
@@ -129,7 +131,9 @@ def test_a_checkpoint_of_another_batch_is_continued_as_there():
 
 
 @pytest.mark.parametrize(
-    "clone", [copy.deepcopy, lambda rows: pickle.loads(pickle.dumps(rows))], ids=["copy", "pickle"]
+    "clone",
+    [pytest.param(copy.deepcopy, marks=pytest.mark.slow), lambda rows: pickle.loads(pickle.dumps(rows))],
+    ids=["copy", "pickle"],
 )
 def test_a_clone_goes_on_as_its_original_and_neither_disturbs_the_other(clone):
     rows, twin = (tensor_rows(TASKS, seed=3) for _ in range(2))

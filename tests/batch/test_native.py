@@ -90,7 +90,7 @@ def test_every_call_of_compiled_rows_gives_the_bits_of_the_tensor_code(tasks):
     tasks = batch(tasks, 6)
     rows, twin = (Rows(tasks, seed=3, first_row=2, kernel=kernel) for kernel in ENGINES)
 
-    for number, (name, args) in enumerate(calls(60, len(tasks))):
+    for number, (name, args) in enumerate(calls(40, len(tasks))):
         expected, found = getattr(rows, name)(*args), getattr(twin, name)(*args)
 
         expected, found = ((one,) if isinstance(one, Tensor) else one for one in (expected, found))
@@ -126,7 +126,13 @@ def test_any_tasks_compiled_give_the_bits_of_the_tensor_code(tasks, seed):
     assert same(rows.state, twin.state)
 
 
-@pytest.mark.parametrize("switch", [ByEpisode(2), AtRandom(0.4), AtRandom(0.5, together=True)])
+@pytest.mark.parametrize(
+    "switch",
+    [
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (ByEpisode(2), AtRandom(0.4))),
+        AtRandom(0.5, together=True),
+    ],
+)
 def test_rows_that_change_their_tasks_give_the_same_data_compiled(switch):
     pool = [surjective(goal=(1, 2)), *MIXED]
     eager, compiled = (CTGraphEnv([pool[0]] * 20, task_pool=pool, kernel=kernel) for kernel in ENGINES)

@@ -89,7 +89,9 @@ def test_a_drift_draws_anew_for_every_episode_and_row():
         assert binomial_p_value(count, 6000, prob) >= ALPHA / 4
 
 
-@pytest.mark.parametrize(("switch", "share"), [(Drift(2, True), 0.5), (AtRandom(0.25, True), 0.25)])
+@pytest.mark.parametrize(
+    ("switch", "share"), [(AtRandom(0.25, True), 0.25), pytest.param(Drift(2, True), 0.5, marks=pytest.mark.slow)]
+)
 def test_together_all_rows_have_one_draw_with_the_same_chances(switch, share):
     rows, changed = switching(FORKS[:2], switch, 3), 0
 
@@ -102,7 +104,7 @@ def test_together_all_rows_have_one_draw_with_the_same_chances(switch, share):
     assert binomial_p_value(changed, 200, share) >= ALPHA
 
 
-@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("alone", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_together_draws_are_new_for_every_episode_even_where_the_first_row_has_but_one(alone):
     rows, starting = switching(FORKS[:2], AtRandom(0.5, True), 2, seed=1), torch.tensor([not alone, True])
     rows.reset()

@@ -29,6 +29,7 @@ def test_the_example_of_the_fast_path_learns_the_task(capsys):
     assert float(capsys.readouterr().out.split()[0]) >= 0.9
 
 
+@pytest.mark.slow
 def test_the_benchmark_prints_a_row_for_every_way(capsys):
     benchmark.main(["--rows", "2", "--tasks", "SU", "--rounds", "1", "--seconds", "0.001", "--skip-kernel"])
 

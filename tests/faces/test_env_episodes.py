@@ -81,7 +81,10 @@ def test_the_waiting_of_an_optimal_episode_is_as_long_as_e_rho(p):
     assert binomial_p_value(3 * rows, tries, 1 - p) >= ALPHA
 
 
-@pytest.mark.parametrize(("b", "d", "p"), [(2, 2, 0.0), (3, 2, 0.0), (2, 4, 0.5)])
+@pytest.mark.parametrize(
+    ("b", "d", "p"),
+    [(3, 2, 0.0), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((2, 2, 0.0), (2, 4, 0.5)))],
+)
 def test_a_navigation_policy_gets_the_reward_with_probability_b_to_the_minus_d(b, d, p):
     rows = 20_000
     env = CTGraphEnv([surjective(b, d, p, goal=(b,) * d)] * rows, seed=1, check_actions=False)

@@ -121,9 +121,10 @@ def test_neither_acting_nor_learning_needs_the_host(name, compose, captured, swa
     assert {value.device for step in measured for value in step.values()} == {META}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "cell"),
-    others_slow([("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("cell=gru",))], ("a2c", ())),
+    [("ppo", ()), ("a2c", ()), ("lstm_ppo", ()), ("lstm_ppo", ("cell=gru",))],
 )
 def test_neither_acting_nor_learning_of_several_seeds_needs_the_host(name, cell, compose, captured, swapped, request):
     env = CTGraphEnv([confounding(p=0.3)] * 48, kernel="off")
@@ -169,12 +170,13 @@ def test_a_gpu_estimates_the_advantages_that_a_cpu_estimates(name, compose, monk
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "boundaries"),
     [
-        pytest.param("ppo", "announced", marks=pytest.mark.slow),
-        pytest.param("ppo", "hidden", marks=pytest.mark.slow),
-        pytest.param("rl2", "hidden", marks=pytest.mark.slow),
+        ("ppo", "announced"),
+        ("ppo", "hidden"),
+        ("rl2", "hidden"),
         ("rl2", "announced"),
     ],
 )

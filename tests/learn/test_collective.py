@@ -105,6 +105,7 @@ class Unequal(L2D2C):
         super().observe(member, batch, 0.3 * (member + 1))
 
 
+@pytest.mark.slow
 def test_a_collective_is_resumed_from_any_state_as_if_it_had_never_stopped(make, tmp_path):
     def opened(folder) -> list[RunLog]:
         folder.mkdir()

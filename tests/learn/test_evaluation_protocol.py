@@ -198,7 +198,7 @@ def test_agents_learn_the_same_weights_with_and_without_evaluation(compose, name
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
-@pytest.mark.parametrize("boundaries", ["announced", "hidden"])
+@pytest.mark.parametrize("boundaries", ["hidden", pytest.param("announced", marks=pytest.mark.slow)])
 def test_training_data_are_the_same_with_and_without_evaluation(boundaries):
     blocks = (Block(task(wait_prob=0.5), 52), Block((TWO, task(wait_prob=0.9)), 48, Drift(2)))
     agents = [Scripted(decide(random_decision), num_steps=5) for _ in range(2)]

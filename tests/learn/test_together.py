@@ -94,7 +94,7 @@ alternating = decide(lambda data: 1 + data["step_count"].squeeze(-1) % 2)
 @pytest.mark.parametrize(
     "curriculum",
     [
-        of(Block(THREE, 48), Block(ONE, 72)),
+        pytest.param(of(Block(THREE, 48), Block(ONE, 72)), marks=pytest.mark.slow),
         of(Block(THREE, 48), Block(ONE, 72), boundaries="hidden", task_id="one_hot"),
         of(Block((ONE, THREE), 48), Block(TWO, 48)),
         of(Block((ONE, THREE), 96, ByEpisode(2)), Block(TWO, 40), boundaries="hidden"),
@@ -117,7 +117,7 @@ def test_with_given_actions_each_seed_has_the_trajectories_measurements_and_eval
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    others_slow(EACH, ("prioritized dqn", "finetune"), ("ppo", "ewc"), ("ppo", "mask_lc")),
+    others_slow(EACH, ("prioritized dqn", "finetune"), ("ppo", "mask_lc")),
 )
 def test_losses_and_gradients_of_the_first_update_in_each_task_are_those_of_a_run_alone(
     make, monkeypatch, name, method
@@ -178,9 +178,7 @@ def wide(value: torch.Tensor) -> torch.Tensor:
     return value.double() if value.is_floating_point() else value
 
 
-@pytest.mark.parametrize(
-    ("name", "method"), others_slow([*EACH[:2], *SOME, ("dqn", "finetune")], ("a2c", "finetune"), ("dqn", "finetune"))
-)
+@pytest.mark.parametrize(("name", "method"), others_slow([*EACH[:2], *SOME, ("dqn", "finetune")], ("a2c", "finetune")))
 def test_each_seed_ends_near_its_run_alone(make, name, method):
     soon = ["agent.target_update_interval=1"] * ("dqn" in name)  # within the first batch
     its = make(name, method, *soon, curriculum=ONE_BATCH_EACH)
@@ -194,7 +192,8 @@ def test_each_seed_ends_near_its_run_alone(make, name, method):
         assert first_training(log) == pytest.approx(first_training(its_log), rel=1e-4, abs=1e-5, nan_ok=True)
 
 
-@pytest.mark.parametrize(("name", "method"), others_slow(SOME[::3], ("a2c", "mask_lc")))
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "method"), SOME[::3])
 def test_seeds_act_by_a_graph_of_the_operations_of_their_networks_as_they_are(make, monkeypatch, name, method):
     act, compared = SeedGroup._act, []
 
@@ -328,7 +327,8 @@ def spoil(monkeypatch, numbers=(1,)) -> None:
     monkeypatch.setattr(SeedGroup, "learn", spoiled)
 
 
-@pytest.mark.parametrize(("name", "method"), others_slow([("a2c", "finetune"), *SOME[1:]], ("a2c", "finetune")))
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "method"), [("a2c", "finetune"), *SOME[1:]])
 def test_a_seed_that_is_not_finite_fails_alone_and_changes_no_bit_of_another(make, monkeypatch, tmp_path, name, method):
     its, kept = make(name, method), []
     group, logs = its.learn()

@@ -141,6 +141,7 @@ def peak(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_memory_grows_as_the_files_that_are_read_and_written(tmp_path):
     def shares(count: int) -> list[float]:
         log, each = logged(curriculum(count)), curriculum(count)

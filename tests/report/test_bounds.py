@@ -64,7 +64,7 @@ def test_no_end_state_pays_more_or_less_than_the_reward_says(reward_fn, branchin
         assert low <= paid.min() and paid.max() <= high
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 2.0)])
+@pytest.mark.parametrize(("low", "high"), [pytest.param(0.0, 1.0, marks=pytest.mark.slow), (-1.0, 2.0)])
 def test_no_metric_of_any_matrix_or_curve_is_outside_of_what_it_says(low, high):
     generator = torch.Generator().manual_seed(0)
     known = Known(low, high, tasks=3, evaluations=6, failure_is_lowest=True)

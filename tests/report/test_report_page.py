@@ -167,6 +167,7 @@ def test_the_page_needs_nothing_from_elsewhere(whole):
     assert "<script" not in html and "url(" not in html and "@import" not in html
 
 
+@pytest.mark.slow
 def test_a_run_without_weights_says_so_and_trees_are_drawn_without_a_policy(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "OF_SECTION", ())
     monkeypatch.setattr(page, "OF_AGENT", (task_trees,))
@@ -239,7 +240,8 @@ def run_of(path, tasks):
     return write_run(path, labels=[f"goal{task}" for task in range(tasks)], performance=performance)
 
 
-@pytest.mark.parametrize("tasks", [1, *(pytest.param(tasks, marks=pytest.mark.slow) for tasks in (12, 40))])
+@pytest.mark.slow
+@pytest.mark.parametrize("tasks", [1, 12, 40])
 def test_any_number_of_tasks_has_its_figures(tmp_path, tasks):
     html, _, _ = written(tmp_path / "out", run_of(tmp_path / "run", tasks))
 

@@ -101,7 +101,7 @@ def learned_again(agent, curriculum: Curriculum) -> list[dict]:
     return [{**m, "seconds": 0} for m in learn_curriculum(curriculum, agent).measurements]
 
 
-@pytest.mark.parametrize("name", others_slow(METHODS, "mas", "mask_blc"))
+@pytest.mark.parametrize("name", others_slow(METHODS, "mask_blc"))
 def test_an_agent_comes_back_with_its_method_to_play_every_task_and_to_learn_on(compose, tmp_path, name):
     method = OmegaConf.to_container(compose(f"method={name}").method)
     agent = learn_with(method | ({"heads": "multi"} if "heads" in method else {}), tmp_path)

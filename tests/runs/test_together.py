@@ -115,9 +115,10 @@ def test_a_group_of_an_older_numbers_version_is_noticed_where_a_run_alone_has_no
     assert code_changes({"numbers": 1, "together": [0, 1]}, now) == ["ctgraph_rl (numbers version 1 before, 2 now)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "finished", "others"),
-    [("finetune", [1], []), pytest.param("ewc", [1, 2], [3, 4], marks=pytest.mark.slow)],
+    [("finetune", [1], []), ("ewc", [1, 2], [3, 4])],
 )
 def test_a_stopped_group_is_resumed_as_a_group_bit_by_bit_and_not_otherwise(
     monkeypatch, capsys, together, method, finished, others
@@ -339,6 +340,7 @@ def groups(folder: str = "experts") -> list[list[int] | None]:
     return [first_line(expert).get("together") for expert in experts(folder)]
 
 
+@pytest.mark.slow
 def test_experts_of_a_group_are_trained_as_a_group_like_those_alone_up_to_rounding(monkeypatch):
     assert sweep(monkeypatch, "seed=0,1", "together=true", *EXPERTS) == 0
     train_experts(jobs(0))

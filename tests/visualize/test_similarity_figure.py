@@ -13,7 +13,7 @@ from ctgraph_rl.visualize.similarity_figure import draw_similarity
 GOALS = [(1, 1), (1, 2), (2, 2)]
 
 
-@pytest.mark.parametrize("num_tasks", [1, pytest.param(3, marks=pytest.mark.slow), 41])
+@pytest.mark.parametrize("num_tasks", [1, *(pytest.param(num, marks=pytest.mark.slow) for num in (3, 41))])
 def test_the_heat_maps_are_drawn_for_few_and_many_tasks(tmp_path, num_tasks):
     blocks = tuple(Block(surjective(goal=GOALS[i % 3], image_seed=i), 1) for i in range(num_tasks))
 

@@ -200,7 +200,7 @@ def test_a_buffer_that_holds_no_whole_row_is_refused_where_rows_are_replayed(com
 # Runs
 
 
-ENOUGH = ("cka_rl", "clear", "ewc", "mask_lc", "multitask", "packnet")
+ENOUGH = ("cka_rl", "clear", "ewc", "packnet")
 """A method of each family."""
 
 
@@ -325,7 +325,7 @@ def test_fine_tuning_is_the_agent_itself(compose, agent):
     assert made(compose, "method", "finetune")().attach(alone, CURRICULUM) is alone
 
 
-@pytest.mark.parametrize("agent", others_slow(AGENTS, "a2c", "dqn"))
+@pytest.mark.parametrize("agent", others_slow(AGENTS, "a2c"))
 def test_the_hooks_of_no_method_change_no_bit(compose, agent):
     alone = life(compose, agent, "finetune")
     attached = Life(alone.curriculum, lambda *specs: Method().attach(alone.make_agent(*specs), alone.curriculum))

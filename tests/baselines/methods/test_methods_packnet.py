@@ -20,7 +20,7 @@ def packed(compose, agent: str = "ppo", retrain: float = 0.5) -> tuple[AgentWith
     return with_method(compose, agent, method), method
 
 
-@pytest.mark.parametrize("agent", ["dqn", "lstm_ppo"])
+@pytest.mark.parametrize("agent", ["dqn", pytest.param("lstm_ppo", marks=pytest.mark.slow)])
 def test_each_task_keeps_an_equal_share_of_every_weight_matrix(compose, agent):
     attached, method = packed(compose, agent)
     for number in range(3):

@@ -60,7 +60,7 @@ def after(method: Any, *embeddings: torch.Tensor, number: int | None = None) -> 
 # What a selection changes
 
 
-@pytest.mark.parametrize(("selection", "twin"), [("all", MaskLC), ("none", MaskRI)])
+@pytest.mark.parametrize(("selection", "twin"), [("all", MaskLC), pytest.param("none", MaskRI, marks=pytest.mark.slow)])
 def test_all_selected_is_mask_lc_and_none_is_mask_ri_bit_by_bit(compose, selection, twin):
     attached = with_method(compose, "a2c", sc(selection=selection))
     other = with_method(compose, "a2c", twin())

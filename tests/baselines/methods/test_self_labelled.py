@@ -111,8 +111,8 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "agent"),
     [
-        *(("ewc", "ppo"), ("mask_lc", "ppo")),
-        *(pytest.param(method, "ppo", marks=SLOW) for method in OTHERS),
+        ("ewc", "ppo"),
+        *(pytest.param(method, "ppo", marks=SLOW) for method in ("mask_lc", *OTHERS)),
         *(pytest.param("mas", agent, marks=SLOW) for agent in ("dqn", "lstm_ppo")),
     ],
 )

@@ -9,6 +9,8 @@ from statistics import fmean
 import pytest
 from helpers.paths import CHECKOUT
 
+pytestmark = pytest.mark.slow
+
 FOLDER = CHECKOUT / "docs" / "results"
 PAGE = " ".join((FOLDER / "lifelong.md").read_text(encoding="utf-8").split())
 METHODS = ("finetune", "mask_lc", "ewc_published", "mask_ri", "mask_blc")
@@ -42,7 +44,6 @@ def by_curriculum():
     }
 
 
-@pytest.mark.slow
 def test_in_short_says_on_which_curricula_the_papers_claims_hold(by_curriculum):
     masks, short = [m for m in METHODS if "mask" in m], PAGE[: PAGE.index("Cells are means")]
 
@@ -61,7 +62,6 @@ def values(measured):
     return lambda table, epochs, method, column: [scores[column] for scores in measured[table, epochs, method]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("table", TABLES)
 def test_a_line_has_both_columns_for_8_epochs_and_for_one(values, table, method):

@@ -320,7 +320,7 @@ EVALUATIONS = st.builds(
 ).filter(lambda how: how.at_block_ends or how.tasks == "all")  # else nothing may ever be evaluated
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.text(min_size=1), st.integers(1, 99), st.text(), BLOCKS, EVALUATIONS)
 def test_random_curricula_come_back_from_json(name, version, source, blocks, evaluation):
     curriculum = Curriculum(name, version, source, blocks, evaluation)
