@@ -1,0 +1,47 @@
+"""How long pages are: in all, each, and the running text of a page of results."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from helpers.paths import CHECKOUT, sources
+
+CODE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+FOLD = re.compile(r"<details>.*?</details>", re.DOTALL)
+ROW = re.compile(r"^\s*\|.*$", re.MULTILINE)
+
+
+def prose(path: Path) -> str:
+    """A page, or the Markdown of a notebook, without its code blocks."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        text = "\n\n".join("".join(c["source"]) for c in json.loads(text)["cells"] if c["cell_type"] == "markdown")
+    return CODE.sub("", text)
+
+
+def words(text: str, of: str = "[A-Za-z]") -> int:
+    return sum(re.search(of, each) is not None for each in text.split())
+
+
+PAGES = {
+    path.relative_to(CHECKOUT).as_posix(): prose(path)
+    for path in sources((".md", ".ipynb"))
+    if path.is_relative_to(CHECKOUT / "docs") and not {"templates", "board"} & {*path.parts}
+}
+
+
+def test_all_pages_together_have_at_most_50_000_words_and_numbers():
+    assert len(PAGES) > 70
+    assert sum(words(text, "[A-Za-z0-9]") for text in PAGES.values()) <= 50_000
+
+
+def test_a_page_has_at_most_2_500_words_and_a_page_of_results_1_200_outside_of_tables_and_folds():
+    running = {
+        name: ROW.sub("", FOLD.sub("", text)) for name, text in PAGES.items() if name.startswith("docs/results/")
+    }
+
+    assert len(running) > 7
+    assert {name: words(text) for name, text in PAGES.items() if words(text) > 2500} == {}
+    assert {name: words(text) for name, text in running.items() if words(text) > 1200} == {}
