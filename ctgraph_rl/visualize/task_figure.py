@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,8 @@ ROOM, ROOM_FOR_NUMBERS = 30.0, 50.0
 MOST_WAIT_LEVELS = 6
 """Depth up to which wait states are drawn in a tree that is not drawn whole."""
 LARGEST_MARK = 24.0
+LEGEND_WIDTH = 5.5
+"""Inches of a legend in one line."""
 SMALLEST_TEXT = 4.0
 INITIALS = {kind: kind.name[0] for kind in StateType}
 GREY = "0.65"
@@ -272,7 +275,7 @@ class _TaskPicture:
             marks.append(Line2D([], [], label="stays with p", markersize=6, **RING))
         self.axes.legend(
             handles=marks,
-            ncols=len(marks),
+            ncols=math.ceil(len(marks) / math.ceil(LEGEND_WIDTH / self._room())),
             loc="upper center",
             bbox_to_anchor=(0.5, 0.02),
             fontsize=7,
@@ -282,6 +285,11 @@ class _TaskPicture:
             handletextpad=0.3,
             columnspacing=1.0,
         )
+
+    def _room(self) -> float:
+        """Return the inches of the figure that the axes have, beside others."""
+        spec = self.axes.get_subplotspec()
+        return float(self.axes.figure.get_figwidth() / (1 if spec is None else spec.get_gridspec().ncols))
 
     def _meaning(self) -> str:
         """Return the meaning of numbers and widths."""

@@ -24,6 +24,7 @@ from ctgraph_rl.tasks.configurations import ct_co_b1, ct_fo_b1, ct_fo_b2, ct_su_
 from ctgraph_rl.tasks.images import ImageFile
 from ctgraph_rl.visualize.draw import main
 from ctgraph_rl.visualize.image_figure import image_figure
+from ctgraph_rl.visualize.style import new_figure
 from ctgraph_rl.visualize.task_figure import draw_task, task_figure
 from ctgraph_rl.visualize.visits import visits
 
@@ -196,6 +197,17 @@ def test_a_small_panel_leaves_numbers_out():
 
     assert axes.get_legend() is None
     assert [text.get_text() for text in axes.texts if ":" in text.get_text()] == []
+
+
+def test_the_legend_of_a_tree_fits_a_figure_of_one_column():
+    figure = new_figure(3.5, 4)
+    axes = figure.subplots()
+
+    draw_task(axes, ct_su_b1())
+    figure.canvas.draw()
+
+    box = axes.get_legend().get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
 def test_the_images_of_each_kind_of_state_are_shown():
