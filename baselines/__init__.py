@@ -30,7 +30,7 @@ MOVED = {
     "baselines.methods.self_labelled": "baselines.methods.parts.self_labelled",
     "baselines.methods.weights": "baselines.methods.parts.weights",
     "baselines.networks": "baselines.parts.networks",
-    "baselines.optimisers": "baselines.update.optimiser",
+    "baselines.optimisers": "baselines.update.update",
     "baselines.policy_gradient": "baselines.parts.policy_gradient",
     "baselines.prioritized": "baselines.parts.prioritized",
     "baselines.q_learning": "baselines.parts.q_learning",
@@ -38,6 +38,7 @@ MOVED = {
     "baselines.stack": "baselines.update.stack",
     "baselines.together": "baselines.update.seeds",
     "baselines.transport": "baselines.parts.transport",
+    "baselines.update.optimiser": "baselines.update.update",
 }
 """Former names of modules, and where these are now."""
 

@@ -67,18 +67,18 @@ class DQN(QLearner):
             *not_negative(priority_alpha=priority_alpha),
             *at_most(LARGEST_ALPHA, priority_alpha=priority_alpha),
         )
-        require_weights(observation_spec, hidden_size, 2, num_actions_of(action_spec))
+        num_actions = num_actions_of(action_spec)
+        require_weights(observation_spec, hidden_size, 2, num_actions)
         require_replay(observation_spec, settings["buffer_size"], settings["batch_size"])
         self.priority_alpha = priority_alpha
         self.priority_beta = priority_beta
         self.gamma = gamma
         super().__init__(gamma=gamma, **settings)
-        layers = [
+        head = nn.Sequential(
             linear_layer(hidden_size, hidden_size),
             nn.ReLU(),
-            linear_layer(hidden_size, num_actions_of(action_spec)),
-        ]
-        head = nn.Sequential(*layers)
+            linear_layer(hidden_size, num_actions),
+        )
         values = TensorDictModule(head, in_keys=["features"], out_keys=["action_value"])
         features = make_encoder(observation_spec, hidden_size, kind=encoder)
         self.greedy = QValueActor(TensorDictSequential(features, values), in_keys=features.in_keys, spec=action_spec)

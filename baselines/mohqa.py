@@ -32,7 +32,6 @@ from torch.func import functional_call
 from torch.nn.functional import one_hot
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule
-from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import linear_layer
 from baselines.parts.networks import (
@@ -46,7 +45,7 @@ from baselines.parts.networks import (
     require_weights,
 )
 from baselines.parts.networks import encoder as make_encoder
-from baselines.parts.q_learning import QLearner, require_replay
+from baselines.parts.q_learning import QLearner, WithTarget, require_replay
 from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, positive, require, true_or_false
 
 STATE = ("eligibility", "average", "trial")
@@ -197,20 +196,15 @@ class ModulatedGreedy(TensorDictModuleBase):
         return self.noise_std * torch.randn_like(features) * (torch.rand_like(features) < self.noise_share)
 
 
-class Target(LossModule):
+class Target(WithTarget):
     """A Q-network and its target network.
 
     Args:
         network: a sequence of trunk and head.
     """
 
-    value_network: TensorDictSequential
-    value_network_params: TensorDictBase
-    target_value_network_params: TensorDictBase
-
     def __init__(self, network: TensorDictSequential) -> None:
-        super().__init__()
-        self.convert_to_functional(network, "value_network", create_target_params=True)
+        super().__init__(network)
         self.in_keys = network.in_keys
         self.out_keys = ["features", "action_value"]
 

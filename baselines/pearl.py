@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import deepcopy
 from functools import partial
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -37,10 +36,10 @@ from torchrl.data import Composite, TensorSpec
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.inner_loop import NetInputs
 from baselines.parts.learner import MOST_PASSES, Learner
-from baselines.parts.networks import Data, draw, entropy, guided, is_greedy, num_actions_of
+from baselines.parts.networks import Data, Items, TensorsByName, draw, entropy, guided, is_greedy, num_actions_of
 from baselines.parts.q_learning import require_replay
-from baselines.update.optimiser import make_optimiser
-from ctgraph_rl.checks import at_least_one, at_most, fraction, not_negative, one_of, positive, require
+from baselines.update.update import make_optimiser
+from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, not_negative, one_of, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
 
 SMALLEST_VARIANCE = 1e-7
@@ -80,8 +79,11 @@ class PosteriorPolicy(TensorDictModuleBase):
         self, actor: GatedNetwork, encoder: GatedNetwork, seen_keys: list[str], num_actions: int, trial_episodes: int
     ) -> None:
         super().__init__()
-        self.actor, self.encoder = actor, encoder
-        self.seen_keys, self.num_actions, self.trial_episodes = seen_keys, num_actions, trial_episodes
+        self.actor = actor
+        self.encoder = encoder
+        self.seen_keys = seen_keys
+        self.num_actions = num_actions
+        self.trial_episodes = trial_episodes
         self.kept_keys = [f"{UNSTORED}{key}" for key in seen_keys]
         state = ["trial", ACTION, PRECISION, WEIGHTED, CONTEXT, *self.kept_keys]
         self.in_keys = [*seen_keys, "is_init", "reward", *state]
@@ -223,7 +225,7 @@ class PEARL(Learner):
         self.critics = nn.ModuleList([network(num_context, num_actions, gate="none") for _ in range(2)])
         self.targets = deepcopy(self.critics).requires_grad_(False)
         self.optimiser = make_optimiser("adam", [*self.policy.parameters(), *self.critics.parameters()], learning_rate)
-        self.replay: dict[Any, Tensor] = {}
+        self.replay: Items = {}
         """The last steps of all rows, [rows, steps] each, and whether a trial ``begins`` there."""
 
     def initial_state(self, num_envs: int) -> TensorDict:
@@ -236,7 +238,7 @@ class PEARL(Learner):
             state[f"{UNSTORED}{key}"] = torch.zeros(num_envs, *spec.shape, dtype=spec.dtype, device=like.device)
         return TensorDict(state, batch_size=[num_envs])
 
-    def minibatches(self, batch: TensorDictBase) -> Iterator[dict[Any, Tensor]]:
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Items]:
         """Store a batch, and yield steps of trials, [num_trials, batch_size], each with a context of its trial."""
         self._store(batch)
         begins = self.replay["begins"]
@@ -265,13 +267,13 @@ class PEARL(Learner):
             kept[key] = torch.cat(steps, dim=1)[:, -self.kept_steps :].contiguous()
         self.replay = kept
 
-    def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> dict[Any, Tensor]:
+    def _steps(self, row: Tensor, first: Tensor, last: Tensor, number: int) -> Items:
         """Draw steps of trials with replacement, [num_trials, number]; row, first and last are [num_trials, 1]."""
         share = torch.rand(len(row), number, dtype=torch.float32, device=row.device)
         step = (first + (share * (last + 1 - first)).long()).minimum(last)
         return {key: value[row, step] for key, value in self.replay.items() if key != "begins"}
 
-    def loss(self, batch: Data) -> dict[str, Tensor]:
+    def loss(self, batch: Data) -> TensorsByName:
         """Compute the losses of what `minibatches` yields."""
         mean, variance = self.posterior(batch)
         context = (mean + variance.sqrt() * batch["noise"]).unsqueeze(1).expand(-1, batch["action"].shape[1], -1)
@@ -303,7 +305,7 @@ class PEARL(Learner):
         return gaussian(precision.sum(dim=1), weighted.sum(dim=1))
 
     @torch.no_grad()
-    def after_update(self, measured: dict[str, Tensor]) -> dict[str, Tensor]:
+    def after_update(self, measured: TensorsByName) -> TensorsByName:
         """Let the target critics follow."""
         for target, online in zip(self.targets.parameters(), self.critics.parameters(), strict=True):
             target.lerp_(online, self.target_rate)
@@ -313,11 +315,11 @@ class PEARL(Learner):
         """Copy the weights to the target critics."""
         self.targets.load_state_dict(self.critics.state_dict())
 
-    def get_extra_state(self) -> dict[str, Any]:
+    def get_extra_state(self) -> NamedValues:
         """Return the optimiser's state and replay."""
         return {**super().get_extra_state(), "replay": self.replay}
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
+    def set_extra_state(self, state: NamedValues) -> None:
         """Restore what `get_extra_state` returned."""
         super().set_extra_state(state)
         self.replay = state["replay"]

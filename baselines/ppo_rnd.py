@@ -34,7 +34,7 @@ from baselines.parts.learner import reset_layer
 from baselines.parts.networks import Data, Items, TensorsByName, critic, encoder, highest
 from baselines.parts.policy_gradient import generalized_advantages
 from baselines.ppo import PPO
-from baselines.update.optimiser import make_optimiser
+from baselines.update.update import make_optimiser
 from ctgraph_rl.checks import NamedValues, at_least_one, fraction, not_negative, positive, require, require_memory
 
 LARGEST_INPUT = 5.0

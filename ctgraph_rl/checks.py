@@ -111,13 +111,18 @@ def is_int(value: object, low: float = -math.inf, high: float = math.inf) -> boo
 
 
 def are_ints(value: object, low: float = -math.inf, high: float = math.inf) -> bool:
-    """True for a list of what `is_int` is true for."""
-    return isinstance(value, list) and all(is_int(each, low, high) for each in value)
+    """True for a list or a tuple of what `is_int` is true for."""
+    return isinstance(value, (list, tuple)) and all(is_int(each, low, high) for each in value)
 
 
 def repeated(values: Iterable[T]) -> list[T]:
     """Return the values that are there more than once, each once."""
     return [value for value, count in Counter(values).items() if count > 1]
+
+
+def by_name(*named: Any) -> dict[str, Any]:
+    """Return functions or classes by their names."""
+    return {each.__name__: each for each in named}
 
 
 def is_real(value: object, low: float = -math.inf, high: float = math.inf) -> bool:

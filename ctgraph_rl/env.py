@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ctgraph_rl.batch.assignment import checked_num_ids
+from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.native import Stepped
 from ctgraph_rl.batch.render import render
 from ctgraph_rl.batch.rows import Rows
@@ -372,7 +372,7 @@ class CTGraphEnv(EnvBase):
         task, shown = self._task_id
         if task is not self.rows.task:
             ids = self._id_of_task.index_select(0, self.rows.task)
-            shown = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
+            shown = one_hot_ids(ids, self.num_task_ids)
             self._task_id = self.rows.task, shown
         return shown
 

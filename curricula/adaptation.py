@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ctgraph_rl.checks import at_least_one, is_int, require, takes_numbers
+from ctgraph_rl.checks import at_least_one, by_name, is_int, require, takes_numbers
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot, PaperImages
@@ -183,5 +183,5 @@ def _longest_episode(depth: int) -> int:
     return 2 * depth + 3
 
 
-NAMED = {f.__name__: f for f in (dick2020_pair, goal_search, nm_uniform_goals, penn_a_swap, swoks_2x4)}
+NAMED = by_name(dick2020_pair, goal_search, nm_uniform_goals, penn_a_swap, swoks_2x4)
 """The curricula of this module by name."""

@@ -15,7 +15,7 @@ from functools import partial
 from math import prod
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, is_int, require, require_all, takes_numbers
+from ctgraph_rl.checks import NamedValues, as_tuple, is_int, require, require_all, takes_numbers
 from ctgraph_rl.core.graph import CTGraph, StateType
 from ctgraph_rl.tasks.configurations import OBSERVABILITY as OBSERVABILITY
 from ctgraph_rl.tasks.configurations import observations_of
@@ -313,8 +313,10 @@ def _random_task(choices: Sequence[Sequence[Any]], source: random.Random) -> Tas
 
 
 def _shifted(observations: Observations, shift: int, kinds: Sequence[str]) -> Observations:
-    ranges = {kind: observations.ids(StateType[kind.upper()]) for kind in kinds}
-    ids: dict[str, Any] = {f"{kind}_ids": (first + shift, last + shift) for kind, (first, last) in ranges.items()}
+    ids: NamedValues = {}
+    for kind in kinds:
+        first, last = observations.ids(StateType[kind.upper()])
+        ids[f"{kind}_ids"] = first + shift, last + shift
     return replace(observations, **ids)
 
 

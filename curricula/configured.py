@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ctgraph_rl.checks import as_tuple, at_least_one, is_int, require, takes_its_kinds
+from ctgraph_rl.checks import are_ints, as_tuple, at_least_one, is_int, require, takes_its_kinds
 from ctgraph_rl.core.rewards import Gradient, Needle, RewardFn
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.images import OneHot
@@ -171,7 +171,7 @@ def _deepest(
     """The configured task on its deepest graph, and all depths."""
     task = configured(configuration)
     depths = _several(task.graph.depth if depth is None else depth)
-    whole = bool(depths) and all(is_int(d, 1) for d in depths)
+    whole = bool(depths) and are_ints(depths, 1)
     require((whole, f"depth must be an integer >= 1 or a list of them, got {depth!r}"))
     b = task.graph.branching_factor if branching_factor is None else branching_factor
     graph = replace(task.graph, branching_factor=b, depth=max(depths))

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import by_name, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.kinds.gym_task import GymTask
 from ctgraph_rl.tasks.protocol import Block, Evaluation
@@ -104,5 +104,5 @@ def minigrid_3tasks(num_frames: int = 102_400) -> Curriculum:
 NEEDS = {"minigrid_3tasks": "minigrid"}
 """The packages of extras that curricula need."""
 
-NAMED = {each.__name__: each for each in (frozen_lake_4maps, cartpole_3lengths, minigrid_3tasks)}
+NAMED = by_name(frozen_lake_4maps, cartpole_3lengths, minigrid_3tasks)
 """Curricula by name."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import by_name, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from curricula.order import sequence
 from curricula.published import labelled, one_wait_image, pool_ids, words
@@ -79,5 +79,5 @@ def _curriculum(name: str, source: str, listing: str, ids: Sequence[int], num_id
     return labelled(name, source, tasks, ids=ids, num_task_ids=num_ids, num_frames=num_frames)
 
 
-NAMED = {f.__name__: f for f in (ct2_interfering, ct8, ct8_md, ct12, single_task)}
+NAMED = by_name(ct2_interfering, ct8, ct8_md, ct12, single_task)
 """The curricula of this module by name."""

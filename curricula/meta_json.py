@@ -19,7 +19,7 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as short
 
-from ctgraph_rl.checks import NamedValues, Rule, is_int, require, takes_numbers
+from ctgraph_rl.checks import NamedValues, Rule, are_ints, is_int, require, takes_numbers
 from ctgraph_rl.disk import read_regular
 from ctgraph_rl.strict import json_value
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -219,5 +219,5 @@ def _int_rule(key: str, value: object, most: float = float("inf")) -> Rule:
 
 
 def _ints_rule(key: str, value: object) -> Rule:
-    holds = isinstance(value, list) and 1 <= len(value) <= MOST_TASKS and all(is_int(number, 0) for number in value)
+    holds = isinstance(value, list) and 1 <= len(value) <= MOST_TASKS and are_ints(value, 0)
     return holds, f"{key} must be a list of 1 to {MOST_TASKS} integers >= 0, got {short(value)}"

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 
-from ctgraph_rl.checks import require
+from ctgraph_rl.checks import by_name, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation
 from curricula.published import MASK_EVALUATION, chosen, labelled, one_wait_image, pool_ids, words
@@ -231,5 +231,5 @@ def _curriculum(
 _SKIPPING_D5 = (ct28_blocked_skips_d5, ct28_interleaved_skips_d5, ct28_mosaic_skips_d5, ct28_random_skips_d5)
 _SINGLE = (ct8_interleaved, ct10, ct14_half_1, ct14_half_2, ct14_md, ct28, ct28_one_branch, ct29_recovery)
 _TWO_FAMILIES = (ct20, mosaic_ladder)
-NAMED = {f.__name__: f for f in (*_SKIPPING_D5, *_SINGLE, *_TWO_FAMILIES)}
+NAMED = by_name(*_SKIPPING_D5, *_SINGLE, *_TWO_FAMILIES)
 """The curricula of this module by name."""

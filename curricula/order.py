@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, zip_longest
 
 from ctgraph_rl.checks import as_tuple, is_int, require, require_all, takes_numbers
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -31,7 +31,7 @@ def as_tasks(tasks: OneOrMore) -> Tasks:
 
 def each(tasks: OneOrMore, vary: Callable[[Task], Iterable[Task]]) -> Tasks:
     """Return the variations of each task, those of the first task first."""
-    return tuple(varied for task in as_tasks(tasks) for varied in vary(task))
+    return tuple(chain.from_iterable(map(vary, as_tasks(tasks))))
 
 
 def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
@@ -44,7 +44,7 @@ def product(tasks: OneOrMore, *axes: Axis) -> Tasks:
 
 def concatenate(*sequences: OneOrMore) -> Tasks:
     """One sequence after the other."""
-    return tuple(task for tasks in sequences for task in as_tasks(tasks))
+    return tuple(chain.from_iterable(map(as_tasks, sequences)))
 
 
 def interleave(*sequences: OneOrMore) -> Tasks:
@@ -56,22 +56,26 @@ def interleave(*sequences: OneOrMore) -> Tasks:
         >>> [task.goal for task in interleave((a, b), c)]
         [(1, 1), (2, 1), (1, 2)]
     """
-    rounds = itertools.zip_longest(*map(as_tasks, sequences))
-    return tuple(task for turn in rounds for task in turn if task is not None)
+    rounds = zip_longest(*map(as_tasks, sequences))
+    return tuple(filter(None, chain.from_iterable(rounds)))
 
 
 @takes_numbers
 def repeat(tasks: OneOrMore, times: int) -> Tasks:
     """Each task several times in a row: A A B B."""
-    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+    _check_times(times)
     return each(tasks, lambda task: [task] * times)
 
 
 @takes_numbers
 def cycle(tasks: OneOrMore, times: int) -> Tasks:
     """The whole sequence several times: A B A B."""
-    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
+    _check_times(times)
     return as_tasks(tasks) * times
+
+
+def _check_times(times: object) -> None:
+    require((is_int(times, 1, MOST_TASKS), f"times must be an integer >= 1, got {times!r}"))
 
 
 @takes_numbers

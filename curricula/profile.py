@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from ctgraph_rl.checks import NamedValues, by_name
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.tasks.configurations import OBSERVABILITY, ct_graph, observations_of
 from ctgraph_rl.tasks.curriculum import Curriculum
@@ -166,7 +167,7 @@ class Property(NamedTuple):
 
     title: str
     measure: str
-    arguments: dict[str, Any]
+    arguments: NamedValues
 
 
 PROPERTIES = {
@@ -183,19 +184,16 @@ PROPERTIES = {
 }
 """The properties in the order of the paper, by their curricula. A measure counts tasks from 0."""
 
-NAMED = {
-    f.__name__: f
-    for f in (
-        profile_observability,
-        profile_memory,
-        profile_sparsity,
-        profile_adaptation,
-        profile_similarity,
-        profile_hierarchy,
-        profile_attention,
-        profile_exploration,
-        profile_model,
-        profile_innate,
-    )
-}
+NAMED = by_name(
+    profile_observability,
+    profile_memory,
+    profile_sparsity,
+    profile_adaptation,
+    profile_similarity,
+    profile_hierarchy,
+    profile_attention,
+    profile_exploration,
+    profile_model,
+    profile_innate,
+)
 """The curricula of this module by name."""

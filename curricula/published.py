@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import NamedValues, is_int, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Evaluation, Protocol
 from ctgraph_rl.tasks.task import Task
@@ -35,7 +35,7 @@ def environment(
     fail_reward: float = 0.0,
     unique: tuple[bool, bool] = (True, True),
     one_hot: bool = False,
-) -> dict[str, Any]:
+) -> NamedValues:
     """A configuration file as the labs have them: b=2, p=0, one goal, reward 1, no noise; ids are consecutive.
 
     Args:

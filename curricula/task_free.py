@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
-from ctgraph_rl.checks import at_least_one, one_of, require
+from ctgraph_rl.checks import at_least_one, by_name, one_of, require
 from ctgraph_rl.tasks.configurations import ct_fo_b1
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.protocol import Block, Protocol
@@ -96,5 +96,5 @@ def _tasks(differ: str, image_seed: int) -> list[Task]:
     return shown if differ == "inputs" else [replace(s, goal=g.goal) for s, g in zip(shown, goals, strict=True)]
 
 
-NAMED = {f.__name__: f for f in (task_free_abrupt, task_free_gradual, task_free_recurring)}
+NAMED = by_name(task_free_abrupt, task_free_gradual, task_free_recurring)
 """The curricula of this module by name."""

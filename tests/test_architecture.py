@@ -102,15 +102,13 @@ MODULES_OF_ONE_NAME = {
     "memory": "bytes of images, and sequences that need a memory",
     "method": "what methods derive from, and the facts of a submitted one",
     "page": "of the board and of a report",
-    "rules": "of a track and of learning",
     "seeds": "as one batch: the learners, and the runs",
-    "segments": "of a batch between episodes: for cells, and for the loop",
     "style": "of figures: of reports in print, and of pictures of tasks",
     "tables": "of the board, and of a log",
 }
 """Names of several modules, each said after its folder, and why."""
 
-ANY_NUMBER = ("require", "groups")
+ANY_NUMBER = ("require", "groups", "by_name")
 """Functions whose arguments are alike, and as many as there are."""
 
 NOT_IN_KERNEL: dict[str, str] = {}

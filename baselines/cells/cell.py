@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ctgraph_rl.checks import TakesNumbers, require, true_or_false
+from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.core.kernel import is_traced
 
 CellState = tuple[Tensor, ...]
@@ -59,11 +60,12 @@ class Cell(TakesNumbers, nn.Module):
         require(*true_or_false(reads_action=reads_action, reads_reward=reads_reward))
         self.own_keys = (PREVIOUS_ACTION,) * reads_action + (REWARD,) * reads_reward
         self.num_inputs = num_features + num_actions * reads_action + reads_reward
-        self.num_outputs, self.num_actions = num_outputs, num_actions
+        self.num_outputs = num_outputs
+        self.num_actions = num_actions
 
     def zeros(self, num_rows: int) -> CellState:
-        """Return the state at the start of an episode, which is zero, [num_rows, ...] each."""
-        return ()
+        """Return the state at the start of an episode, which is zero: of each key [num_rows, num_outputs] here."""
+        return tuple(zeros_like_weights(self, num_rows, self.num_outputs) for _ in self.state_keys)
 
     def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """Compute the outputs, [rows, num_outputs], and the next state from inputs, [rows, num_inputs], and a state."""
@@ -127,7 +129,7 @@ def episodes_of(starts: Tensor) -> Tensor:
 
 def reset(state: Sequence[Tensor], starts: Tensor) -> CellState:
     """Return a state that is zero in the rows where an episode starts, bool [rows]."""
-    return tuple(torch.where(starts.view(-1, *[1] * (value.ndim - 1)), 0.0, value) for value in state)
+    return tuple(torch.where(beside(starts, value), 0.0, value) for value in state)
 
 
 def zeros_like_weights(cell: nn.Module, *shape: int) -> Tensor:

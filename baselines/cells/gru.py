@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from baselines.cells.cell import Cell, CellState, zeros_like_weights
-from baselines.cells.segments import segments
+from baselines.cells.cell import Cell, CellState
+from baselines.cells.packed import segments
 from ctgraph_rl.core.kernel import is_traced
 
 
@@ -22,10 +22,6 @@ class GRU(Cell):
     def __init__(self, num_features: int, num_outputs: int, num_actions: int, **reads: bool) -> None:
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.gru = nn.GRU(self.num_inputs, num_outputs, batch_first=True, dtype=torch.float32, device="cpu")
-
-    def zeros(self, num_rows: int) -> CellState:
-        """Return zeros, [num_rows, num_outputs]."""
-        return (zeros_like_weights(self, num_rows, self.num_outputs),)
 
     def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""

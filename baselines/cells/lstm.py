@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from baselines.cells.cell import Branches, Cell, CellState, can_branch, of_frames, zeros_like_weights
-from baselines.cells.segments import segments
+from baselines.cells.packed import segments
 
 
 class LSTM(Cell):

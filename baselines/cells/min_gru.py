@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from baselines.cells.cell import Cell, CellState, linear_layer, of_frames, zeros_like_weights
+from baselines.cells.cell import Cell, CellState, linear_layer, of_frames
 from baselines.cells.scan import linear_scan
 
 
@@ -22,10 +22,6 @@ class MinGRU(Cell):
         super().__init__(num_features, num_outputs, num_actions, **reads)
         self.gate = linear_layer(self.num_inputs, num_outputs)
         self.candidate = linear_layer(self.num_inputs, num_outputs)
-
-    def zeros(self, num_rows: int) -> CellState:
-        """Return zeros, [num_rows, num_outputs]."""
-        return (zeros_like_weights(self, num_rows, self.num_outputs),)
 
     def step(self, inputs: Tensor, state: CellState) -> tuple[Tensor, CellState]:
         """See `Cell`."""

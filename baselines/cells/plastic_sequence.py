@@ -138,7 +138,9 @@ class PlasticGradient:
             state: before it.
             after: the state after it, where the next step does not reset it.
         """
-        (before, hebb, *_), by_hebb, weights = state, self.state[1], self._weights
+        before, hebb, *_ = state
+        by_hebb = self.state[1]
+        weights = self._weights
         torch.ops.aten.hardtanh_backward.grad_input(by_hebb, after[1], -self._bound, self._bound, grad_input=by_hebb)
         by_units, by_before = self._through_change(t, by_units + self.state[0], state)
         by_given = torch.mul(by_units, self._slope[t], out=self.given[t])
@@ -172,7 +174,9 @@ class PlasticGradient:
             across = rows_times(by_hebb, eta * units)
             torch.mul(columns, units, out=self._by_eta[t])
         else:
-            trace, (by_hebb, by_trace), rate = state[2], self.state[1:], self._weights.rate
+            trace = state[2]
+            by_hebb, by_trace = self.state[1:]
+            rate = self._weights.rate
             columns = columns_times(before, by_trace)
             across = rate * rows_times(by_trace, units)
             self._rate.add_((columns * units).sum() - (by_trace * trace).sum())

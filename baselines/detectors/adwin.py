@@ -7,7 +7,7 @@ library River. We chose what counts as a suspicion, and when a label is accepted
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from statistics import fmean, pvariance
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import SUSPICION, Seen, Verdict
-from ctgraph_rl.checks import LARGEST_INT, at_least_one, is_int, is_real, require
+from ctgraph_rl.checks import LARGEST_INT, NamedValues, ReadOnlyValues, at_least_one, is_int, is_real, require
 
 
 class Returns(NamedTuple):
@@ -137,14 +137,14 @@ class ADWIN(Detector):
             return None
         return self.label if abs(seen.mean - kept.mean) <= bound(kept, seen, self.delta) else None
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return what verdicts depend on; 8 bytes for each return in the window, 1 for each row."""
         kept = {label: tuple(each) for label, each in self.kept.items()}
         returns = torch.tensor(self.returns, dtype=torch.float64, device="cpu")
         now = {"label": self.label, "is_trial": self.is_trial, "is_whole": self.is_whole}
         return {**now, "returns": returns, "kept": kept}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned; the window is made again of its returns."""
         self.start_label(state["label"], state["is_trial"])
         self.kept = {label: Returns(*each) for label, each in state["kept"].items()}

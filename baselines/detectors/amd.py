@@ -8,9 +8,8 @@ batches decide, a new model is not tested during its first steps, and steps with
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -18,7 +17,17 @@ from torch.nn.functional import one_hot
 
 from baselines.detectors.detector import Detector
 from baselines.detectors.seen import Seen, Verdict
-from ctgraph_rl.checks import at_least_one, fraction, is_int, one_of, positive, require, true_or_false
+from ctgraph_rl.checks import (
+    NamedValues,
+    ReadOnlyValues,
+    at_least_one,
+    fraction,
+    is_int,
+    one_of,
+    positive,
+    require,
+    true_or_false,
+)
 
 DEGREES = ("published", "corrected")
 
@@ -205,12 +214,12 @@ class AMD(Detector):
         degrees = pairs * (self.num_observations - (self.degrees == "corrected"))
         return chi_squared_tail(statistic(observed, expected), degrees)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return the models, and what verdicts depend on beside them."""
         models = {label: (model.keys, model.counts) for label, model in self.models.items()}
         return {**super().state_dict(), "models": models}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.models = {label: Counts(*model) for label, model in state["models"].items()}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from baselines.detectors.seen import Seen, Verdict
 from baselines.methods.parts.self_labelled import SelfLabelled
-from ctgraph_rl.checks import TakesNumbers, at_least_one, at_most, is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, TakesNumbers, at_least_one, at_most, is_int, require
 
 if TYPE_CHECKING:
     from ctgraph_rl.agent import MethodLike
@@ -99,11 +98,11 @@ class Detector(TakesNumbers):
             trial: whether it is tried after a suspicion; False where learning begins, or resumes, with it.
         """
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> NamedValues:
         """Return all that verdicts depend on, as tensors and plain values."""
         return {name: copy(getattr(self, name)) for name in self.changing}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         for name in self.changing:
             setattr(self, name, copy(state[name]))

@@ -24,7 +24,8 @@ def ks_greater(first: ArrayLike, second: ArrayLike) -> float:
         first: real numbers [m], at least one.
         second: real numbers [n], at least one; m + n is at most `MOST_VALUES`.
     """
-    x, y = np.sort(np.asarray(first, dtype=np.float64)), np.sort(np.asarray(second, dtype=np.float64))
+    x = np.sort(np.asarray(first, dtype=np.float64))
+    y = np.sort(np.asarray(second, dtype=np.float64))
     both = np.concatenate([x, y])
     below_x = np.searchsorted(x, both, side="right")
     below_y = np.searchsorted(y, both, side="right")

@@ -6,7 +6,7 @@ changes is not here: a new task begins without an embedding. We chose to query f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,9 +19,18 @@ from baselines.exchanges.exchange import MaskExchange
 from baselines.methods.mask_shared import MaskShared
 from baselines.methods.parts.masks import Masks
 from baselines.methods.parts.weights import flat
-from baselines.parts.embedding import linear_wasserstein, reference_points, transitions
+from baselines.parts.embedding import linear_wasserstein, reference_points, sampled_points, with_last
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import LARGEST_INT, NamedValues, at_least_one, is_int, is_real, require, true_or_false
+from ctgraph_rl.checks import (
+    LARGEST_INT,
+    NamedValues,
+    ReadOnlyValues,
+    at_least_one,
+    is_int,
+    is_real,
+    require,
+    true_or_false,
+)
 from ctgraph_rl.learn.collective import Help
 from ctgraph_rl.learn.messages import TASK_ID, Array, Fields, Message, Number, to_all
 
@@ -124,10 +133,10 @@ class Mosaic(MaskExchange):
         known = self.known[member]
         if known.task != task:
             known = self.known[member] = KnownMask(task)
-        known.see(batch, self.buffer_size)
+        known.recent = with_last(known.recent, batch.transpose(0, 1), self.buffer_size)
         if len(known.recent["action"]) < self.num_samples:
             return
-        points = known.sample(self.num_samples, self.num_actions, self.generator)
+        points = sampled_points(known.recent, self.num_samples, self.num_actions, self.generator)
         new = linear_wasserstein(points, reference_points(self.num_references, points.shape[1]))
         known.embedding = (new if known.embedding is None else known.embedding + new) / 2
         query = {**self.kinds["query"], "embedding": Array(tuple(new.shape))}
@@ -138,7 +147,10 @@ class Mosaic(MaskExchange):
         if kind == "query":
             return self._queries(member)
         if kind == "offer":
-            return [each for query in received for each in self._offers(member, query)]
+            offers: list[Message] = []
+            for query in received:
+                offers += self._offers(member, query)
+            return offers
         if kind == "request":
             best = self._best(member, received)
             return [Message(kind, member, each.sender, _of(each, "task", "similarity")) for each in best]
@@ -197,7 +209,7 @@ class Mosaic(MaskExchange):
         known = [dict(vars(each)) for each in self.known]
         return {**super().state_dict(), "known": known, "random": self.generator.get_state()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: ReadOnlyValues) -> None:
         """Restore what `state_dict` returned."""
         super().load_state_dict(state)
         self.known = [KnownMask(**each) for each in state["known"]]
@@ -211,19 +223,6 @@ class KnownMask:
     task: int | None = None
     embedding: Tensor | None = None
     recent: dict[str, Tensor] = field(default_factory=dict)
-
-    def see(self, batch: TensorDictBase, most: int) -> None:
-        """Keep the last transitions of a batch, [num_envs, num_steps], and of those before it."""
-        given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
-        for key, values in given.items():
-            new = values.transpose(0, 1).flatten(0, 1).cpu()
-            self.recent[key] = torch.cat([self.recent.get(key, new[:0]), new])[-most:].clone()
-
-    def sample(self, number: int, num_actions: int, generator: torch.Generator) -> Tensor:
-        """Draw transitions without replacement, as points; see `baselines.parts.embedding.transitions`."""
-        drawn = torch.randperm(len(self.recent["action"]), generator=generator, device="cpu")[:number]
-        observation, action, reward = (self.recent[key][drawn] for key in ("observation", "action", "reward"))
-        return transitions(observation, action, reward.squeeze(-1), num_actions)
 
 
 def _of(message: Message, *names: str) -> NamedValues:

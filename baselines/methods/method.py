@@ -91,7 +91,8 @@ class Method(TakesNumbers, Hooks):
         """
         missing = [f"`{name}`" for name in self.agent_members if not hasattr(agent, name)]
         missing += ["`torch.nn.Module` as its base"] * (not isinstance(agent, nn.Module))
-        name, learner = type(self).__name__, type(agent).__name__
+        name = type(self).__name__
+        learner = type(agent).__name__
         message = f"{name} needs an agent with {', '.join(missing)}, got {learner}"
         adapts = getattr(agent, "adapt_episodes", 0) > 0
         require(

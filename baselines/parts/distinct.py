@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from baselines.cells.cell import Branches, CellState, can_branch
-from baselines.cells.segments import segments
+from baselines.cells.packed import segments
 
 
 def distinct(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -76,16 +76,21 @@ def histories(groups: Tensor, starts: Tensor, state: CellState) -> Histories:
         starts: where the state is reset to zero, bool [rows, steps].
         state: before the first step, already zero where it is reset there, [rows, ...] each.
     """
-    found, flat, num_groups = segments(starts), groups.flatten(), int(groups.max()) + 1
+    found = segments(starts)
+    flat = groups.flatten()
+    num_groups = int(groups.max()) + 1
     states = [torch.cat([torch.zeros_like(value[:1]), value]) for value in state]
     none = torch.zeros(len(starts) + 1, dtype=torch.int64, device="cpu")
     examples, equal = distinct(states) if states else (none[:1], none)
     last = torch.where(found.at_first, equal[found.rows + 1], equal[0])
-    of_frames, branches, count = torch.empty_like(flat), [], 0
+    of_frames = torch.empty_like(flat)
+    branches = []
+    count = 0
     for frames in found.frames.split(found.sizes.tolist()):
         different, places = (last[: len(frames)] * num_groups + flat[frames]).unique(return_inverse=True)
         branches.append((different.div(num_groups, rounding_mode="floor"), different % num_groups))
         of_frames[frames] = places + count
-        last, count = places, count + len(different)
+        last = places
+        count = count + len(different)
     initial = tuple(value.index_select(0, examples) for value in states)
     return Histories(initial, branches, of_frames.view_as(groups))

@@ -8,9 +8,11 @@ samples, n coordinates of each, M reference points, L directions.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
@@ -38,6 +40,23 @@ def transitions(observation: Tensor, action: Tensor, reward: Tensor, num_actions
     deviation = pixels.std(correction=0)
     pixels = (pixels - pixels.mean()) / torch.where(deviation > 0, deviation, 1.0)
     return torch.cat([pixels, one_hot(action, num_actions).float(), reward.float().unsqueeze(1)], dim=1)
+
+
+def with_last(recent: Mapping[str, Tensor], batch: TensorDictBase, most: int) -> dict[str, Tensor]:
+    """Return the last transitions of ``recent`` and of a batch behind them, row after row, [n, ...] each."""
+    given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
+    found = {}
+    for key, values in given.items():
+        new = values.flatten(0, 1).cpu()
+        found[key] = torch.cat([recent.get(key, new[:0]), new])[-most:].clone()
+    return found
+
+
+def sampled_points(recent: Mapping[str, Tensor], number: int, num_actions: int, generator: torch.Generator) -> Tensor:
+    """Draw some of what `with_last` returned, without replacement, as points; see `transitions`."""
+    drawn = torch.randperm(len(recent["action"]), generator=generator, device="cpu")[:number]
+    reward = recent["reward"][drawn].squeeze(-1)
+    return transitions(recent["observation"][drawn], recent["action"][drawn], reward, num_actions)
 
 
 def reference_points(number: int, width: int, seed: int = REFERENCE_SEED) -> Tensor:

@@ -80,7 +80,8 @@ class GatedNetwork(nn.Module):
         gate_size: int,
     ) -> None:
         super().__init__()
-        self.event_dims, self.scale = len(shape), 1 / high
+        self.event_dims = len(shape)
+        self.scale = 1 / high
         widths = [shape.numel() + num_extra, *[hidden_size] * num_layers]
         layers = [GatedLayer(before, after, gate, gate_size) for before, after in pairwise(widths)]
         self.layers = nn.Sequential(*layers)

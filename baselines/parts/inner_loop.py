@@ -33,9 +33,10 @@ from torchrl.data import Composite, TensorSpec
 from baselines.parts.gates import GATES, GatedNetwork, gated_network, require_gated_weights, shown_specs
 from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName, draw, guided, is_greedy, num_actions_of
-from baselines.update.optimiser import make_optimiser
 from baselines.update.trust_region import trust_region_step
+from baselines.update.update import make_optimiser
 from ctgraph_rl.checks import at_least_one, fraction, one_of, positive, require
+from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.learn.collect import UNSTORED
 
 OUTER = ("trpo", "ppo")
@@ -208,7 +209,7 @@ class InnerPolicy(TensorDictModuleBase):
             adapted = vmap(self.model.adapt, in_dims=(None, 0, 0))(theta, theirs, self.before(played))
             own = {name: value.index_copy(0, rows, adapted[name]) for name, value in own.items()}
         for name, first in self.model.start(theta).items():
-            own[name] = torch.where(fresh.view(-1, *[1] * first.ndim), first, own[name])
+            own[name] = torch.where(beside(fresh, own[name]), first, own[name])
         return own
 
     def before(self, played: Played) -> Episodes:

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from baselines.parts.hooks import Hooks
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiled
-from baselines.update.optimiser import parts_of
-from baselines.update.update import Update, UpdateState, update
+from baselines.update.update import Update, UpdateState, parts_of, update
 from ctgraph_rl.checks import NamedValues, TakesNumbers, at_least_one, positive, require, true_or_false
 from ctgraph_rl.core.region import Region, captures
 
@@ -70,7 +69,9 @@ class Learner(TakesNumbers, nn.Module):
         self.compiled_step: Update | None = compiled(update) if compile else None
         self._region: Region | None = None
         self.method = Hooks()
-        self.num_envs, self.num_steps, self.max_grad_norm = num_envs, num_steps, max_grad_norm
+        self.num_envs = num_envs
+        self.num_steps = num_steps
+        self.max_grad_norm = max_grad_norm
 
     def initial_state(self, num_envs: int) -> TensorDict:
         """Return an empty recurrent state."""

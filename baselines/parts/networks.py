@@ -65,8 +65,10 @@ class Convolutions(nn.Module):
         tiled = flat.unflatten(-1, (channels, rows // TILE, TILE, columns // TILE, TILE))
         tiles = tiled.movedim((-4, -2), (-5, -4)).flatten(-3)
         found = nn.functional.pad(self.first(tiles).relu(), (0, 0, 1, 1, 1, 1))
-        heights = [found[..., i : i + rows // TILE, :, :] for i in range(3)]
-        patches = [height[..., j : j + columns // TILE, :] for height in heights for j in range(3)]
+        patches = []
+        for i in range(3):
+            for j in range(3):
+                patches.append(found[..., i : i + rows // TILE, j : j + columns // TILE, :])
         return self.second(torch.cat(patches, dim=-1)).relu().flatten(-3)
 
 
@@ -93,14 +95,14 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         require(*one_of(ENCODERS, encoder=kind))
-        self.event_dims, self.scale = len(shape), 1 / high
+        self.event_dims = len(shape)
+        self.scale = 1 / high
         self.convolutions = Convolutions(shape) if kind == "cnn" else None
         num_inputs = shape.numel() if self.convolutions is None else self.convolutions.num_features
         self.linear = linear_layer(num_inputs + num_extra, num_features)
-        layers = [
-            layer for _ in range(num_layers - 1) for layer in (linear_layer(num_features, num_features), nn.ReLU())
-        ]
-        self.further = nn.Sequential(*layers)
+        self.further = nn.Sequential()
+        for _ in range(num_layers - 1):
+            self.further.extend([linear_layer(num_features, num_features), nn.ReLU()])
 
     def forward(self, observation: Tensor, *extra: Tensor) -> Tensor:
         """Map uint8 [..., *shape] and further inputs, [..., n] each, to [..., num_features] of the weights' dtype."""
@@ -146,7 +148,8 @@ class RecurrentModule(TensorDictModuleBase):
     def __init__(self, encoder: EncoderModule, cell: Cell) -> None:
         super().__init__()
         self.module = nn.ModuleList([encoder, cell])
-        self.state_keys, self.own_keys = cell.state_keys, cell.own_keys
+        self.state_keys = cell.state_keys
+        self.own_keys = cell.own_keys
         self.in_keys = [*encoder.in_keys, *self.state_keys, "is_init", *self.own_keys]
         self.out_keys = ["memory", *(("next", key) for key in self.state_keys)]
 
@@ -166,7 +169,8 @@ class RecurrentModule(TensorDictModuleBase):
 
     def act(self, data: Data) -> Items:
         """Compute ``memory`` and the next state for one step of all rows."""
-        encoder, cell = self.encoder, self.cell
+        encoder = self.encoder
+        cell = self.cell
         state = reset([data[key] for key in self.state_keys], data["is_init"].squeeze(-1))
         memory, state = cell.step(joined(encoder.over_time(data), *self._own(data)), state)
         return {"memory": memory, **{("next", key): value for key, value in zip(self.state_keys, state, strict=True)}}
@@ -198,7 +202,9 @@ class RecurrentModule(TensorDictModuleBase):
 
     def _sequences(self, data: Data) -> tuple[Tensor, Tensor, Tensor, CellState]:
         """Return what the cell reads, one for all frames with the same inputs; see `Cell.sequence`."""
-        encoder, starts, read = self.encoder, data["is_init"].squeeze(-1), self._read(data)
+        encoder = self.encoder
+        starts = data["is_init"].squeeze(-1)
+        read = self._read(data)
         examples, groups = renumbered(data[GROUP].flatten()) if GROUP in data else distinct([*chain(*read)])
         seen, own = ([value.index_select(0, examples) for value in values] for values in read)
         inputs = joined(encoder.module(*seen), *own)
@@ -270,7 +276,8 @@ def num_actions_of(action_spec: TensorSpec) -> int:
         ValueError: for continuous actions.
     """
     count = getattr(action_spec, "n", None)
-    shape, dtype = list(action_spec.shape), str(action_spec.dtype).removeprefix("torch.")
+    shape = list(action_spec.shape)
+    dtype = str(action_spec.dtype).removeprefix("torch.")
     fix = "take a learner of your own, measured by Recorder, or a task with discrete ones"
     require((count is not None, f"agents of baselines choose from discrete actions, these are {dtype} {shape}: {fix}"))
     return count  # type: ignore[return-value]

@@ -32,7 +32,7 @@ from baselines.parts.networks import (
     sequences_of,
 )
 from baselines.parts.networks import encoder as make_encoder
-from baselines.update.optimiser import OPTIMISERS, make_optimiser
+from baselines.update.update import OPTIMISERS, make_optimiser
 from ctgraph_rl.checks import at_least_one, at_most, fraction, one_of, positive, require, true_or_false
 from ctgraph_rl.core.device import torchs_defaults
 

@@ -21,7 +21,7 @@ from torchrl.objectives.common import LossModule
 from baselines.parts.learner import MOST_PASSES, Learner
 from baselines.parts.networks import Data, Items, TensorsByName, guided
 from baselines.parts.prioritized import PrioritySampler
-from baselines.update.optimiser import make_optimiser
+from baselines.update.update import make_optimiser
 from ctgraph_rl.checks import NamedValues, at_least_one, at_most, fraction, one_of, positive, require, require_memory
 from ctgraph_rl.core.device import torchs_defaults
 
@@ -89,6 +89,22 @@ class EpsilonGreedy(TensorDictSequential):
         for module in others:
             module(tensordict)
         return tensordict
+
+
+class WithTarget(LossModule):
+    """A Q-network and its target network.
+
+    Args:
+        network: a sequence of trunk and head.
+    """
+
+    value_network: TensorDictSequential
+    value_network_params: TensorDictBase
+    target_value_network_params: TensorDictBase
+
+    def __init__(self, network: TensorDictSequential) -> None:
+        super().__init__()
+        self.convert_to_functional(network, "value_network", create_target_params=True)
 
 
 class QLearner(Learner):

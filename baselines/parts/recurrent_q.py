@@ -15,12 +15,11 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import QValueActor
-from torchrl.objectives.common import LossModule
 
 from baselines.cells.cell import MakeCell, linear_layer
 from baselines.cells.lstm import LSTM
 from baselines.parts.networks import Data, TensorsByName, copied_action, num_actions_of, recurrent, require_weights
-from baselines.parts.q_learning import QLearner, require_replay
+from baselines.parts.q_learning import QLearner, WithTarget, require_replay
 from ctgraph_rl.checks import at_least_one, is_int, positive, require
 from ctgraph_rl.learn.collect import UNSTORED
 
@@ -45,20 +44,12 @@ class Quantiles(nn.Module):
         return quantiles.mean(dim=-1), quantiles
 
 
-class RecurrentTargets(LossModule):
+class RecurrentTargets(WithTarget):
     """Computes the predicted quantiles of the actions taken, and their targets.
 
     Args:
         network: reads sequences, writes ``quantiles`` [B, L, A, K].
     """
-
-    value_network: TensorDictSequential
-    value_network_params: TensorDictBase
-    target_value_network_params: TensorDictBase
-
-    def __init__(self, network: TensorDictSequential) -> None:
-        super().__init__()
-        self.convert_to_functional(network, "value_network", create_target_params=True)
 
     def forward(self, batch: Data) -> tuple[Tensor, Tensor]:
         """Compute both, [B, L, K]; where ``learnt`` is False, they mean nothing.
@@ -123,17 +114,16 @@ class RecurrentQ(QLearner):
             *positive(learning_rate=learning_rate),
             (holds_one, f"buffer_size must be an integer >= num_steps={num_steps!r}, got {buffer_size!r}"),
         )
-        num_outputs = num_actions_of(action_spec) * self.num_quantiles
-        require_weights(observation_spec, hidden_size, 1, num_outputs, memory=True)
+        num_actions = num_actions_of(action_spec)
+        require_weights(observation_spec, hidden_size, 1, num_actions * self.num_quantiles, memory=True)
         pairs = num_steps * self.num_quantiles**2
         require_replay(observation_spec, buffer_size, settings["batch_size"], pairs)
         super().__init__(**settings)
-        num_actions = num_actions_of(action_spec)
         self.trunk = recurrent(observation_spec, hidden_size, 1, num_actions, make_cell=cell, kind=encoder)
         unstored = [key for key in self.trunk.state_keys if key.startswith(UNSTORED)]
         message = f"{type(self).__name__} replays sequences, which need a cell whose state is stored, not {unstored}"
         require((not unstored, f"{message}: use agent=lstm_ppo"))
-        head = Quantiles(hidden_size, num_actions_of(action_spec), self.num_quantiles)
+        head = Quantiles(hidden_size, num_actions, self.num_quantiles)
         values = TensorDictModule(head, in_keys=["memory"], out_keys=["action_value", "quantiles"])
         self.greedy = QValueActor(
             TensorDictSequential(self.trunk, values), in_keys=self.trunk.in_keys, spec=action_spec

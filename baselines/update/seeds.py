@@ -22,9 +22,8 @@ from baselines.parts.hooks import Hooks
 from baselines.parts.learner import Learner, table_of
 from baselines.parts.networks import Data, Items, TensorsByName
 from baselines.update.compiled import compiler_options
-from baselines.update.optimiser import has_parts
 from baselines.update.stack import Stack
-from baselines.update.update import update
+from baselines.update.update import has_parts, update
 from ctgraph_rl.agent import Agent
 
 LARGEST_MINIBATCH = 512
@@ -85,7 +84,8 @@ class SeedGroup:
     @contextmanager
     def random(self, number: int) -> Iterator[None]:
         """Let torch's global generator be that of one agent."""
-        generator, before = self.generators[number], torch.get_rng_state()
+        generator = self.generators[number]
+        before = torch.get_rng_state()
         torch.set_rng_state(generator.get_state())
         try:
             yield

@@ -13,8 +13,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName
-from baselines.update.optimiser import Parts, parts_of
-from baselines.update.update import UpdateState, over_seeds, stacked, unstacked
+from baselines.update.update import Parts, UpdateState, over_seeds, parts_of, stacked, unstacked
 
 
 def named_tensors(learner: Learner) -> TensorsByName:
@@ -130,9 +129,8 @@ class Stack:
         state = self.state
 
         def outputs(*given: Tensor) -> TensorsByName:
-            left = iter(given)
-            kept = {name: next(left) for name in self.kept}
-            its = {key: next(left) for key in data}
+            kept = dict(zip(self.kept, given, strict=False))
+            its = dict(zip(data, given[len(kept) :], strict=True))
             return over_seeds(self.learners[0], _outputs, state._replace(tensors=self._named(kept)), its)
 
         return make_fx(outputs, tracing_mode="fake")(*self.acting_inputs(data))

@@ -44,7 +44,8 @@ def trust_region_step(
         return logits_of({name: part.view_as(value) for (name, value), part in zip(weights, parts, strict=True)})
 
     at_present = vjp(logits_at, present)
-    logits, pull = at_present[0], at_present[1]
+    logits = at_present[0]
+    pull = at_present[1]
     chances = logits.softmax(dim=-1)
     gradient = pull(grad(loss_of)(logits))[0]
 
@@ -95,6 +96,7 @@ def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor) -> 
         step = square / (direction @ image)
         solution += step * direction
         residual -= step * image
-        last, square = square, residual @ residual
+        last = square
+        square = residual @ residual
         direction = residual + square / last * direction
     return solution

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import as_tuple, is_int, plain, require, require_all
+from ctgraph_rl.checks import are_ints, as_tuple, is_int, plain, require, require_all
 from ctgraph_rl.core import philox
 from ctgraph_rl.tasks.protocol import MOST_IDS
 from ctgraph_rl.tasks.switch import Switch
@@ -22,13 +22,18 @@ def checked_num_ids(task_ids: Mapping[Any, int] | None, num_task_ids: int | None
         require((num_task_ids is None, f"num_task_ids={num_task_ids!r} needs task_ids"))
         return 0
     ids = plain(list(task_ids.values())) if isinstance(task_ids, Mapping) else [task_ids]
-    by_task = isinstance(task_ids, Mapping) and bool(ids) and all(is_int(i, 0, MOST_IDS - 1) for i in ids)
+    by_task = isinstance(task_ids, Mapping) and bool(ids) and are_ints(ids, 0, MOST_IDS - 1)
     require((by_task, f"task_ids must give tasks their ids, integers in 0..{MOST_IDS - 1}, got {ids[:5]!r}"))
     needed = max(ids) + 1
     room = needed if num_task_ids is None else num_task_ids
     rule = f"num_task_ids must be an integer in {needed}..{MOST_IDS}, from the largest id + 1, got {room!r}"
     require((is_int(room, needed, MOST_IDS), rule))
     return room
+
+
+def one_hot_ids(ids: Tensor, length: int) -> Tensor:
+    """Return ids, int64 [N], as one-hot, uint8 [N, length]; zeros for -1."""
+    return (ids.unsqueeze(-1) == torch.arange(length, device=ids.device)).to(torch.uint8)
 
 
 def numbers_in(pool: Iterable[Task], tasks: Iterable[Task]) -> list[int]:

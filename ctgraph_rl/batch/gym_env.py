@@ -15,10 +15,11 @@ from torch.nn.functional import one_hot
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ctgraph_rl.batch.assignment import checked_num_ids
+from ctgraph_rl.batch.assignment import checked_num_ids, one_hot_ids
 from ctgraph_rl.batch.rows import seed_rule
-from ctgraph_rl.checks import Rule, require, require_all
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, Rule, require, require_all
 from ctgraph_rl.core.device import checked_device
+from ctgraph_rl.core.dynamics import beside
 from ctgraph_rl.tasks.kinds.gym_task import GymTask, spaces_of
 
 NUM_PROBED = 20
@@ -102,8 +103,7 @@ class GymEnv(EnvBase):
         self.reward_spec = Unbounded(shape=column, dtype=torch.float32, device="cpu").to(self.device)
         done = {"done": flag, "terminated": flag.clone(), "truncated": flag.clone()}
         self.full_done_spec = Composite(done, shape=(n,), device="cpu").to(self.device)
-        zeros = self.observation_spec.zero()
-        self._data = {key: zeros[key] for key in keys} | {key: self.full_done_spec.zero()[key] for key in done}
+        self._data = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
 
     def set_tasks(self, tasks: Iterable[GymTask], at_episode_end: bool = False) -> None:
         """Give every row a task of the pool: before the next reset of all rows, or at the end of its episode.
@@ -140,18 +140,22 @@ class GymEnv(EnvBase):
             mask = given.view(-1).cpu().numpy()
         rows = np.flatnonzero(mask).tolist()
         if self._next is not None:
-            self.tasks = tuple(self._next[row] if mask[row] else task for row, task in enumerate(self.tasks))
+            tasks = list(self.tasks)
+            for row in rows:
+                tasks[row] = self._next[row]
+            self.tasks = tuple(tasks)
             self._place(rows)
         self._episode[mask] += 1
+        seeds: list[int | None] = [None] * len(mask)
         for row in rows:
             self._actions[row] = []
-        seeds = [self._episode_seed(row) if mask[row] else None for row in range(len(mask))]
+            seeds[row] = self._episode_seed(row)
         observations, _ = self._rows.reset(seed=seeds, options={"reset_mask": mask})
         begun = torch.from_numpy(mask).to(self.device).unsqueeze(-1)
         data = self._observed(observations)
         for key, value in self._data.items():
             given_up = data[key] if key in data else torch.zeros_like(value)
-            data[key] = torch.where(begun.view(-1, *[1] * (value.ndim - 1)), given_up, value)
+            data[key] = torch.where(beside(begun, value), given_up, value)
         data["is_init"] = begun
         return self._shown(data)
 
@@ -160,19 +164,23 @@ class GymEnv(EnvBase):
         for played, taken in zip(self._actions, action, strict=True):
             played.append(taken)
         observations, reward, terminated, truncated, _ = self._rows.step(self._as_given(action))
-        flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        data = {key: torch.from_numpy(value).to(self.device, copy=True).unsqueeze(-1) for key, value in flags.items()}
-        rewards = torch.tensor(reward, dtype=torch.float32, device=self.device).unsqueeze(-1)
-        data |= self._observed(observations)
+        rewards = self._column(reward, torch.float32)
+        data = self._observed(observations)
+        data["terminated"] = self._column(terminated, torch.bool)
+        data["truncated"] = self._column(truncated, torch.bool)
+        data["done"] = data["terminated"] | data["truncated"]
         data["is_init"] = torch.zeros_like(data["done"])
         data["step_count"] = self._data["step_count"] + 1
         data["episode_reward"] = self._data["episode_reward"] + rewards
         return self._shown(data).set("reward", rewards)
 
+    def _column(self, values: np.ndarray, dtype: torch.dtype) -> Tensor:
+        """Return a value of each row, [rows, 1]."""
+        return torch.tensor(values, dtype=dtype, device=self.device).unsqueeze(-1)
+
     def _shown(self, data: dict[str, Tensor]) -> TensorDict:
         self._data = data
-        shown = {key: value.clone() for key, value in data.items()}
-        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+        return TensorDict(data, batch_size=self.batch_size, device=self.device).clone()
 
     def _observed(self, observations: Any) -> dict[str, Tensor]:
         """Return what rows show of their observations and tasks."""
@@ -188,7 +196,7 @@ class GymEnv(EnvBase):
         data = {"observation": seen.contiguous()}
         if self.num_task_ids:
             ids = torch.tensor([self._ids.get(task, -1) for task in self.tasks], device=self.device, dtype=torch.int64)
-            data["task_id"] = (ids.unsqueeze(-1) == torch.arange(self.num_task_ids, device=self.device)).to(torch.uint8)
+            data["task_id"] = one_hot_ids(ids, self.num_task_ids)
         return data
 
     def _as_given(self, action: np.ndarray) -> np.ndarray:
@@ -209,30 +217,38 @@ class GymEnv(EnvBase):
         self.seed = seed  # type: ignore[assignment]
         self._episode[:] = -1
 
-    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+    def state_dict(self, *args: Any, **kwargs: Any) -> NamedValues:
         """Return what `load_state_dict` needs to continue: each row's task, episode and actions, and the shown data."""
         following = self.tasks if self._next is None else self._next
         return {
-            "tasks": [self.pool.index(task) for task in self.tasks],
-            "next_tasks": [self.pool.index(task) for task in following],
+            "tasks": self._numbers(self.tasks),
+            "next_tasks": self._numbers(following),
             "episode": torch.from_numpy(self._episode.copy()),
             "actions": [torch.from_numpy(np.array(played)) for played in self._actions],
             "data": dict(self._data),
         }
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> None:
+    def _numbers(self, tasks: Iterable[GymTask]) -> list[int]:
+        return [self.pool.index(task) for task in tasks]
+
+    def _numbered(self, numbers: Iterable[int]) -> tuple[GymTask, ...]:
+        return tuple(self.pool[number] for number in numbers)
+
+    def load_state_dict(self, state_dict: ReadOnlyValues, *args: Any, **kwargs: Any) -> None:
         """Go back to a state: each row's episode begins with its seed, and its actions are taken again.
 
         Raises:
             ValueError: if a row then does not show what it showed.
         """
-        self.tasks = tuple(self.pool[number] for number in state_dict["tasks"])
-        self._next = tuple(self.pool[number] for number in state_dict["next_tasks"])
+        self.tasks = self._numbered(state_dict["tasks"])
+        self._next = self._numbered(state_dict["next_tasks"])
         self._episode = state_dict["episode"].numpy().copy()
         kept = all(task.repeats for task in self.tasks)
-        self._actions = [list(played.numpy()) if kept else [] for played in state_dict["actions"]]
         self._place(range(len(self.tasks)))
-        seeds: list[int | None] = [self._episode_seed(row) for row in range(len(self.tasks))]
+        seeds: list[int | None] = []
+        for row, played in enumerate(state_dict["actions"]):
+            self._actions[row] = list(played.numpy()) if kept else []
+            seeds.append(self._episode_seed(row))
         begun, _ = self._rows.reset(seed=seeds, options={"reset_mask": np.ones(len(seeds), dtype=bool)})
         found = np.array(begun)
         for row, (env, played) in enumerate(zip(self._rows.envs, self._actions, strict=True)):
@@ -263,7 +279,7 @@ def _action_spec(space: Any, num_rows: int) -> Any:
     ends = np.stack([space.low, space.high])
     if not np.isfinite(ends).all():
         return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
-    low, high = (torch.tensor(end, dtype=torch.float32, device="cpu").expand(shape) for end in ends)
+    low, high = torch.tensor(ends, dtype=torch.float32, device="cpu").unsqueeze(1).expand(2, *shape)
     return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 

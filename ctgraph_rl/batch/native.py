@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterable
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ctgraph_rl.batch.params import Tables
-from ctgraph_rl.checks import Rule, one_of, require
+from ctgraph_rl.checks import NamedValues, Rule, one_of, require
 from ctgraph_rl.core.dynamics import STATE_DTYPES, RowState, Shown
 from ctgraph_rl.core.kernel import library, num_threads
 from ctgraph_rl.core.rewards import KERNEL_REWARDS, RewardFn
@@ -80,7 +81,7 @@ class Native:
         self._state: RowState | None = None
         self._shapes: Stepped | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> NamedValues:
         """Copies start without what is prepared."""
         return {"params": self.params, "tables": self.tables, "_call": None, "_state": None, "_shapes": None}
 
@@ -125,12 +126,20 @@ class Native:
         if action is None or action.dtype != torch.int64 or action.shape != (n,):
             return None
         if self._shapes is None:
-            one = [torch.empty((), dtype=dtype, device=self.params.row.device) for dtype, _ in _STEPPED]
-            shapes = [(n, *self.params.bank.shape[1:]) if images else (n,) for _, images in _STEPPED]
-            self._shapes = Stepped(*(value.expand(shape) for value, shape in zip(one, shapes, strict=True)))
+            self._shapes = self._stepped_shapes()
         made = Stepped(*map(torch.empty_like, self._shapes))
         after, wrong = self._run(state, most_action=most_action, restarts=True, made=made, action=action)
         return None if wrong else (after, made)
+
+    def _stepped_shapes(self) -> Stepped:
+        """Return tensors without memory of their own, of the shapes and dtypes of what rows show after a step."""
+        shapes = []
+        for name in Stepped._fields:
+            dtype, is_image, _ = _ARRAYS[name]
+            pixels = self.params.bank.shape[1:] if is_image else ()
+            one = torch.empty((), dtype=dtype, device=self.params.row.device)
+            shapes.append(one.expand(len(self.tables.entry), *pixels))
+        return Stepped(*shapes)
 
     def _show(self, state: RowState, **arrays: Any) -> tuple[RowState, Shown]:
         """One call for all that rows show, with the arrays ``action``, ``mask`` and ``shown``."""
@@ -175,21 +184,25 @@ class Native:
         made: Stepped | None = None,
         **arrays: Tensor | None,
     ) -> tuple[RowState, int]:
-        if self._call is None or self._pointers != [value.data_ptr() for value in self._alive]:
+        if self._call is None or self._pointers != _pointers(self._alive):
             self._call = self._prepare()  # the first call, or tables that were moved, as into memory of many processes
         call = self._call
         n = call.num_rows
         before = self._own(state, call)
         after = RowState(*map(torch.empty_like, before))
-        call.before, call.after = (_Pointers(*(value.data_ptr() for value in state)) for state in (before, after))
+        call.before = _StatePointers(*_pointers(before))
+        call.after = _StatePointers(*_pointers(after))
         call.num_steps = num_steps
         call.restarts = restarts
         call.most_action = most_action
         call.num_threads = num_threads(n * num_steps, most=-(-n // _BLOCK))
         names = _ARRAYS if made is None else _READ
-        kept = [_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps) for name in names]
-        for name, array in () if made is None else made._asdict().items():  # made for this call: nothing to check
-            setattr(call, name, array.data_ptr())
+        kept = []
+        for name in names:
+            kept.append(_set(call, name, arrays.get(name), 1 if name in _OF_ROWS else num_steps))
+        if made is not None:  # for this call: nothing to check
+            for name, array in made._asdict().items():
+                setattr(call, name, array.data_ptr())
         wrong = library().ctgraph_run(ctypes.byref(call))
         del kept
         if not wrong:
@@ -202,11 +215,13 @@ class Native:
         if last is not None and all(a is b for a, b in zip(state, last, strict=True)):
             return state
         shape = (call.num_rows,)
+        own = []
         for (name, dtype), value in zip(STATE_DTYPES.items(), state, strict=True):
             got = f"{value.dtype} {list(value.shape)} on {value.device}"
             fits = value.dtype == dtype and value.shape == shape and value.is_cpu
             require((fits, f"{name} of a state must be {dtype} {list(shape)} on the CPU, got {got}"))
-        return RowState(*(value.contiguous() for value in state))
+            own.append(value.contiguous())
+        return RowState(*own)
 
     def _prepare(self) -> _Call:
         """Return a call with all that stays the same between two changes of parameters."""
@@ -231,8 +246,8 @@ class Native:
         if x.taps is not None:
             tables |= {"tap_index": x.taps[0], "tap_weight": x.taps[1]}
         self._alive = [value.contiguous() for value in tables.values()]
-        self._pointers = [value.data_ptr() for value in self._alive]
-        return _Call(
+        self._pointers = _pointers(self._alive)
+        call = _Call(
             num_rows=n,
             num_tasks=len(tables["tasks"]),
             bank_rows=len(params.bank),
@@ -241,9 +256,16 @@ class Native:
             is_vector=params.bank.ndim == 2,
             num_levels=0 if x.legacy is None else x.legacy.level_first.shape[1],
             own_seeds=len(params.seed) > 1,
-            **{name: int(getattr(uses, name)) for name in _USES},
-            **dict(zip(tables, self._pointers, strict=True)),
         )
+        for name in _USES:
+            setattr(call, name, getattr(uses, name))
+        for name, pointer in zip(tables, self._pointers, strict=True):
+            setattr(call, name, pointer)
+        return call
+
+
+def _pointers(tensors: Iterable[Tensor]) -> list[int]:
+    return [tensor.data_ptr() for tensor in tensors]
 
 
 def _set(call: _Call, name: str, array: Tensor | None, num_steps: int) -> Tensor | None:
@@ -305,20 +327,18 @@ _ARRAYS = {
     "episode_reward": (torch.float32, False, False),
 }
 """Arrays of a call, [T, N, ...]: the dtype, whether it holds images, whether it is read."""
-_STEPPED = [_ARRAYS[name][:2] for name in Stepped._fields]
 _READ = [name for name, (*_, is_read) in _ARRAYS.items() if is_read]
 _OF_ROWS = ("mask", "shown")
 """Those of [N, ...]."""
-_Pointers = ctypes.c_void_p * len(RowState._fields)
+_StatePointers = ctypes.c_void_p * len(RowState._fields)
 
 
 class _Call(ctypes.Structure):
     """``Call`` of `kernel.c`."""
 
     _fields_ = [
-        *((name, ctypes.c_int64) for name in (*_SIZES, "num_levels", *_USES, "own_seeds", "restarts", "most_action")),
-        *((name, ctypes.c_void_p) for name in (*_TABLES, *_OPTIONAL_TABLES)),
-        ("before", _Pointers),
-        ("after", _Pointers),
-        *((name, ctypes.c_void_p) for name in _ARRAYS),
+        *product((*_SIZES, "num_levels", *_USES, "own_seeds", "restarts", "most_action"), [ctypes.c_int64]),
+        *product((*_TABLES, *_OPTIONAL_TABLES), [ctypes.c_void_p]),
+        *product(("before", "after"), [_StatePointers]),
+        *product(_ARRAYS, [ctypes.c_void_p]),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -20,8 +21,30 @@ from ctgraph_rl.tasks.images import white_level
 from ctgraph_rl.tasks.memory import BankKey, bank_bytes, bank_key, make_bank, rotates_after_noise
 from ctgraph_rl.tasks.task import Task
 
-MakeTensor = Callable[..., Tensor]
-"""Makes a tensor on the right device from a list with one entry per different task, and a dtype (int64)."""
+
+@dataclass(frozen=True)
+class _Different:
+    """Different tasks, and tensors with an entry for each of them."""
+
+    tasks: tuple[Task, ...]
+    device: torch.device
+
+    def each(self, value: Callable[[Task], Any], dtype: torch.dtype = torch.int64) -> Tensor:
+        """Return the value of each task."""
+        return torch.tensor([value(task) for task in self.tasks], dtype=dtype, device=self.device)
+
+    def each_kind(self, number: Callable[[Task, StateType], int]) -> Tensor:
+        """Return a number for each kind of state of each task, flattened."""
+        return self.each(lambda task: [number(task, kind) for kind in StateType]).flatten()
+
+    def some(self, holds: Callable[[Task], object]) -> bool:
+        """Return whether something holds for a task at least."""
+        return any(holds(task) for task in self.tasks)
+
+    @property
+    def max_depth(self) -> int:
+        """The largest depth."""
+        return max(task.graph.depth for task in self.tasks)
 
 
 class Tables(NamedTuple):
@@ -51,90 +74,91 @@ class Tables(NamedTuple):
 
 def make_tables(tasks: tuple[Task, ...], number: Tensor, bank: Bank) -> Tables:
     """Return the tables of different tasks with these numbers in their pool; no row has one yet."""
-
-    def each(values: Sequence[Any], dtype: torch.dtype = torch.int64) -> Tensor:
-        return torch.tensor(values, dtype=dtype, device=number.device)
-
+    different = _Different(tasks, number.device)
     reward_fns = tuple(dict.fromkeys(task.reward_fn for task in tasks))
-    observations = [task.observations for task in tasks]
-    uses = Uses(
-        waits=any(task.graph.wait_prob > 0 for task in tasks),
-        unique_ids=any(x.is_unique(kind) and not x.legacy_index for x in observations for kind in StateType),
-        drawn_ids=any(x.draws_ids for x in observations),
-        views=any(_num_views(task) * _num_angles(task) > 1 for task in tasks),
-        pixel_noise=any(x.read_noise for x in observations),
-        noise_bank=bank.num_noises if any(x.read_noise for x in observations) else 0,
-        reward_noise=any(task.reward_std for task in tasks),
-        multiplicative=any(task.reward_std and task.reward_noise == "multiplicative" for task in tasks),
-        fail_reward=any(task.fail_reward for task in tasks),
-        step_reward=any(task.step_reward for task in tasks),
-        reward_cue=any(x.reward_cue for x in observations),
-        goal_change=any(task.goal_change for task in tasks),
-        max_depth=max(task.graph.depth for task in tasks),
-        reward_fns=reward_fns,
-    )
     return Tables(
-        tree=_tree_params(tasks, each),
-        x=_observation_params(tasks, each, bank),
-        g=_reward_params(tasks, each, reward_fns),
-        goal_leaf=each([task.goal_leaf for task in tasks]),
-        uses=uses,
+        tree=_tree_params(different),
+        x=_observation_params(different, bank),
+        g=_reward_params(different, reward_fns),
+        goal_leaf=different.each(lambda task: task.goal_leaf),
+        uses=_uses(different, bank, reward_fns),
         number=number,
         entry=number[:0],
     )
 
 
-def _tree_params(tasks: tuple[Task, ...], each: MakeTensor) -> TreeParams:
-    graphs = [task.graph for task in tasks]
-    extra = [task.extra_end_step for task in tasks]
-    return tree_params(
-        branching_factor=each([graph.branching_factor for graph in graphs]),
-        first_leaf=each([graph.num_decision_states for graph in graphs]),
-        stay_below=each([int(graph.wait_prob * 2**63) for graph in graphs]),
-        extra_end_step=each(extra, torch.bool) if any(extra) else None,
-        swap=_swap(tasks, each) if any(task.swapped_branches for task in tasks) else None,
+def _uses(tasks: _Different, bank: Bank, reward_fns: tuple[RewardFn, ...]) -> Uses:
+    some = tasks.some
+    pixel_noise = some(lambda task: task.observations.read_noise)
+    return Uses(
+        waits=some(lambda task: task.graph.wait_prob > 0),
+        unique_ids=some(lambda task: any(_is_by_node(task, kind) for kind in StateType)),
+        drawn_ids=some(lambda task: task.observations.draws_ids),
+        views=some(lambda task: _num_views(task) * _num_angles(task) > 1),
+        pixel_noise=pixel_noise,
+        noise_bank=bank.num_noises if pixel_noise else 0,
+        reward_noise=some(lambda task: task.reward_std),
+        multiplicative=some(lambda task: task.reward_std and task.reward_noise == "multiplicative"),
+        fail_reward=some(lambda task: task.fail_reward),
+        step_reward=some(lambda task: task.step_reward),
+        reward_cue=some(lambda task: task.observations.reward_cue),
+        goal_change=some(lambda task: task.goal_change),
+        max_depth=tasks.max_depth,
+        reward_fns=reward_fns,
     )
 
 
-def _swap(tasks: tuple[Task, ...], each: MakeTensor) -> Swap:
-    pairs = [task.swapped_branches or ((), (0, 0)) for task in tasks]
-    nodes = [-1 if task.swapped_node is None else task.swapped_node for task in tasks]
-    return Swap(each(nodes), each([first for _, (first, _) in pairs]), each([second for _, (_, second) in pairs]))
+def _tree_params(tasks: _Different) -> TreeParams:
+    extra_end_step = tasks.each(lambda task: task.extra_end_step, torch.bool)
+    return tree_params(
+        branching_factor=tasks.each(lambda task: task.graph.branching_factor),
+        first_leaf=tasks.each(lambda task: task.graph.num_decision_states),
+        stay_below=tasks.each(lambda task: int(task.graph.wait_prob * 2**63)),
+        extra_end_step=extra_end_step if tasks.some(lambda task: task.extra_end_step) else None,
+        swap=_swap(tasks) if tasks.some(lambda task: task.swapped_branches) else None,
+    )
 
 
-def _observation_params(tasks: tuple[Task, ...], each: MakeTensor, bank: Bank) -> ObservationParams:
-    observations = [task.observations for task in tasks]
-    angles = list(map(_num_angles, tasks))
-    bank_start = each([bank.start[bank_key(task)] for task in tasks])
+def _swap(tasks: _Different) -> Swap:
+    branches = tasks.each(lambda task: task.swapped_branches[1] if task.swapped_branches else (0, 0))
+    node = tasks.each(lambda task: -1 if task.swapped_node is None else task.swapped_node)
+    return Swap(node, branches[:, 0], branches[:, 1])
 
-    def table(of_kind: Callable[[Task, StateType], int]) -> Tensor:
-        """A number for each kind of state of each task, flattened."""
-        values = [of_kind(task, kind) for task in tasks for kind in StateType]
-        return torch.tensor(values, device=bank_start.device, dtype=torch.int64)
+
+def _observation_params(tasks: _Different, bank: Bank) -> ObservationParams:
+    each = tasks.each
+    most_angles = max(map(_num_angles, tasks.tasks))
+    first_kind = len(StateType) * torch.arange(len(tasks.tasks), device=tasks.device)
+
+    def first_view(task: Task, kind: StateType) -> int:
+        return bank.start[bank_key(task)] + _first_view(task, kind)
+
+    def first_noise(task: Task) -> int:
+        return bank.noise_levels.index(task.observations.read_noise) * bank.num_noises
 
     return ObservationParams(
-        first_kind=each([len(StateType) * i for i in range(len(tasks))]) if len(tasks) > 1 else None,
-        first_view=table(lambda task, kind: bank.start[bank_key(task)] + _first_view(task, kind)),
-        views_per_node=table(lambda task, kind: _num_views(task) * _is_by_node(task, kind)),
-        num_ids=table(_num_ids),
-        bank_start=bank_start,
-        num_views=each(list(map(_num_views, tasks))),
-        num_angles=each(angles),
-        read_noise=each([x.read_noise for x in observations]),
-        reward_cue=each([x.reward_cue for x in observations], torch.bool),
-        cue_wraps=each([x.cue_wraps for x in observations], torch.bool),
-        cue_element=each([task.images.shape[-1] - 1 for task in tasks]),
-        white=each([white_level(task.images) for task in tasks], torch.float64),
-        noise_start=each([bank.noise_levels.index(x.read_noise) * bank.num_noises for x in observations]),
-        legacy=_legacy_index(tasks, each, table) if any(x.legacy_index for x in observations) else None,
-        taps=_taps(bank.shape[-1], max(angles), bank_start.device) if max(angles) > 1 else None,
+        first_kind=first_kind if len(tasks.tasks) > 1 else None,
+        first_view=tasks.each_kind(first_view),
+        views_per_node=tasks.each_kind(lambda task, kind: _num_views(task) * _is_by_node(task, kind)),
+        num_ids=tasks.each_kind(_num_ids),
+        bank_start=each(lambda task: bank.start[bank_key(task)]),
+        num_views=each(_num_views),
+        num_angles=each(_num_angles),
+        read_noise=each(lambda task: task.observations.read_noise),
+        reward_cue=each(lambda task: task.observations.reward_cue, torch.bool),
+        cue_wraps=each(lambda task: task.observations.cue_wraps, torch.bool),
+        cue_element=each(lambda task: task.images.shape[-1] - 1),
+        white=each(lambda task: white_level(task.images), torch.float64),
+        noise_start=each(first_noise),
+        legacy=_legacy_index(tasks) if tasks.some(lambda task: task.observations.legacy_index) else None,
+        taps=_taps(bank.shape[-1], most_angles, tasks.device) if most_angles > 1 else None,
     )
 
 
-def _taps(size: int, angles: int, device: torch.device) -> Any:
+def _taps(size: int, angles: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return what rotates an image of a size by each angle."""
-    of_angles = [taps_of(size, angle) for angle in range(angles)]
-    return tuple(torch.stack(part).to(device) for part in zip(*of_angles, strict=True))
+    index, weight = zip(*(taps_of(size, angle) for angle in range(angles)), strict=True)
+    return torch.stack(index).to(device), torch.stack(weight).to(device)
 
 
 def _is_by_node(task: Task, kind: StateType) -> bool:
@@ -154,45 +178,42 @@ def _num_ids(task: Task, kind: StateType) -> int:
     return 1 if task.observations.is_unique(kind) else last - first + 1
 
 
-def _legacy_index(
-    tasks: tuple[Task, ...], each: MakeTensor, table: Callable[[Callable[[Task, StateType], int]], Tensor]
-) -> LegacyIndex:
+def _legacy_index(tasks: _Different) -> LegacyIndex:
     """A level of the tree begins with node (b^k - 1) / (b - 1), which has the legacy number b^k - 1."""
 
-    def level(task: Task, k: int) -> tuple[int, int]:
-        if k > task.graph.depth:
-            return MAX_STATES, 0
-        number = task.graph.branching_factor**k - 1
-        first = number // (task.graph.branching_factor - 1)
-        return first, number - first
+    def first(task: Task, level: int) -> int:
+        return task.graph.first_node(level) if level <= task.graph.depth else MAX_STATES
+
+    def shift(task: Task, level: int) -> int:
+        return task.graph.branching_factor**level - 1 - first(task, level) if level <= task.graph.depth else 0
 
     def num_ids(task: Task, kind: StateType) -> int:
         first, last = task.observations.ids(kind)
         return last - first + 1 if task.observations.legacy_index and task.observations.is_unique(kind) else 1
 
-    levels = range(max(task.graph.depth for task in tasks) + 1)
-    by_level = [[level(task, k) for k in levels] for task in tasks]
+    levels = range(tasks.max_depth + 1)
     return LegacyIndex(
-        level_first=each([[first for first, _ in pairs] for pairs in by_level]),
-        level_shift=each([[shift for _, shift in pairs] for pairs in by_level]),
-        num_ids=table(num_ids),
+        level_first=tasks.each(lambda task: [first(task, level) for level in levels]),
+        level_shift=tasks.each(lambda task: [shift(task, level) for level in levels]),
+        num_ids=tasks.each_kind(num_ids),
     )
 
 
-def _reward_params(tasks: tuple[Task, ...], each: MakeTensor, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
-    changes = [task.goal_change or (0, 0) for task in tasks]
+def _reward_params(tasks: _Different, reward_fns: tuple[RewardFn, ...]) -> RewardParams:
+    each = tasks.each
+    change = each(lambda task: task.goal_change or (0, 0))
     return RewardParams(
-        depth=each([task.graph.depth for task in tasks]),
-        num_leaves=each([task.graph.num_end_states for task in tasks]),
-        reward_fn=each([reward_fns.index(task.reward_fn) for task in tasks]),
-        goal_reward=each([task.goal_reward for task in tasks], torch.float32),
-        fail_reward=each([task.fail_reward for task in tasks], torch.float32),
-        step_reward=each([task.step_reward for task in tasks], torch.float32),
-        reward_std=each([task.reward_std for task in tasks], torch.float32),
-        multiplicative=each([task.reward_noise == "multiplicative" for task in tasks], torch.bool),
-        change_first=each([first for first, _ in changes]),
-        change_last=each([last for _, last in changes]),
-        legacy_change=each([task.legacy_goal_change and bool(task.goal_change) for task in tasks], torch.bool),
+        depth=each(lambda task: task.graph.depth),
+        num_leaves=each(lambda task: task.graph.num_end_states),
+        reward_fn=each(lambda task: reward_fns.index(task.reward_fn)),
+        goal_reward=each(lambda task: task.goal_reward, torch.float32),
+        fail_reward=each(lambda task: task.fail_reward, torch.float32),
+        step_reward=each(lambda task: task.step_reward, torch.float32),
+        reward_std=each(lambda task: task.reward_std, torch.float32),
+        multiplicative=each(lambda task: task.reward_noise == "multiplicative", torch.bool),
+        change_first=change[:, 0],
+        change_last=change[:, 1],
+        legacy_change=each(lambda task: task.legacy_goal_change and bool(task.goal_change), torch.bool),
     )
 
 

@@ -85,7 +85,7 @@ def render(
     n = len(tasks)
     lengths = [len(tensor) for tensor in (state_type, node, goal_leaf, observation)]
     require(
-        (n > 0 and all(length == n for length in lengths), f"render needs N >= 1 rows of each, got {n} and {lengths}"),
+        (n > 0 and set(lengths) == {n}, f"render needs N >= 1 rows of each, got {n} and {lengths}"),
         (observation.ndim in (2, 4), f"observation must be [N, 1, r, r] or [N, K], got {list(observation.shape)}"),
         (is_int(size, MIN_SIZE), f"size must be an integer >= {MIN_SIZE}, got {size!r}"),
     )
@@ -110,8 +110,10 @@ def _show(panels: Pixels, observation: Pixels) -> None:
         images = images.repeat(max(room // longest, 1), axis)
     if one_hot and room >= 4 * longest:
         images[:, :: room // longest] = images[:, :, :: room // longest] = PANEL_GREY
-    top, left = ((size - length) // 2 for length in images.shape[1:])
-    panels[:, top : top + images.shape[1], left : left + images.shape[2]] = images[..., None]
+    height, width = images.shape[1:]
+    top = (size - height) // 2
+    left = (size - width) // 2
+    panels[:, top : top + height, left : left + width] = images[..., None]
 
 
 def _grid(vectors: Pixels) -> Pixels:
@@ -156,13 +158,21 @@ def _picture(graph: CTGraph, size: int, nodes: tuple[int, ...]) -> tuple[Pixels,
     fail = Mark(size * 0.925, size * 0.075, size / 25)
     marks = {HOME_KEY: home, FAIL_KEY: fail}
     stubs = _place_paths(marks, graph, size, gap, nodes) if nodes else _place_all(marks, graph, size, gap)
-    edges = {node: (marks[graph.parent(node)], mark) for node, mark in marks.items() if node >= 0}
-    waits = {node: _middle(*edge) for node, edge in edges.items()}
+    edges = []
+    waits = {}
+    decisions: list[Mark] = []
+    ends: list[Mark] = []
+    for node, mark in marks.items():
+        if node >= 0:
+            parent = marks[graph.parent(node)]
+            edges.append((parent, mark))
+            waits[node] = _middle(parent, mark)
+            (decisions if node < graph.num_decision_states else ends).append(mark)
     canvas = np.full((SCALE * size, SCALE * size), BACKGROUND, np.uint8)
-    _lines(canvas, [*edges.values(), *stubs], size / 192, EDGE)
+    _lines(canvas, [*edges, *stubs], size / 192, EDGE)
     _discs(canvas, [*waits.values(), *(end for _, end in stubs)], StateType.WAIT)
-    _discs(canvas, [mark for node, mark in marks.items() if 0 <= node < graph.num_decision_states], StateType.DECISION)
-    _discs(canvas, [mark for node, mark in marks.items() if node >= graph.num_decision_states], StateType.END)
+    _discs(canvas, decisions, StateType.DECISION)
+    _discs(canvas, ends, StateType.END)
     _discs(canvas, [home], StateType.HOME)
     _discs(canvas, [fail], StateType.FAIL)
     _lines(canvas, _cross(fail, size / 60), size / 96, BACKGROUND)
@@ -173,11 +183,12 @@ def _place_all(marks: Places, graph: CTGraph, size: int, gap: float) -> list[Mar
     """Add every node of a small tree, each level spread over the width. No branch is a stub."""
     b = graph.branching_factor
     for level in range(graph.depth + 1):
-        first = (b**level - 1) // (b - 1)
+        first = graph.first_node(level)
         width = size / b**level
         y = marks[HOME_KEY].y + gap * (level + 1)
         radius = min(size / 32, 0.3 * gap, 0.39 * width)
-        marks |= {first + i: Mark((i + 0.5) * width, y, radius) for i in range(b**level)}
+        for i in range(b**level):
+            marks[first + i] = Mark((i + 0.5) * width, y, radius)
     return []
 
 
@@ -192,13 +203,15 @@ def _place_paths(marks: Places, graph: CTGraph, size: int, gap: float, nodes: tu
     marks[0] = Mark(home.x, home.y + gap, radius)
     for level in range(1, graph.depth + 1):
         drawn = sorted({path[level] for path in paths if len(path) > level})
+        children: dict[int, Places] = {path[level - 1]: {} for path in paths if len(path) >= level}
         for child in drawn:
-            start = marks[graph.parent(child)]
+            parent = graph.parent(child)
+            start = marks[parent]
             column = start.x if len(drawn) == 1 else size * (0.28 if child == drawn[0] else 0.72)
             marks[child] = Mark(start.x + min(max(column - start.x, -fan), fan), start.y + gap, radius)
-        for parent in {path[level - 1] for path in paths if len(path) >= level}:
-            children = {graph.decision(child) - 1: marks[child] for child in drawn if graph.parent(child) == parent}
-            stubs += _stubs(b, marks[parent], children, gap, min(fan, size / 3 / (b - 1)))
+            children[parent][graph.decision(child) - 1] = marks[child]
+        for parent, known in children.items():
+            stubs += _stubs(b, marks[parent], known, gap, min(fan, size / 3 / (b - 1)))
     return stubs
 
 
@@ -224,9 +237,12 @@ def _cross(mark: Mark, reach: float) -> list[MarkLine]:
 
 def _star(canvas: Pixels, mark: Mark, unit: float) -> None:
     """A pentagram below a state, its middle filled."""
-    x, y = mark.x, mark.y + mark.radius + 10.5 * unit
-    turns = [0.8 * math.pi * k for k in range(6)]
-    points = [Mark(x + 5.5 * unit * math.sin(turn), y - 5.5 * unit * math.cos(turn), 0) for turn in turns]
+    x = mark.x
+    y = mark.y + mark.radius + 10.5 * unit
+    points = []
+    for k in range(6):
+        turn = 0.8 * math.pi * k
+        points.append(Mark(x + 5.5 * unit * math.sin(turn), y - 5.5 * unit * math.cos(turn), 0))
     _lines(canvas, list(pairwise(points)), 1.5 * unit, GOAL)
     _discs(canvas, [Mark(x, y, 2 * unit)], GOAL)
 
@@ -248,8 +264,9 @@ def _fill(canvas: Pixels, centres: NDArray[np.float64], offsets: NDArray[np.int6
 
 
 def _discs(canvas: Pixels, marks: list[Mark], colour: int) -> None:
-    for radius in {mark.radius for mark in marks}:
-        _fill(canvas, np.array([mark[:2] for mark in marks if mark.radius == radius]), _ring(-1, radius), colour)
+    circles = np.array(marks)
+    for radius in np.unique(circles[:, 2]).tolist():
+        _fill(canvas, circles[circles[:, 2] == radius, :2], _ring(-1, radius), colour)
 
 
 def _lines(canvas: Pixels, lines: list[MarkLine], width: float, colour: int) -> None:

@@ -66,10 +66,15 @@ class Shown(NamedTuple):
 Batch = TypeVar("Batch", RowState, Shown)
 
 
+def beside(rows: Tensor, value: Tensor) -> Tensor:
+    """Return a number of each row, [N] or [N, 1], in the form that broadcasts with a value, [N, ...]."""
+    return rows.view(-1, *[1] * (value.ndim - 1))
+
+
 def choose(mask: Tensor, new: Batch, old: Batch) -> Batch:
     """Return one value in the rows of a mask, bool [N], and another value in the others."""
     pairs = zip(new, old, strict=True)
-    return type(new)(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+    return type(new)(*(torch.where(beside(mask, a), a, b) for a, b in pairs))
 
 
 OUTCOME_RUNNING, OUTCOME_FAIL, OUTCOME_OTHER_END, OUTCOME_GOAL = range(4)

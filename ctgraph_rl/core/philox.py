@@ -42,10 +42,14 @@ def by_tensors(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(_ROUNDS):
-        (even_high, even_low), (odd_high, odd_low) = _product(c0, _MULTIPLIERS[0]), _product(c2, _MULTIPLIERS[1])
-        c0, c1 = (odd_high ^ c1 ^ k0) & _WORD, odd_low
-        c2, c3 = (even_high ^ c3 ^ k1) & _WORD, even_low
-        k0, k1 = (k0 + _KEY_STEPS[0]) & _WORD, (k1 + _KEY_STEPS[1]) & _WORD
+        even_high, even_low = _product(c0, _MULTIPLIERS[0])
+        odd_high, odd_low = _product(c2, _MULTIPLIERS[1])
+        c0 = (odd_high ^ c1 ^ k0) & _WORD
+        c1 = odd_low
+        c2 = (even_high ^ c3 ^ k1) & _WORD
+        c3 = even_low
+        k0 = (k0 + _KEY_STEPS[0]) & _WORD
+        k1 = (k1 + _KEY_STEPS[1]) & _WORD
     return c0, c1, c2, c3
 
 
@@ -113,7 +117,8 @@ def randint(word: Tensor, high: Tensor | int) -> Tensor:
 def randint_wide(words: tuple[Tensor, Tensor], high: Tensor) -> Tensor:
     """Two words as an integer in [0, high) for any high up to 2**62; off by less than 2**-64 per value."""
     upper, lower = words
-    high_upper, high_lower = high >> 32, high & _WORD
+    high_upper = high >> 32
+    high_lower = high & _WORD
     middle_high, middle_low = _product(upper, high_lower)
     carry = (_product(lower, high_lower)[0] & _WORD) + middle_low + lower * high_upper
     return upper * high_upper + (middle_high & _WORD) + (carry >> 32)
@@ -140,6 +145,7 @@ def normal(word: Tensor, table: Tensor) -> Tensor:
     tail = ((word >> 1).to(torch.float64) + 0.5).view(torch.int64)  # the bits of a double: octave, cell, place in it
     cell = (tail >> 44) - (1022 << 8)
     place = (tail & ((1 << 44) - 1)).to(torch.float64) * 2.0**-44
-    low, high = table[cell], table[cell + 1]
+    low = table[cell]
+    high = table[cell + 1]
     size = ((low + (high - low) * place) / _NORMAL_UNIT).round() * _NORMAL_UNIT
     return torch.where((word & 1).bool(), size, -size)

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ctgraph_rl.batch.specs import Specs, specs_of
 from ctgraph_rl.checks import Rule, at_least_one, is_int, require
-from ctgraph_rl.core.dynamics import RowState
+from ctgraph_rl.core.dynamics import RowState, beside
 from ctgraph_rl.core.region import Region, captures
 from ctgraph_rl.core.row_params import RowParams
 from ctgraph_rl.env import CTGraphEnv
@@ -177,7 +177,7 @@ def act(env: EnvBase, policy: Policy, data: Step, start: Step) -> tuple[Step, St
     step, following = take_step(env, data)
     for key, value in start.items():
         state = step["next", key]
-        begins = following["is_init"].view(-1, *[1] * (value.ndim - 1))
+        begins = beside(following["is_init"], value)
         following[key] = state if TRIAL in start else torch.where(begins, value, state)
     return step, following
 

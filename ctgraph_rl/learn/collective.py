@@ -198,7 +198,8 @@ class _Learner:
         try:
             yield
         finally:
-            self.random, self.random_cuda = torch.get_rng_state(), self._cuda_state()
+            self.random = torch.get_rng_state()
+            self.random_cuda = self._cuda_state()
             torch.set_rng_state(before)
             self._set_cuda_state(before_cuda)
 

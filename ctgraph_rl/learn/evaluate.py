@@ -85,7 +85,9 @@ def evaluate(
     require((callable(policy), f"policy must be a function or a module that writes actions, got {policy!r:.80}"))
     require((not bound, f"{type(policy).__name__} acts in the environment that it was built on: give the class itself"))
     device = checked_device(device)
-    rows = [task for task in tasks for _ in range(num_episodes // episodes_per_row)]
+    rows: list[TaskLike] = []
+    for task in tasks:
+        rows += [task] * (num_episodes // episodes_per_row)
     if curriculum is None:
         env = type(tasks[0]).make_env(rows, seed, device=device)
     else:
@@ -145,7 +147,8 @@ class LogitsPolicy:
     """
 
     def __init__(self, module: nn.Module, num_actions: int) -> None:
-        self.module, self.num_actions = module, num_actions
+        self.module = module
+        self.num_actions = num_actions
         self._takes_ids = _takes_ids(module.forward)
 
     def __call__(self, data: TensorDictBase) -> TensorDictBase:
@@ -161,7 +164,8 @@ class LogitsPolicy:
         Raises:
             ValueError: if the module fails or gives anything else; says what to write.
         """
-        name, shape = type(self.module).__name__, list(data["observation"].shape)
+        name = type(self.module).__name__
+        shape = list(data["observation"].shape)
         wanted = (
             f"a plain module must map observations, float {shape}, to logits, float [{shape[0]}, {self.num_actions}]"
         )
@@ -279,7 +283,10 @@ class Evaluator:
     """
 
     def __init__(self, curriculum: Curriculum, seed: int, log: RunLog, device: torch.device | str = "cpu") -> None:
-        self.curriculum, self.seed, self.log, self.device = curriculum, seed, log, device
+        self.curriculum = curriculum
+        self.seed = seed
+        self.log = log
+        self.device = device
 
     def evaluate_if_due(self, agent: Agent, frames: int) -> None:
         """Evaluate an agent where the curriculum evaluates after ``frames`` frames of the run."""
@@ -290,7 +297,8 @@ class Evaluator:
 
     def evaluate(self, policy: Policy, frames: int, moment: str, initial_state: InitialState | None = None) -> None:
         """Evaluate a policy after ``frames`` frames and append one line for each task."""
-        tasks, curriculum = self.tasks_at(frames), self.curriculum
+        tasks = self.tasks_at(frames)
+        curriculum = self.curriculum
         if not tasks:
             return
         how = curriculum.evaluation

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -21,12 +22,12 @@ def task_labels(log: RunLog, curriculum: Curriculum) -> dict[int, int]:
     """
     acted, blocks, ends = (log.training(name).tolist() for name in ("acted_label", "block", "frames"))
     starts = [0.0, *ends]
-    parts = [
-        (task, int(label) - 1, (end - start) / len(curriculum.trained[int(block) - 1]))
-        for label, block, end, start in zip(acted, blocks, ends, starts, strict=False)
-        if label == label  # unless it is NaN
-        for task in curriculum.trained[int(block) - 1]
-    ]
+    parts = []
+    for label, block, end, start in zip(acted, blocks, ends, starts, strict=False):
+        if not math.isnan(label):
+            trained = curriculum.trained[int(block) - 1]
+            for task in trained:
+                parts.append((task, int(label) - 1, (end - start) / len(trained)))
     return most_frequent(*zip(*parts, strict=True)) if parts else {}
 
 

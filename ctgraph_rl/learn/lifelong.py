@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any
 
 import torch
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import NamedValues, takes_numbers
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.loop import Alone, Lockstep, Progress, run_loop
 from ctgraph_rl.learn.progress import ProgressBar
@@ -28,7 +27,7 @@ def learn_curriculum(
     log: RunLog | None = None,
     progress: Progress | bool | None = None,
     device: torch.device | str = "cpu",
-    saved: Mapping[str, Any] | None = None,
+    saved: ReadOnlyValues | None = None,
     checkpoint: OfferCheckpoint | None = None,
 ) -> RunLog:
     """Let an agent learn a curriculum block by block, evaluated as the curriculum says.

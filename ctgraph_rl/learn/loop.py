@@ -7,7 +7,7 @@ learn as one. Learners that exchange messages are a `Lockstep` each, and `ctgrap
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Protocol
@@ -17,15 +17,15 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from ctgraph_rl.agent import Agent
-from ctgraph_rl.checks import NamedValues
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues
 from ctgraph_rl.learn.collect import Policy, make_env
 from ctgraph_rl.learn.evaluate import Evaluator
-from ctgraph_rl.learn.rules import check_adaptation, check_env, check_ids, check_rows, resumes
+from ctgraph_rl.learn.refusals import check_adaptation, check_env, check_ids, check_rows, resumes
 from ctgraph_rl.learn.segments import Segment, announced_id, collect_segment, guided, log_training, segments
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 
-SavedState = Mapping[str, Any]
+SavedState = ReadOnlyValues
 """All that the rest of a member's run depends on, as tensors and plain values."""
 
 

@@ -71,7 +71,7 @@ def collect_segment(
     """
     ends = list(accumulate(block.num_frames for block in segment.blocks))
     following = dict(zip(ends, segment.blocks[1:], strict=False))
-    _set_tasks(env, segment.blocks[sum(end <= done for end in ends[:-1])], num_seeds)
+    _set_tasks(env, segment.blocks[bisect_right(ends[:-1], done)], num_seeds)
     carried = None if restore is None else restore()
     num_rows = env.numel() // num_seeds
     guide = Guide(policy, env, guide_frames) if done < guide_frames else None

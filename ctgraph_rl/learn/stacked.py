@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 
-from ctgraph_rl.checks import takes_numbers
+from ctgraph_rl.checks import NamedValues, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.learn.loop import Group, Lockstep, Progress, SavedState, run_loop
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.tasks.curriculum import Curriculum
 from ctgraph_rl.tasks.task import are_graphs
 
-OfferCheckpoints = Callable[[Callable[[], list[dict[str, Any]]], bool], object]
+OfferCheckpoints = Callable[[Callable[[], list[NamedValues]], bool], object]
 """Takes a function that makes the state of each seed's run, and whether a block ends here."""
 
 

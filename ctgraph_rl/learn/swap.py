@@ -53,18 +53,22 @@ def changed_decisions(
         "task and swapped must differ in their wait images only: use curricula.axes.new_images(task, 2, ('wait',))"
     )
     require((replace(swapped, observations=same) == task, differs), *at_least_one(num_episodes=num_episodes))
-    envs = [CTGraphEnv([each] * num_episodes, seed=seed) for each in (task, swapped)]
-    starts = [start_of_episodes(env, initial_state) for env in envs]
-    data = [dict(env.reset().update(start).items(True, True)) for env, start in zip(envs, starts, strict=True)]
+    envs = []
+    data = []
+    for each in (task, swapped):
+        env = CTGraphEnv([each] * num_episodes, seed=seed)
+        start = start_of_episodes(env, initial_state)
+        envs.append(env)
+        data.append(dict(env.reset().update(start).items(True, True)))
     running = torch.ones(num_episodes, dtype=torch.bool, device=envs[0].device)
     changed = 0
     decided = 0
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while running.any():
             decides = running & (envs[0].state_type == StateType.DECISION)
-            step, data[0] = act(envs[0], policy, data[0], starts[0])
+            step, data[0] = act(envs[0], policy, data[0], start)
             follower = _Follower(policy, step["action"])
-            _, data[1] = act(envs[1], follower, data[1], starts[1])
+            _, data[1] = act(envs[1], follower, data[1], start)
             changed += int((decides & (follower.own != step["action"])).sum())
             decided += int(decides.sum())
             running &= ~step["next", "done"].squeeze(-1)

@@ -114,8 +114,7 @@ def continual_world_performance(curves: Curves, last: int = 1) -> Tensor:
         curves: the evaluations of a run.
         last: evaluations that "at the end" is the mean of: 1 as in the paper, 5 as in its code.
     """
-    tasks = range(curves.performance.shape[1])
-    return torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
+    return _final(curves, last)
 
 
 @defined(
@@ -136,7 +135,13 @@ def continual_world_forgetting(curves: Curves, last: int = 1) -> Tensor:
     """
     tasks = range(curves.performance.shape[1])
     own = torch.stack([curves.at_end_of(curves.own_block(task), task, last) for task in tasks])
-    return own - torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
+    return own - _final(curves, last)
+
+
+def _final(curves: Curves, last: int) -> Tensor:
+    """Return the performance on each task at the very end, [tasks]."""
+    tasks = range(curves.performance.shape[1])
+    return torch.stack([curves.at_end_of(len(curves.trained), task, last) for task in tasks])
 
 
 @defined("ben-iwhiwhu2022/icr", "sum_j p_j(end)", LABS, aggregate=lambda returns: returns[-1], bounds=of_sums)

@@ -13,11 +13,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import between, not_negative, of_performance
-from ctgraph_rl.metrics.record import HERE, Undefined, defined
+from ctgraph_rl.metrics.record import HERE, Undefined, defined, float64
 
 HUBERT = "Hubert & Arabie 1985, Comparing partitions (Journal of Classification 2)"
 
@@ -79,7 +78,7 @@ def false_alarms(labelling: Labelling) -> Tensor:
     """Return the alarms per 100,000 frames that are not the first ones after a change of task."""
     detected = int((~_delays(labelling).isnan()).sum())
     rate = PER * (int(labelling.alarm.sum()) - detected) / int(labelling.frames.sum())
-    return torch.tensor([rate], dtype=torch.float64, device="cpu")
+    return float64([rate])
 
 
 @defined("ctgraph_rl/labels-per-task", "labels learned with / tasks trained", HERE, bounds=not_negative)
@@ -88,7 +87,7 @@ def labels_per_task(labelling: Labelling) -> Tensor:
     labelling.check_one_task_each()
     labels = labelling.acted[labelling.learned].unique()
     tasks = labelling.task.unique()
-    return torch.tensor([len(labels) / len(tasks)], dtype=torch.float64, device="cpu")
+    return float64([len(labels) / len(tasks)])
 
 
 @defined(
@@ -104,7 +103,7 @@ def label_agreement(labelling: Labelling) -> Tensor:
     1: each task has its own label, whatever its number. 0 is expected of labels without relation to the tasks.
     """
     labelling.check_one_task_each()
-    return torch.tensor([adjusted_rand_index(*labelling[:3])], dtype=torch.float64, device="cpu")
+    return float64([adjusted_rand_index(*labelling[:3])])
 
 
 @defined("ctgraph_rl/frames-not-learned", "frames of batches that were not learned from", HERE, bounds=not_negative)
@@ -191,4 +190,4 @@ def _delays(labelling: Labelling) -> Tensor:
     alarms = ends[labelling.alarm].tolist()
     spans = pairwise([*changes, math.inf])
     delays = [next((alarm - start for alarm in alarms if start <= alarm < stop), math.nan) for start, stop in spans]
-    return torch.tensor(delays, dtype=torch.float64, device="cpu")
+    return float64(delays)

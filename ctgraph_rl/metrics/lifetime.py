@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
-from ctgraph_rl.metrics.record import defined
+from ctgraph_rl.metrics.record import defined, float64
 from ctgraph_rl.metrics.regimes import Regime, RegimeTable
 
 NEW = "New et al. 2022, Lifelong learning metrics (arXiv 2201.08278), as in l2metrics 3.1.0"
@@ -78,14 +78,16 @@ def prepare(regimes: Regimes, experts: Experts | None = None, ranges: Ranges | N
     smoothed = table.replaced(values)
     expert_curves = {task: [smooth(curve) for curve in curves] for task, curves in (experts or {}).items()}
     scales = _ranges(smoothed, expert_curves) if ranges is None else ranges
-    low, high = (
-        torch.tensor([scales[task][i] for task in table.names], dtype=torch.float64, device="cpu") for i in (0, 1)
-    )
+    limits = float64([scales[task] for task in table.names]).view(-1, 2)
+    low, high = limits.unbind(1)
     of_task = torch.from_numpy(table.task.repeat(table.length))
     scaled = smoothed.replaced(_scaled(smoothed.values, low[of_task], high[of_task]))
-    known = {task: curves for task, curves in expert_curves.items() if task in scales}
-    limits = {task: torch.tensor(scales[task], dtype=torch.float64, device="cpu") for task in known}
-    return scaled, {task: [_scaled(curve, *limits[task]) for curve in curves] for task, curves in known.items()}
+    scaled_experts = {}
+    for task, curves in expert_curves.items():
+        if task in scales:
+            ends = float64(scales[task])
+            scaled_experts[task] = [_scaled(curve, *ends) for curve in curves]
+    return scaled, scaled_experts
 
 
 ON_THE_SCALE = from_failure_to_best(OFFSET, OFFSET + SCALE)
@@ -101,7 +103,7 @@ of_tasks = partial(defined, source=NEW, partial=True, missing="a task has none")
 def mean_training_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over training regimes of their mean performance."""
     table = RegimeTable.of(regimes)
-    return _tensor([_mean([table.values_of(i).mean().item() for i in own]) for own in table.places(training=True)])
+    return float64([_mean([table.values_of(i).mean().item() for i in own]) for own in table.places(training=True)])
 
 
 @of_tasks(
@@ -112,7 +114,7 @@ def mean_training_performance(regimes: Regimes) -> Tensor:
 def mean_evaluation_performance(regimes: Regimes) -> Tensor:
     """Mean over tasks of the mean over evaluations of their mean performance."""
     table = RegimeTable.of(regimes)
-    return _tensor([_mean(table.terminal[own].tolist()) for own in table.places(training=False)])
+    return float64([_mean(table.terminal[own].tolist()) for own in table.places(training=False)])
 
 
 @of_tasks(
@@ -128,7 +130,7 @@ def performance_recovery(regimes: Regimes) -> Tensor:
     Theil-Sen's. A task needs three training regimes.
     """
     table = RegimeTable.of(regimes)
-    return _tensor([-theil_sen(recovery_times([table[i] for i in own])) for own in table.places(training=True)])
+    return float64([-theil_sen(recovery_times([table[i] for i in own])) for own in table.places(training=True)])
 
 
 @of_tasks(
@@ -228,8 +230,11 @@ def relative_performance(regimes: Regimes, experts: Experts) -> Tensor:
 
     def of_task(curves: Sequence[Tensor], trainings: list[int]) -> float:
         own = _joined(table, trainings)
-        pairs = [(curve[: len(own)], own[: len(curve)]) for curve in curves]
-        return _mean([_quotient(expert.sum().item(), trained.sum().item()) for expert, trained in pairs])
+        ratios = []
+        for curve in curves:
+            expert = curve[: len(own)].sum().item()
+            ratios.append(_quotient(expert, own[: len(curve)].sum().item()))
+        return _mean(ratios)
 
     return _against(table, experts, of_task)
 
@@ -306,7 +311,7 @@ def _maintenance(table: RegimeTable, to_evaluation: bool) -> Tensor:
             reference[task] = terminal[i]
         elif trained is not None and evaluated is not None:
             changes[task].append(terminal[i] - (evaluated if to_evaluation else trained))
-    return _tensor(list(map(_mean, changes)))
+    return float64(list(map(_mean, changes)))
 
 
 def _transfer(regimes: Regimes, measure: Measure, forward: bool) -> Tensor:
@@ -338,7 +343,8 @@ def _values_around_training(table: RegimeTable, measure: Measure) -> tuple[Any, 
     before = ordered[:-1]
     after = ordered[1:]
     changes = np.flatnonzero(np.diff(table.task[trained], prepend=-1))  # where other trainings begin
-    start, end = (np.searchsorted(trained, places) for places in (before, after))
+    start = np.searchsorted(trained, before)
+    end = np.searchsorted(trained, after)
     of_end = np.searchsorted(changes, end, "left") - 1
     alone = (table.task[before] == table.task[after]) & (end > start)
     alone[alone] &= changes[of_end[alone]] <= start[alone]
@@ -366,16 +372,21 @@ def _joined(table: RegimeTable, places: Sequence[int]) -> Tensor:
 
 def _against(table: RegimeTable, experts: Experts, value: Callable[[Sequence[Tensor], list[int]], float]) -> Tensor:
     """A value for each task that is trained, in the order of first appearance; NaN for one without experts."""
-    trained = zip(table.names, table.places(training=True), strict=True)
-    return _tensor([value(experts[task], own) if experts.get(task) else math.nan for task, own in trained if own])
+    values = []
+    for task, own in zip(table.names, table.places(training=True), strict=True):
+        if own:
+            values.append(value(experts[task], own) if experts.get(task) else math.nan)
+    return float64(values)
 
 
 def _ranges(table: RegimeTable, experts: Experts) -> Ranges:
     """Lowest and highest value of each task and its experts."""
     both = zip(table.names, table.places(training=True), table.places(training=False), strict=True)
-    curves = {task: [_joined(table, [*own, *tests]), *experts.get(task, [])] for task, own, tests in both}
-    values = {task: torch.cat(of_task) for task, of_task in curves.items()}
-    return {task: (each.min().item(), each.max().item()) for task, each in values.items()}
+    ranges = {}
+    for task, own, tests in both:
+        values = torch.cat([_joined(table, [*own, *tests]), *experts.get(task, [])])
+        ranges[task] = values.min().item(), values.max().item()
+    return ranges
 
 
 def _scaled(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -384,7 +395,3 @@ def _scaled(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values) if values else math.nan
-
-
-def _tensor(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ctgraph_rl.metrics.bounds import between, from_failure_to_best, not_negative
-from ctgraph_rl.metrics.record import HERE, MASTERED, defined, ratio
+from ctgraph_rl.metrics.record import HERE, MASTERED, defined, float64, ratio
 
 PAPER = "closed forms of Soltoggio et al. 2023 (arXiv 2302.10887)"
 
@@ -105,9 +105,7 @@ def frames_to_first_reward(
         success_rates: for each task, share of each interval's episodes that reached the goal; NaN without episodes.
         random_frames: for each task, `ctgraph_rl.tasks.values.random_frames_to_goal`.
     """
-    return _at_first_success(frames, episodes, success_rates) / torch.tensor(
-        random_frames, dtype=torch.float64, device="cpu"
-    )
+    return _at_first_success(frames, episodes, success_rates) / float64(random_frames)
 
 
 @of_first_success(
@@ -131,13 +129,13 @@ def search_efficiency(
     """
     played = [each.cumsum(0) for each in episodes]
     first = _at_first_success(played, episodes, success_rates)
-    return torch.tensor(expected_episodes, dtype=torch.float64, device="cpu") / first
+    return float64(expected_episodes) / first
 
 
 def _at_first_success(counts: Sequence[Tensor], episodes: Sequence[Tensor], success_rates: Sequence[Tensor]) -> Tensor:
     """For each task, the count at the first success, float64 [tasks]; NaN without one."""
     tasks = zip(counts, episodes, success_rates, strict=True)
-    return torch.tensor([_count_at_first_success(*task) for task in tasks], dtype=torch.float64, device="cpu")
+    return float64([_count_at_first_success(*task) for task in tasks])
 
 
 def _count_at_first_success(counts: Tensor, episodes: Tensor, success_rates: Tensor) -> float:

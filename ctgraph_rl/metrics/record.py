@@ -144,7 +144,7 @@ def defined(
             given = given_as.bind(*args, **kwargs)
             for name in tensors:
                 if isinstance(given.arguments.get(name), (list, tuple, np.ndarray)):
-                    given.arguments[name] = torch.tensor(given.arguments[name], dtype=torch.float64, device="cpu")
+                    given.arguments[name] = float64(given.arguments[name])
             return _measured(*given.args, **given.kwargs)
 
         def _measured(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Metric:
@@ -167,20 +167,28 @@ def _register(
     """List a metric with the inputs of its arguments."""
     name = metric.__name__
     arguments = signature(metric).parameters
-    sources = {argument: renamed.get(argument, argument) for argument in arguments}
-    required = [argument for argument, each in arguments.items() if each.default is Parameter.empty]
-    options = arguments.keys() - {*required, *(each for each in sources if sources[each] in INPUTS)}
-    misspelt = [each for each in options if get_close_matches(each, INPUTS, cutoff=0.8)]
-    stars = [each for each in required if arguments[each].kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)]
-    unknown = [*(renamed.keys() - arguments.keys()), *(each for each in required if sources[each] not in INPUTS)]
-    unknown += [*misspelt, *stars, *([] if required else ["any argument"])]
+    inputs = {}
+    required = []
+    unknown = [*(renamed.keys() - arguments.keys())]
+    for argument, each in arguments.items():
+        source = renamed.get(argument, argument)
+        if source in INPUTS:
+            inputs[argument] = source
+        if each.default is Parameter.empty:
+            required.append(source)
+            is_star = each.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+            is_wrong = is_star or source not in INPUTS
+        else:
+            is_wrong = source not in INPUTS and bool(get_close_matches(argument, INPUTS, cutoff=0.8))
+        if is_wrong:
+            unknown.append(argument)
+    if not required:
+        unknown.append("any argument")
     if unknown:
         raise ValueError(f"metric {name}: no input for {', '.join(unknown)}. Inputs: {', '.join(INPUTS)}")
     if name in METRICS or meaning.id in (entry.meaning.id for entry in METRICS.values()):
         raise ValueError(f"metric {name} ({meaning.id}): another metric has its name or its id; choose others")
-    inputs = {argument: source for argument, source in sources.items() if source in INPUTS}
-    needed = tuple(sources[argument] for argument in required)
-    METRICS[name] = Entry(metric, meaning, inputs, required=needed, bounds=bounds, is_time=is_time)
+    METRICS[name] = Entry(metric, meaning, inputs, required=tuple(required), bounds=bounds, is_time=is_time)
 
 
 def undefined(metric: Callable[..., Metric], reason: str) -> Metric:
@@ -206,3 +214,8 @@ def _metric(meaning: Definition, terms: Tensor, missing: str, aggregate: Callabl
 def ratio(above: Tensor, below: Tensor) -> Tensor:
     """``above / below``, NaN where ``below`` is 0."""
     return torch.where(below == 0, torch.nan, above / below)
+
+
+def float64(values: Any) -> Tensor:
+    """Return numbers as a tensor on the CPU."""
+    return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from ctgraph_rl.checks import by_name
 from ctgraph_rl.log.run_log import RunLog
 from ctgraph_rl.log.scores import mastered_returns, optimal_values
 from ctgraph_rl.metrics import Undefined
@@ -134,9 +135,9 @@ def teaches(run: Evidence) -> Measured:
     return Measured(max(0.0, share), 0.0, 1.0)
 
 
-MEASURES: Mapping[str, Callable[..., Measured]] = {
-    each.__name__: each for each in (above_ceiling, above_random_search, faster, held_out, searches, teaches)
-}
+MEASURES: Mapping[str, Callable[..., Measured]] = by_name(
+    above_ceiling, above_random_search, faster, held_out, searches, teaches
+)
 """The measures by name, as a table of properties names them."""
 
 

@@ -19,7 +19,7 @@ from ctgraph_rl.agent import Agent, MethodLike
 from ctgraph_rl.checks import NamedValues, ReadOnlyValues, plain, require, takes_numbers
 from ctgraph_rl.core.device import checked_device
 from ctgraph_rl.disk import is_writable
-from ctgraph_rl.learn.rules import notes
+from ctgraph_rl.learn.refusals import notes
 from ctgraph_rl.log.files import CHECKPOINTS, CURRICULUM, LOG, METRICS, locked
 from ctgraph_rl.log.provenance import code, code_changes, is_unknown, learners, versions
 from ctgraph_rl.log.run_log import RunLog

@@ -33,7 +33,7 @@ from ctgraph_rl.learn.collect import agent_specs
 from ctgraph_rl.learn.lifelong import learn_curriculum
 from ctgraph_rl.learn.loop import Group
 from ctgraph_rl.learn.progress import ProgressBar
-from ctgraph_rl.learn.rules import check_adaptation, check_ids, check_rows
+from ctgraph_rl.learn.refusals import check_adaptation, check_ids, check_rows
 from ctgraph_rl.learn.stacked import learn_together
 from ctgraph_rl.log.damage import damaged
 from ctgraph_rl.log.escape import terminal_text

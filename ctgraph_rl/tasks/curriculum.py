@@ -82,7 +82,7 @@ class Curriculum:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: a table of the first blocks."""
         labels = dict(zip(self.tasks, self.labels, strict=True))
-        head = "".join(f"<th>{name}</th>" for name in ("block", "tasks", "b, d, p", "frames"))
+        head = "<th>block</th><th>tasks</th><th>b, d, p</th><th>frames</th>"
         rows = [_block_html(number, block, labels) for number, block in enumerate(self.blocks[:SHOWN], 1)]
         more = f"<p>and {len(self.blocks) - SHOWN:,} more blocks</p>" if len(self.blocks) > SHOWN else ""
         source = escape(f"{self._summary}. {self.source}")
@@ -98,10 +98,10 @@ class Curriculum:
         shapes = list(dict.fromkeys(task.observation_shape for task in everything))
         actions = list(dict.fromkeys(task.num_actions for task in everything))
         pads = are_graphs(everything)
-        one_shape = len(shapes) == 1 or (pads and all(len(shape) == 1 for shape in shapes))
+        one_shape = len(shapes) == 1 or (pads and max(map(len, shapes)) == 1)
         trained = set(self.tasks)
         trained_too = [task for task in self.evaluation.held_out if task in trained]
-        one_each = self.protocol.task_id != "at_boundaries" or all(len(set(block.tasks)) == 1 for block in self.blocks)
+        one_each = self.protocol.task_id != "at_boundaries" or max(map(len, self.trained)) == 1
         how = self.evaluation
         at_once = how.before and (how.tasks == "all" or bool(how.held_out))
         evaluates = how.at_block_ends or at_once or 0 < how.every <= self.num_frames
@@ -122,7 +122,7 @@ class Curriculum:
     @cached_property
     def num_frames(self) -> int:
         """Frames of all blocks."""
-        return sum(block.num_frames for block in self.blocks)
+        return self.ends[-1]
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
@@ -153,7 +153,7 @@ class Curriculum:
         """All numbers of frames after which an evaluation is due."""
         every = self.evaluation.every
         within = range(every, self.num_frames + 1, every) if every else ()
-        return tuple(frames for frames in sorted({0, *self.ends, *within}) if self.moment(frames) is not None)
+        return tuple(filter(self.moment, sorted({0, *self.ends, *within})))
 
     @property
     def segments(self) -> tuple[tuple[Block, ...], ...]:
@@ -179,10 +179,15 @@ class Curriculum:
         """`labels`, and in the same manner those of the held-out tasks."""
         parts = [task.label_parts for task in (*self.tasks, *self.evaluation.held_out)]
         first = next(iter(parts[0]))
-        differing = [name for name in parts[0] if name == first or len({part.get(name) for part in parts}) > 1]
+        differing = []
+        for name in parts[0]:
+            values = {part.get(name) for part in parts}
+            if name == first or len(values) > 1:
+                differing.append(name)
         counts: Counter[str] = Counter()
         labels = []
-        for label in ("-".join(part.get(name, "") for name in differing) for part in parts):
+        for part in parts:
+            label = "-".join(part.get(name, "") for name in differing)
             counts[label] += 1
             labels.append(f"{label}#{counts[label]}" if counts[label] > 1 else label)
         return tuple(labels)
@@ -191,7 +196,10 @@ class Curriculum:
     def trained(self) -> tuple[tuple[int, ...], ...]:
         """For each block, the positions in ``tasks`` of the tasks that it trains."""
         position = {task: number for number, task in enumerate(self.tasks)}
-        return tuple(tuple(position[task] for task in dict.fromkeys(block.tasks)) for block in self.blocks)
+        trained = []
+        for block in self.blocks:
+            trained.append(tuple(position[task] for task in dict.fromkeys(block.tasks)))
+        return tuple(trained)
 
     def to_json(self, path: str | PathLike[str] | None = None) -> dict[str, Any]:
         """This curriculum as JSON with every field written out; see `ctgraph_rl.tasks.curriculum_json`.
@@ -227,11 +235,14 @@ class Curriculum:
 
 def _block_html(number: int, block: Block, labels: Mapping[TaskLike, str]) -> str:
     """Return a row of the table of a notebook."""
-    tasks = list(dict.fromkeys(block.tasks))
-    of_tasks = [task.graph for task in tasks if isinstance(task, Task)]
-    graphs = dict.fromkeys((graph.branching_factor, graph.depth, graph.wait_prob) for graph in of_tasks)
-    shapes = [f"{b}, {d}, {p:g}" for b, d, p in graphs]
-    cells = (str(number), _some([labels[task] for task in tasks]), _some(shapes, "; "), f"{block.num_frames:,}")
+    names = []
+    shapes = {}
+    for task in dict.fromkeys(block.tasks):
+        names.append(labels[task])
+        if isinstance(task, Task):
+            graph = task.graph
+            shapes[graph] = f"{graph.branching_factor}, {graph.depth}, {graph.wait_prob:g}"
+    cells = (str(number), _some(names), _some(list(shapes.values()), "; "), f"{block.num_frames:,}")
     return f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
 
 

@@ -22,7 +22,7 @@ from os.path import lexists
 from typing import TYPE_CHECKING, Any
 
 from ctgraph_rl import __version__
-from ctgraph_rl.checks import NamedValues, ReadOnlyValues, is_int, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, are_ints, by_name, is_int, require
 from ctgraph_rl.core.graph import CTGraph
 from ctgraph_rl.core.rewards import REWARD_FNS
 from ctgraph_rl.disk import write_whole
@@ -67,26 +67,26 @@ TASK_KINDS: dict[str, type] = {GymTask.__name__: GymTask}
 def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = None) -> NamedValues:
     """Return a curriculum as JSON; see `Curriculum.to_json`."""
     require((path is None or not lexists(path), f"{path} exists: choose another path, nothing is overwritten"))
-    places: dict[TaskLike, int] = {
-        task: i for i, task in enumerate((*curriculum.tasks, *curriculum.evaluation.held_out))
-    }
-    content = {
+    tasks = (*curriculum.tasks, *curriculum.evaluation.held_out)
+    places: dict[TaskLike, int] = {task: i for i, task in enumerate(tasks)}
+    content: NamedValues = {
         "schema": SCHEMA,
-        **{name: getattr(curriculum, name) for name in ("fingerprint", "name", "version", "source")},
+        "fingerprint": curriculum.fingerprint,
+        "name": curriculum.name,
+        "version": curriculum.version,
+        "source": curriculum.source,
         "tasks": [_plain_task(task) for task in places],
-        "blocks": [_plain(block, places) for block in curriculum.blocks],
+        "blocks": _plain(curriculum.blocks, places),
         "evaluation": _plain(curriculum.evaluation, places),
         "protocol": _plain(curriculum.protocol, places),
     }
     with _within(curriculum.name):
         _check_form(content)
-    content[_DERIVED] = {
-        "written_by": f"ctgraph_rl {__version__}",
-        "num_frames": curriculum.num_frames,
-        "tasks": [
-            {"label": label} | _of_graph(task) for label, task in zip(curriculum.labels, curriculum.tasks, strict=True)
-        ],
-    }
+    about = []
+    for label, task in zip(curriculum.labels, curriculum.tasks, strict=True):
+        about.append({"label": label} | _of_graph(task))
+    written_by = f"ctgraph_rl {__version__}"
+    content[_DERIVED] = {"written_by": written_by, "num_frames": curriculum.num_frames, "tasks": about}
     if path is not None:
         write_whole(path, file_text(content))
     return content
@@ -95,12 +95,14 @@ def write_curriculum(curriculum: Curriculum, path: str | PathLike[str] | None = 
 def read_curriculum(path_or_dict: str | PathLike[str] | ReadOnlyValues, make: Callable[..., Curriculum]) -> Curriculum:
     """Return the curriculum of a JSON file or of its content, which ``make`` makes; see `Curriculum.from_json`."""
     source, content = json_object(path_or_dict, "curriculum", MAX_BYTES, MAX_NESTING)  # `_check_form` knows numbers
+    content = dict(content)
+    content.pop(_DERIVED, None)
     with _within(source):
-        _check_form({key: value for key, value in content.items() if key != _DERIVED})
+        _check_form(content)
         schema = content.get("schema")
         newer = f"schema {schema} is newer than {SCHEMA}, the newest that is known here; update ctgraph_rl"
         require((not is_int(schema, SCHEMA + 1), newer))
-        _check_keys(content, _KEYS, optional=(_DERIVED,))
+        _check_keys(content, _KEYS)
         require((schema == SCHEMA, f"schema must be {SCHEMA}, got {schema!r}"))
         curriculum = make(**_parts(content))
         stated = content["fingerprint"]
@@ -119,8 +121,11 @@ def _plain(value: Any, places: Mapping[TaskLike, int]) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     require((type(value) in _OURS, f"JSON holds only types of this package, got {value!r}; exchange it as Python"))
-    kind = {"type": type(value).__name__} if type(value) in _CHOSEN else {}
-    return {**kind, **{name: _plain(getattr(value, name), places) for name in _names(type(value))}}
+    return ({"type": type(value).__name__} if type(value) in _CHOSEN else {}) | _plain_fields(value, places)
+
+
+def _plain_fields(value: Any, places: Mapping[TaskLike, int]) -> NamedValues:
+    return {name: _plain(getattr(value, name), places) for name in _names(type(value))}
 
 
 def _plain_task(task: TaskLike) -> NamedValues:
@@ -128,7 +133,7 @@ def _plain_task(task: TaskLike) -> NamedValues:
     kind = type(task)
     if kind is Task:
         return _plain(task, {})
-    return {"type": type_name(kind)} | {name: _plain(getattr(task, name), {}) for name in _names(kind)}
+    return {"type": type_name(kind)} | _plain_fields(task, {})
 
 
 def type_name(kind: type) -> str:
@@ -145,8 +150,14 @@ def _of_graph(task: TaskLike) -> NamedValues:
     """Return numbers that follow from a CT-graph."""
     if not isinstance(task, Task):
         return {}
-    numbers = ("num_states", "num_end_states", "reward_prob_random", "expected_episode_length")
-    return {"goal_leaf": task.goal_leaf} | {name: getattr(task.graph, name) for name in numbers}
+    graph = task.graph
+    return {
+        "goal_leaf": task.goal_leaf,
+        "num_states": graph.num_states,
+        "num_end_states": graph.num_end_states,
+        "reward_prob_random": graph.reward_prob_random,
+        "expected_episode_length": graph.expected_episode_length,
+    }
 
 
 def file_text(content: ReadOnlyValues) -> str:
@@ -195,10 +206,11 @@ def _check_keys(content: Any, names: Sequence[str], optional: Sequence[str] = ()
     missing = [name for name in names if name not in content]
     known = {*names, *optional}
     unknown = [str(name) for name in content if name not in known]
-    close = [f" (did you mean {near!r}?)" for name in unknown[:1] for near in get_close_matches(name[:80], names, 1)]
+    close = get_close_matches(unknown[0][:80], names, 1) if unknown else []
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
     require(
         (not missing, f"missing keys: {', '.join(missing)}"),
-        (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{''.join(close)}"),
+        (not unknown, f"unknown keys: {', '.join(unknown)[:200]}{hint}"),
     )
 
 
@@ -213,14 +225,20 @@ def _parts(content: ReadOnlyValues) -> NamedValues:
         evaluation = _built(Evaluation, content["evaluation"], {"held_out": positions})
     with _within("protocol"):
         protocol = _built(Protocol, content["protocol"], {})
-    about = {name: content[name] for name in ("name", "version", "source")}
-    return {**about, "blocks": tuple(blocks), "evaluation": evaluation, "protocol": protocol}
+    return {
+        "name": content["name"],
+        "version": content["version"],
+        "source": content["source"],
+        "blocks": tuple(blocks),
+        "evaluation": evaluation,
+        "protocol": protocol,
+    }
 
 
 def _task(content: Any) -> TaskLike:
     if not isinstance(content, Mapping) or "type" not in content:
         return _graph(content)
-    task = _built(_kind(content["type"]), {key: item for key, item in content.items() if key != "type"}, {})
+    task = _built(_kind(content["type"]), _without_type(content), {})
     known = ("ctgraph_rl", "curricula", "gymnasium")
     needed = [name for name in getattr(task, "modules", ()) if name not in sys.modules]
     unknown = [name for name in needed if name.partition(".")[0] not in known]
@@ -281,15 +299,19 @@ def _chosen(kinds: Sequence[type], content: Any, or_none: bool = False) -> Any:
     if content is None and or_none:
         return None
     require((isinstance(content, Mapping), f"must be an object with a type, got {content!r:.80}"))
-    names = {kind.__name__: kind for kind in kinds}
+    names = by_name(*kinds)
     given = content.get("type")
     known = isinstance(given, str) and given in names
     require((known, f"type must be one of {', '.join(names)}, got {given!r:.80}"))
-    return _built(names[given], {key: item for key, item in content.items() if key != "type"}, {})
+    return _built(names[given], _without_type(content), {})
+
+
+def _without_type(content: ReadOnlyValues) -> NamedValues:
+    return {key: item for key, item in content.items() if key != "type"}
 
 
 def _tasks_at(tasks: Sequence[TaskLike], positions: Any) -> tuple[TaskLike, ...]:
     """The tasks at positions in the list of tasks."""
-    holds = isinstance(positions, list) and all(is_int(i, 0, len(tasks) - 1) for i in positions)
+    holds = are_ints(positions, 0, len(tasks) - 1)
     require((holds, f"must be positions in the list of {len(tasks)} tasks, from 0, got {positions!r:.80}"))
     return tuple(tasks[i] for i in positions)

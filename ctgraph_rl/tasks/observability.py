@@ -43,8 +43,11 @@ def states_per_observation(task: Task) -> dict[str, int]:
     require(_index_rule(task))
     x = task.observations
     graph = task.graph
-    counts = {kind: getattr(graph, f"num_{kind.name.lower()}_states") for kind in PLACED}
-    return {kind.name.lower(): 1 if x.is_unique(kind) else count for kind, count in counts.items()}
+    found = {}
+    for kind in PLACED:
+        name = kind.name.lower()
+        found[name] = 1 if x.is_unique(kind) else getattr(graph, f"num_{name}_states")
+    return found
 
 
 def state_entropy(task: Task, policy: str = "random") -> float:
@@ -98,7 +101,8 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     Raises:
         ValueError: as for `state_entropy`, and for rewards, goals and images that are drawn, and an extra last step.
     """
-    x, p = task.observations, task.graph.wait_prob
+    x = task.observations
+    p = task.graph.wait_prob
     drawn = task.reward_std or task.goal_change or x.read_noise or x.read_rotation or x.reward_cue
     fixed = task.reward_fn == Needle() and not drawn and not task.extra_end_step
     require(
@@ -113,7 +117,8 @@ def transition_entropy(task: Task, policy: str = "navigation", informed: bool = 
     bits = {kind: 0.0 if x.is_unique(kind) else math.log2(1 + x.ids(kind)[1] - x.ids(kind)[0]) for kind in StateType}
     if not informed:
         return _pair_bits(visits, bits, task, knows_goal) / steps
-    wait, fail = bits[StateType.WAIT], bits[StateType.FAIL]
+    wait = bits[StateType.WAIT]
+    fail = bits[StateType.FAIL]
     stay = sum(-share * math.log2(share) for share in (p, 1 - p) if share) + p * wait
     total = wait + count[StateType.DECISION] * (decides * wait + (1 - decides) * fail)
     for level, v in visits[StateType.WAIT].items():
@@ -135,10 +140,12 @@ def _pair_bits(
     groups = [(1 - arrived, bits[StateType.FAIL])]
     for kind, by_level in visits.items():
         if task.observations.is_unique(kind):
-            groups += [(v, level * math.log2(b)) for level, v in by_level.items()]
+            for level, v in by_level.items():
+                groups.append((v, level * math.log2(b)))
         else:
             shares = (goal, 1 - goal) if kind == StateType.END else (1.0,)
-            groups += [(share * sum(by_level.values()), bits[kind]) for share in shares]
+            for share in shares:
+                groups.append((share * sum(by_level.values()), bits[kind]))
     total = sum(count for count, _ in groups)
     return sum(count * (wide - math.log2(count / total)) for count, wide in groups if count > 0)
 
@@ -146,14 +153,14 @@ def _pair_bits(
 def _visits(graph: CTGraph, waits: float, decides: float) -> dict[StateType, dict[int, float]]:
     """Expected visits of each kind of state by level; home has one visit, and the fail state the rest of the ends."""
     p = graph.wait_prob
-    depth = graph.depth
     leaves = waits * (1 - p) / (1 - waits * p)
-    reached = [(leaves * decides) ** level for level in range(depth + 1)]
-    return {
-        StateType.WAIT: {level: share / (1 - waits * p) for level, share in enumerate(reached)},
-        StateType.DECISION: {level: leaves * share for level, share in enumerate(reached[:depth])},
-        StateType.END: {depth: leaves * reached[depth]},
-    }
+    visits: dict[StateType, dict[int, float]] = {kind: {} for kind in PLACED}
+    for level in range(graph.depth + 1):
+        reached = (leaves * decides) ** level
+        visits[StateType.WAIT][level] = reached / (1 - waits * p)
+        following = StateType.DECISION if level < graph.depth else StateType.END
+        visits[following][level] = leaves * reached
+    return visits
 
 
 def _bits(by_level: dict[int, float], branches: int) -> float:

@@ -63,21 +63,27 @@ class Observations:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        ranges = [field.name for field in fields(self) if field.name.endswith("_ids")]
-        for name in ranges:
-            object.__setattr__(self, name, as_tuple(getattr(self, name)))
         if self.unique_ends is None:
             object.__setattr__(self, "unique_ends", bool(self.unique_decisions or self.unique_waits))
-        given = {name: getattr(self, name) for name in ranges}
+        ranges = {}
+        rules = []
+        flags = {}
+        for field in fields(self):
+            name = field.name
+            value = as_tuple(getattr(self, name))
+            if name.endswith("_ids"):
+                object.__setattr__(self, name, value)
+                rules.append((_is_range(value), f"{name} must be (first, last) with 0 <= first <= last, got {value!r}"))
+                if _is_range(value):
+                    ranges[name] = value
+            elif "bool" in field.type:
+                flags[name] = value
         rotation = self.read_rotation
         degrees = f"read_rotation must be whole degrees in 0..{MAX_READ_ROTATION}, got {rotation!r}"
         require(
-            *(
-                (_is_range(ids), f"{name} must be (first, last) with 0 <= first <= last, got {ids!r}")
-                for name, ids in given.items()
-            ),
-            *_overlap_rules({name: ids for name, ids in given.items() if _is_range(ids)}),
-            *true_or_false(**{field.name: getattr(self, field.name) for field in fields(self) if "bool" in field.type}),
+            *rules,
+            *_overlap_rules(ranges),
+            *true_or_false(**flags),
             (is_int(self.read_noise, 0, 255), f"read_noise must be an integer in 0..255, got {self.read_noise!r}"),
             (is_int(rotation, 0, MAX_READ_ROTATION), degrees),
         )

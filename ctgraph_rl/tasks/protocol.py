@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from ctgraph_rl.checks import (
+    ReadOnlyValues,
     Rule,
+    are_ints,
     as_tuple,
     at_least_one,
     did_you_mean,
@@ -125,7 +127,8 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         make_fields_plain(self)
-        n, per_row = self.num_episodes, self.episodes_per_row
+        n = self.num_episodes
+        per_row = self.episodes_per_row
         held_out = (self.held_out,) if is_dataclass(self.held_out) else as_tuple(self.held_out)
         object.__setattr__(self, "held_out", held_out)
         require(
@@ -160,8 +163,11 @@ class Evaluation:
                 adapts.
         """
         tasks = tuple(tasks)
-        found = [getattr(task, "goal_change", None) for task in tasks]
-        changes = [change[0] for change in found if change]
+        changes = []
+        for task in tasks:
+            change = getattr(task, "goal_change", None)
+            if change:
+                changes.append(change[0])
         changing = self.row_episodes == 1 and bool(changes)
         stays = min(changes, default=self.row_episodes)
         lasts = not self.adapt_episodes or self.row_episodes <= stays
@@ -205,7 +211,7 @@ class Protocol:
         require(*one_of(TASK_IDS, task_id=self.task_id), *one_of(BOUNDARIES, boundaries=self.boundaries))
         ids = as_tuple(self.task_ids)
         object.__setattr__(self, "task_ids", ids)
-        is_ids = ids is None or (isinstance(ids, tuple) and len(ids) > 0 and all(is_int(i, 0, MOST_IDS) for i in ids))
+        is_ids = ids is None or (are_ints(ids, 0, MOST_IDS) and len(ids) > 0)
         names_ids = self.task_id != "hidden" or (ids is None and self.num_task_ids is None)
         differ = not isinstance(ids, tuple) or not is_ids or len(set(ids)) == len(ids)
         hidden_gift = self.task_id == "at_boundaries" and self.boundaries == "hidden"
@@ -238,7 +244,7 @@ class Protocol:
         return max(self.ids(num_tasks)) + 1 if self.num_task_ids is None else self.num_task_ids
 
 
-def changed(name: str, part: ProtocolPart, changes: Mapping[str, Any]) -> ProtocolPart:
+def changed(name: str, part: ProtocolPart, changes: ReadOnlyValues) -> ProtocolPart:
     """An evaluation or a protocol with other values of some fields.
 
     Args:

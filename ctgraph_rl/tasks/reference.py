@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from os import PathLike
 from os.path import lexists
 from typing import TYPE_CHECKING
@@ -79,39 +80,56 @@ def read_task(path_or_dict: str | PathLike[str] | ReadOnlyValues, goal: Sequence
     require((goal is not None, f"goal is not in the file and must be given: {draws}; {fix}"))
     dialect = _dialect(content)
     require(*((False, f"{source}: {fault}") for fault in _faults(content, dialect)))
-    found = {name: content[section][key] for name, (section, key) in _places(dialect).items()}
+    places = _places(dialect)
+    found = {name: content[section][key] for name, (section, key) in places.items()}
     if dialect in _GOAL_NEVER_CHANGES:
         found.update(min_episodes=-1, max_episodes=-1)
-    require(*_value_rules(found, _places(dialect)))
+    require(*_value_rules(found, places))
     return {"goal": goal, **_arguments(found)}
 
 
 def _places(dialect: str) -> dict[str, tuple[str, str]]:
     """Section and key of everything that a dialect knows."""
-    column = 1 + _DIALECTS.index(dialect)
-    return {name: (row[0], key) for name, row in _KEYS.items() if (key := row[column]) is not None}
+    places = {}
+    for name, (section, *keys) in _KEYS.items():
+        key = keys[_DIALECTS.index(dialect)]
+        if key is not None:
+            places[name] = section, key
+    return places
+
+
+def _given(content: ReadOnlyValues) -> list[tuple[str, str]]:
+    """Section and key of everything in the sections of a file."""
+    given: list[tuple[str, str]] = []
+    for section in _SECTIONS:
+        if isinstance(content.get(section), Mapping):
+            given += product([section], content[section])
+    return given
 
 
 def _dialect(content: ReadOnlyValues) -> str:
     """The dialect that has most of the keys, the newest of several."""
-    sections = {name: section for name, section in content.items() if isinstance(section, Mapping)}
-    keys = {(name, key) for name, section in sections.items() for key in section}
-    return max(reversed(_DIALECTS), key=lambda dialect: len(keys & set(_places(dialect).values())))
+    given = set(_given(content))
+    return max(reversed(_DIALECTS), key=lambda dialect: len(given & set(_places(dialect).values())))
 
 
-def _faults(content: ReadOnlyValues, dialect: str) -> list[str]:
-    """Return the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
-    wanted = _places(dialect).values()
+def _faults(content: ReadOnlyValues, dialect: str) -> Iterator[str]:
+    """Yield the faults of a file of a dialect: sections and keys that are missing, unknown, or of another dialect."""
     names = (*_SECTIONS, "general_seed")
-    unknown = [f"unknown section {name!r}{suggested(name, names)}" for name in content if name not in names]
-    whole = [name for name in _SECTIONS if isinstance(content.get(name), Mapping)]
-    absent = {name: "must be an object" if name in content else "is missing" for name in _SECTIONS if name not in whole}
-    no_section = [f"section {name!r} {fault}" for name, fault in absent.items()]
-    given = [(section, key) for section in whole for key in content[section]]
-    surplus = [place for place in given if place not in wanted and not _says_nothing(*place, content)]
-    missing = [place for place in wanted if place[0] in whole and place not in given]
-    faults = [_surplus(*place, dialect) for place in surplus]
-    return [*unknown, *no_section, *faults, *(f"{section}.{key} is missing" for section, key in missing)]
+    for name in content:
+        if name not in names:
+            yield f"unknown section {name!r}{suggested(name, names)}"
+    for name in _SECTIONS:
+        if not isinstance(content.get(name), Mapping):
+            yield f"section {name!r} {'must be an object' if name in content else 'is missing'}"
+    wanted = _places(dialect).values()
+    given = _given(content)
+    for section, key in given:
+        if (section, key) not in wanted and not _says_nothing(section, key, content):
+            yield _surplus(section, key, dialect)
+    for section, key in wanted:
+        if isinstance(content.get(section), Mapping) and (section, key) not in given:
+            yield f"{section}.{key} is missing"
 
 
 def _says_nothing(section: str, key: str, content: ReadOnlyValues) -> bool:
@@ -137,15 +155,21 @@ def _value_rules(found: NamedValues, places: dict[str, tuple[str, str]]) -> list
     def said(name: str) -> str:
         return f"{'.'.join(places[name])} must be"
 
-    noise, rotation, first, end = (found[name] for name in ("noise", "rotation", "min_episodes", "max_episodes"))
+    noise = found["noise"]
+    rotation = found["rotation"]
+    first = found["min_episodes"]
+    end = found["max_episodes"]
     episodes = is_int(first) and is_int(end) and (max(first, end) <= 0 or 1 <= first < end)
     distribution = found["distribution"]
     choices = " or ".join(map(repr, _DISTRIBUTIONS))
     known = isinstance(distribution, str) and distribution in _DISTRIBUTIONS
-    flags = [name for name in ("is_stochastic", "unique_decisions", "unique_waits", "one_hot") if name in found]
     still = found["one_hot"] is not True or (is_real(noise) and noise < 1 and rotation == 1)
+    rules = []
+    for name in ("is_stochastic", "unique_decisions", "unique_waits", "one_hot"):
+        if name in found:
+            rules.append((isinstance(found[name], bool), f"{said(name)} true or false, got {found[name]!r}"))
     return [
-        *((isinstance(found[name], bool), f"{said(name)} true or false, got {found[name]!r}") for name in flags),
+        *rules,
         (known, f"{said('distribution')} {choices}, got {distribution!r}"),
         (
             episodes,
@@ -173,15 +197,22 @@ def _arguments(found: NamedValues) -> NamedValues:
     count = found["num_images"]
     seed = found["image_seed"]
     images = ReferenceOneHot(count) if found["one_hot"] else ReferenceImages(count, seed, noise)
-    shown = {name: found[name] for name in ("wait_ids", "decision_ids", "end_ids", "unique_waits", "unique_decisions")}
     return {
         "graph": CTGraph(found["branching_factor"], found["depth"], found["wait_prob"]),
         "observations": Observations(
-            **shown, **_LEGACY, read_noise=math.floor(noise), read_rotation=found["rotation"] - 1
+            wait_ids=found["wait_ids"],
+            decision_ids=found["decision_ids"],
+            end_ids=found["end_ids"],
+            unique_waits=found["unique_waits"],
+            unique_decisions=found["unique_decisions"],
+            read_noise=math.floor(noise),
+            read_rotation=found["rotation"] - 1,
+            **_LEGACY,
         ),
         "images": images,
         "reward_fn": _DISTRIBUTIONS[found["distribution"]],
-        **{name: found[name] for name in ("goal_reward", "fail_reward")},
+        "goal_reward": found["goal_reward"],
+        "fail_reward": found["fail_reward"],
         "reward_std": found["reward_std"] if found.get("is_stochastic", True) else 0.0,
         "reward_noise": "multiplicative",
         "goal_change": (found["min_episodes"], found["max_episodes"] - 1) if changes else None,
@@ -241,14 +272,20 @@ def _values(task: Task) -> NamedValues:
     images = task.images
     first, last = task.goal_change or (-1, -2)
     return {
-        **{name: getattr(task.graph, name) for name in ("depth", "branching_factor", "wait_prob")},
-        **{name: getattr(task, name) for name in ("goal_reward", "fail_reward", "reward_std")},
+        "depth": task.graph.depth,
+        "branching_factor": task.graph.branching_factor,
+        "wait_prob": task.graph.wait_prob,
+        "goal_reward": task.goal_reward,
+        "fail_reward": task.fail_reward,
+        "reward_std": task.reward_std,
         "min_episodes": first,
         "max_episodes": last + 1,
         "distribution": next(name for name, reward_fn in _DISTRIBUTIONS.items() if reward_fn == task.reward_fn),
         "unique_decisions": x.unique_decisions,
         "unique_waits": x.unique_waits,
-        **{name: list(getattr(x, name)) for name in ("wait_ids", "decision_ids", "end_ids")},
+        "wait_ids": list(x.wait_ids),
+        "decision_ids": list(x.decision_ids),
+        "end_ids": list(x.end_ids),
         "image_seed": getattr(images, "seed", 1),
         "one_hot": isinstance(images, ReferenceOneHot),
         "num_images": images.num_images,

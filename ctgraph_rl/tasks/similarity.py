@@ -54,8 +54,12 @@ def shared_decisions(tasks: Sequence[Task]) -> Tensor:
     """
 
     def share(one: Task, other: Task) -> float:
-        pairs = list(zip(one.goal_decisions, other.goal_decisions, strict=False))
-        return next((k for k, (a, b) in enumerate(pairs) if a != b), len(pairs)) / len(pairs)
+        shared = 0
+        for a, b in zip(one.goal_decisions, other.goal_decisions, strict=False):
+            if a != b:
+                break
+            shared += 1
+        return shared / min(len(one.goal), len(other.goal))
 
     return _matrix(_tasks(tasks), share)
 
@@ -107,7 +111,12 @@ def shared_images(tasks: Sequence[Task]) -> Tensor:
     Raises:
         ValueError: for image sets of more than `MAX_COMPARED_BYTES`, and too many states with unique ids.
     """
-    shown = [{content for kind in StateType for content in _contents(task, _ids(task, kind))} for task in _tasks(tasks)]
+    shown = []
+    for task in _tasks(tasks):
+        of_task: set[bytes] = set()
+        for kind in StateType:
+            of_task.update(_contents(task, _ids(task, kind)))
+        shown.append(of_task)
     return _matrix(shown, lambda one, other: len(one & other) / len(one | other))
 
 
@@ -119,7 +128,7 @@ def graph_containment(tasks: Sequence[Task]) -> Tensor:
     """
 
     def share(one: Task, other: Task) -> float:
-        smaller = min(task.graph.num_decision_states for task in (one, other))
+        smaller = min(one.graph.num_decision_states, other.graph.num_decision_states)
         common = _common(one, other)
         b = common.branching_factor
         swaps = {one.swapped_branches, other.swapped_branches}
@@ -157,8 +166,8 @@ def _matrix(items: Sequence[Any], share: Callable[[Any, Any], float]) -> Tensor:
 
 def _common(one: Task, other: Task) -> CTGraph:
     """Return the common tree."""
-    graphs = (one.graph, other.graph)
-    return CTGraph(min(graph.branching_factor for graph in graphs), min(graph.depth for graph in graphs))
+    b = min(one.graph.branching_factor, other.graph.branching_factor)
+    return CTGraph(b, min(one.graph.depth, other.graph.depth))
 
 
 @dataclass(frozen=True)
@@ -207,15 +216,13 @@ def _optimal_sets(task: Task, gamma: float, num_actions: int) -> dict[tuple[Stat
     tree = smallest_tree(task, is_needle(task))
     best = BestActions(task, gamma)
     step = task.step_reward
-    p = task.graph.wait_prob
-    fails = step + task.fail_reward
-    steps = 2 * (task.graph.depth + 1) / (1 - p)
+    fails = best.failing
+    steps = 2 * (task.graph.depth + 1) / (1 - task.graph.wait_prob)
     margin = ROUNDING * (abs(task.goal_reward) + abs(task.fail_reward) + abs(step) * steps)  # of the largest value
     arrival = tree.end_rewards() + (gamma * step if task.extra_end_step else 0.0)
     sets = {}
     for level in reversed(range(task.graph.depth + 1)):
-        waiting = (step + (1 - p) * arrival) / (1 - gamma * p)
-        sets[StateType.WAIT, level] = _best(waiting.unsqueeze(-1), fails, num_actions, 0, margin)
+        sets[StateType.WAIT, level] = _best(best.waiting(arrival).unsqueeze(-1), fails, num_actions, 0, margin)
         if level > 0:
             children = tree.children(best.at_wait(arrival, level), level - 1)
             deciding = step + gamma * children
@@ -231,8 +238,10 @@ def _best(values: Tensor, fails: float, num_actions: int, first: int, margin: fl
     others = (1 << num_actions) - 1 - (((1 << values.shape[1]) - 1) << first)
     packed = np.packbits(rows.numpy(), axis=1, bitorder="little")
     chosen = [int.from_bytes(row.tobytes(), "little") << first for row in packed]
-    pairs = zip(which.tolist(), (fails >= best).tolist(), strict=True)
-    return [chosen[row] | (others if failing else 0) for row, failing in pairs]
+    sets = []
+    for row, failing in zip(which.tolist(), (fails >= best).tolist(), strict=True):
+        sets.append(chosen[row] | (others if failing else 0))
+    return sets
 
 
 def _equal_share(one: _Choices, other: _Choices) -> float:
@@ -241,13 +250,16 @@ def _equal_share(one: _Choices, other: _Choices) -> float:
     b = tree.branching_factor
     d = tree.depth
     count = _equal_on_ways if one.collapsed and other.collapsed else _equal_everywhere
-    equal = sum(count(one, other, kind, level, b) for kind in CHOOSING for level in range(d + (kind == StateType.WAIT)))
+    equal = 0
+    for kind in CHOOSING:
+        for level in range(d + (kind == StateType.WAIT)):
+            equal += count(one, other, kind, level, b)
     return equal / (tree.num_decision_states + tree.num_wait_states)
 
 
 def _equal_on_ways(one: _Choices, other: _Choices, kind: StateType, level: int, b: int) -> int:
     """Equal states of a level: those on the ways to two needles one by one, all others at once."""
-    ways = {choice.task.goal[:level] for choice in (one, other)}
+    ways = {one.task.goal[:level], other.task.goal[:level]}
     inside = [path for path in ways if max(path, default=1) <= b]
     equal = sum(one.of_path(kind, path) == other.of_path(kind, path) for path in inside)
     others_equal = one.sets[kind, level][ELSEWHERE] == other.sets[kind, level][ELSEWHERE]
@@ -266,7 +278,12 @@ def _equal_everywhere(one: _Choices, other: _Choices, kind: StateType, level: in
 @lru_cache(maxsize=64)
 def _nodes(own_b: int, b: int, level: int) -> list[int]:
     """Numbers within a level of the nodes that b decisions reach, in their order."""
-    return [node * own_b + branch for node in _nodes(own_b, b, level - 1) for branch in range(b)] if level else [0]
+    if level == 0:
+        return [0]
+    nodes: list[int] = []
+    for node in _nodes(own_b, b, level - 1):
+        nodes += range(node * own_b, node * own_b + b)
+    return nodes
 
 
 def _actions_left(choice: _Choices) -> dict[bytes, int]:
@@ -291,7 +308,8 @@ def _shown_with_actions(choice: _Choices) -> Iterator[tuple[Sequence[int], int]]
         for level in _levels(task, kind):
             ids = _unique_ids(task, kind, level)
             sets = choice.of_nodes(kind, level, range(len(ids)))
-            yield from (([number], actions) for number, actions in zip(ids, sets, strict=True))
+            for number, actions in zip(ids, sets, strict=True):
+                yield [number], actions
 
 
 def _ids(task: Task, kind: StateType) -> Sequence[int]:
@@ -299,7 +317,10 @@ def _ids(task: Task, kind: StateType) -> Sequence[int]:
     first, last = task.observations.ids(kind)
     if not task.observations.is_unique(kind):
         return range(first, last + 1)
-    return [number for level in _levels(task, kind) for number in _unique_ids(task, kind, level)]
+    ids = []
+    for level in _levels(task, kind):
+        ids += _unique_ids(task, kind, level)
+    return ids
 
 
 def _levels(task: Task, kind: StateType) -> range:
@@ -328,7 +349,8 @@ def _contents(task: Task, ids: Sequence[int]) -> Iterator[bytes]:
     rule = f"images of {needed:,} bytes are too many to compare, the limit is {MAX_COMPARED_BYTES:,}; use fewer"
     require((needed <= MAX_COMPARED_BYTES, rule))
     digests = _digests(task.images)  # type: ignore[arg-type]
-    return (digests[i * variants + variant] for i in ids for variant in range(variants))
+    for i in ids:
+        yield from digests[i * variants : (i + 1) * variants]
 
 
 @lru_cache(maxsize=256)
@@ -337,5 +359,8 @@ def _digests(images: ImageSet) -> list[bytes]:
     rows = images.bank(0).numpy()
     vectors = rows.ndim == 2
     shape = repr(rows.shape[2:]).encode()
-    contents = (row.tobytes().rstrip(b"\0") if vectors else shape + row.tobytes() for row in rows)
-    return [hashlib.blake2b(content, digest_size=16).digest() for content in contents]
+    digests = []
+    for row in rows:
+        content = row.tobytes().rstrip(b"\0") if vectors else shape + row.tobytes()
+        digests.append(hashlib.blake2b(content, digest_size=16).digest())
+    return digests

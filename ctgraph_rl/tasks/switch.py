@@ -40,8 +40,21 @@ class Switch(Protocol):
         ...
 
 
+class _ForEpisodes:
+    """What changes after a number of episodes."""
+
+    episodes: int
+    together: bool
+
+    def __post_init__(self) -> None:
+        make_fields_plain(self)
+        holds = is_int(self.episodes, 1, MOST_EPISODES)
+        rule = holds, f"episodes must be an integer in 1..2**31, got {self.episodes!r}"
+        require(rule, *true_or_false(together=self.together))
+
+
 @dataclass(frozen=True)
-class ByEpisode:
+class ByEpisode(_ForEpisodes):
     """The tasks take turns, each for a number of episodes.
 
     Args:
@@ -51,10 +64,6 @@ class ByEpisode:
 
     episodes: int = 1
     together: bool = False
-
-    def __post_init__(self) -> None:
-        make_fields_plain(self)
-        require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""
@@ -88,7 +97,7 @@ class AtRandom:
 
 
 @dataclass(frozen=True)
-class Drift:
+class Drift(_ForEpisodes):
     """The probability of the next task rises linearly: from 0 at the start to 1 after ``episodes`` episodes.
 
     With more than two tasks the drift goes from each to the next, and after the last it stays there.
@@ -100,10 +109,6 @@ class Drift:
 
     episodes: int
     together: bool = False
-
-    def __post_init__(self) -> None:
-        make_fields_plain(self)
-        require(_episodes_rule(self.episodes), *true_or_false(together=self.together))
 
     def next_task(self, task: Tensor, clock: Tensor, num_tasks: int, words: tuple[Tensor, ...]) -> Tensor:
         """See `Switch`."""
@@ -119,7 +124,3 @@ def switch_rule(switch: object) -> Rule:
     """The rule for switches, a user's own among them."""
     holds = callable(getattr(switch, "next_task", None)) and not isinstance(switch, type)
     return holds, f"switch must be one such as Drift(100), got {switch!r}"
-
-
-def _episodes_rule(episodes: object) -> Rule:
-    return is_int(episodes, 1, MOST_EPISODES), f"episodes must be an integer in 1..2**31, got {episodes!r}"

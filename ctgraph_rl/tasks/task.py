@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from os import PathLike
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeGuard
+from typing import Any, ClassVar, Self, TypeGuard
 
 from torch import Tensor
 
 from ctgraph_rl.checks import (
     Rule,
+    are_ints,
     as_path,
     as_tuple,
     is_int,
@@ -29,9 +30,6 @@ from ctgraph_rl.tasks import reference, values
 from ctgraph_rl.tasks.images import ImageSet, has_cue_element
 from ctgraph_rl.tasks.kinds.task_like import TaskLike
 from ctgraph_rl.tasks.observations import Observations
-
-if TYPE_CHECKING:
-    import torch
 
 REWARDS = ("goal_reward", "fail_reward", "step_reward", "reward_std")
 NOISES = ("additive", "multiplicative")
@@ -180,19 +178,9 @@ class Task:
         return reference.write_task(self, None if path is None else as_path("path", path), general_seed)
 
     @classmethod
-    def make_env(
-        cls,
-        tasks: Sequence[Task],
-        seed: int = 0,
-        *,
-        task_pool: Sequence[Task] | None = None,
-        device: torch.device | str = "cpu",
-        task_ids: Mapping[Task, int] | None = None,
-        num_task_ids: int | None = None,
-    ) -> Any:
+    def make_env(cls, tasks: Sequence[Task], seed: int = 0, **settings: Any) -> Any:
         """Return a `ctgraph_rl.CTGraphEnv` with one row for each of ``tasks``; see `TaskLike`."""
-        env = import_module("ctgraph_rl.env").CTGraphEnv
-        return env(tasks, seed, task_pool=task_pool, device=device, task_ids=task_ids, num_task_ids=num_task_ids)
+        return import_module("ctgraph_rl.env").CTGraphEnv(tasks, seed, **settings)
 
     def _check_parts(self) -> None:
         images = self.images
@@ -233,10 +221,10 @@ class Task:
         b = self.graph.branching_factor
         d = self.graph.depth
         goal = self.goal
-        holds = isinstance(goal, tuple) and len(goal) == d and all(is_int(decision, 1, b) for decision in goal)
+        holds = isinstance(goal, tuple) and len(goal) == d and are_ints(goal, 1, b)
         written = Decisions if isinstance(goal, Decisions) else tuple
         message = f"goal must be {d} decisions in 1..{b}, such as {written((1,) * d)}, got {goal!r}"
-        if not holds and isinstance(goal, tuple) and 0 in goal and all(is_int(branch, 0, b - 1) for branch in goal):
+        if not holds and isinstance(goal, tuple) and 0 in goal and are_ints(goal, 0, b - 1):
             decisions = written(branch + 1 for branch in goal)
             message += f"; a path of the authors' implementation counts from 0: use {decisions}"
         return holds, message
@@ -245,9 +233,10 @@ class Task:
         b = self.graph.branching_factor
         d = self.graph.depth
         swap = self.swapped_branches
-        pairs = isinstance(swap, tuple) and len(swap) == 2 and all(isinstance(part, tuple) for part in swap)
-        in_range = pairs and all(is_int(branch, 1, b) for part in swap or () for branch in part)
-        holds = in_range and swap is not None and len(swap[0]) < d and len(swap[1]) == 2 and swap[1][0] < swap[1][1]
+        holds = False
+        if isinstance(swap, tuple) and len(swap) == 2 and isinstance(swap[0], tuple) and isinstance(swap[1], tuple):
+            path, pair = swap
+            holds = are_ints((*path, *pair), 1, b) and len(path) < d and len(pair) == 2 and pair[0] < pair[1]
         rule = f"(path, (first, second)): fewer than {d} branches, and two of that decision state with first < second"
         return swap is None or holds, f"swapped_branches must be {rule}, in 1..{b}, such as ((), (1, 2)), got {swap!r}"
 

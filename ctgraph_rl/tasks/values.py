@@ -267,7 +267,8 @@ class _EveryNode:
         node = self.task.swapped_node
         if swap is None or node is None or len(swap[0]) != level:
             return by_branch
-        by_decision, (first, second) = by_branch.clone(), (branch - 1 for branch in swap[1])
+        by_decision = by_branch.clone()
+        first, second = (branch - 1 for branch in swap[1])
         number = node - self.task.graph.first_node(level)
         by_decision[number, [first, second]] = by_branch[number, [second, first]]
         return by_decision
@@ -305,11 +306,19 @@ class BestActions:
     task: Task
     gamma: float
 
+    @property
+    def failing(self) -> float:
+        """The reward of an action that fails."""
+        return self.task.step_reward + self.task.fail_reward
+
+    def waiting(self, arrival: Tensor) -> Tensor:
+        """Wait until it ends."""
+        p = self.task.graph.wait_prob
+        return (self.task.step_reward + (1 - p) * arrival) / (1 - self.gamma * p)
+
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is best once stays best. float64, as ``arrival``."""
-        p = self.task.graph.wait_prob
-        s = self.task.step_reward
-        return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_min(s + self.task.fail_reward)
+        return self.waiting(arrival).clamp_min(self.failing)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """Decide for the best child or fail. float64 [n] of [n, b]."""
@@ -321,9 +330,7 @@ class _WorstActions(BestActions):
 
     def at_wait(self, arrival: Tensor, level: int) -> Tensor:
         """Wait until it ends or fail; the choice that is worst once stays worst. float64, as ``arrival``."""
-        p = self.task.graph.wait_prob
-        s = self.task.step_reward
-        return ((s + (1 - p) * arrival) / (1 - self.gamma * p)).clamp_max(s + self.task.fail_reward)
+        return self.waiting(arrival).clamp_max(self.failing)
 
     def at_decision(self, children: Tensor, level: int) -> Tensor:
         """Decide for the worst child or fail. float64 [n] of [n, b]."""
@@ -357,7 +364,8 @@ class _Memoryless:
 
     def _action_probs(self, kind: StateType, level: int) -> Tensor:
         """float64 [b^level, A] by node where ids are unique, else [1, A]: the mean over the ids that are drawn."""
-        b, (first, last) = self.task.graph.branching_factor, self.task.observations.ids(kind)
+        b = self.task.graph.branching_factor
+        first, last = self.task.observations.ids(kind)
         if not self.task.observations.is_unique(kind):
             return self.policy[first : last + 1].mean(0, keepdim=True)
         number = self.task.observations.first_of_level(self.task.graph, kind, level) + torch.arange(

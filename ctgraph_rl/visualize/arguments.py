@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ctgraph_rl import parsers
-from ctgraph_rl.checks import is_int, require
+from ctgraph_rl.checks import NamedValues, is_int, require
 from ctgraph_rl.learn.collect import InitialState, Policy
 from ctgraph_rl.policies import NavigationPolicy, OptimalPolicy, RandomPolicy
 from ctgraph_rl.runs.config import curriculum_of
@@ -70,7 +70,7 @@ def select(arguments: argparse.Namespace) -> Selection:
     return _named(arguments.name, arguments.task, changes, arguments.config_dir)._replace(policy=policy)
 
 
-def _named(name: str | None, number: int, changes: dict[str, Any], config_dir: Path | None) -> Selection:
+def _named(name: str | None, number: int, changes: NamedValues, config_dir: Path | None) -> Selection:
     """Return a task without a policy."""
     own = name in curriculum_names(config_dir)
     if name is None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -111,11 +112,14 @@ def _draw_panel(axes: Any, graph: CTGraph, goals: Mapping[Goal, str]) -> None:
 def _draw_edges(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:
     """Draw the edges; the paths to goals are thick and black."""
     graph = layout.graph
-    on_path = {node for goal in goals for node in graph.nodes_to(goal)}
-    lines = {node: [places[graph.parent(node)], places[node]] for node in places if node}
-    plain = [line for node, line in lines.items() if node not in on_path]
-    draw_lines(axes, [*plain, *stub_lines(layout, places, 0.45)], colors="0.6", linewidths=0.8)
-    draw_lines(axes, [line for node, line in lines.items() if node in on_path], linewidths=1.6)
+    on_path = set(chain.from_iterable(map(graph.nodes_to, goals)))
+    plain = stub_lines(layout, places, 0.45)
+    thick: list[list[PlanePoint]] = []
+    for node, place in places.items():
+        if node:
+            (thick if node in on_path else plain).append([places[graph.parent(node)], place])
+    draw_lines(axes, plain, colors="0.6", linewidths=0.8)
+    draw_lines(axes, thick, linewidths=1.6)
 
 
 def _draw_states(axes: Any, layout: Layout, places: Mapping[int, PlanePoint], goals: Iterable[int]) -> None:

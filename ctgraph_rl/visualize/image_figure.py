@@ -87,8 +87,10 @@ def _stored(task: Task, ids: list[int]) -> Tensor:
 
 def _reads(task: Task, shown: list[tuple[StateType, int]], count: int, seed: int) -> Tensor:
     """Observations of ids by an environment whose states show no other, uint8 [ids, count, *shape]."""
-    pinned = [_pinned(task, kind, number) for kind, number in shown]
-    env = CTGraphEnv([one for one in pinned for _ in range(count)], seed)
+    rows: list[Task] = []
+    for kind, number in shown:
+        rows += [_pinned(task, kind, number)] * count
+    env = CTGraphEnv(rows, seed)
     env.reset()
     state = env.get_state()
     kinds = state["state_type"].new_tensor([kind for kind, _ in shown]).repeat_interleave(count)

@@ -65,7 +65,9 @@ def ids_at(task: Task, state: Key, level: int) -> tuple[int, int]:
         state: a state of its graph.
         level: the decisions taken before it.
     """
-    (kind, node), x, graph = state, task.observations, task.graph
+    kind, node = state
+    x = task.observations
+    graph = task.graph
     first, last = x.ids(kind)
     if not x.is_unique(kind):
         return first, last

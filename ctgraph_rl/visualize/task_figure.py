@@ -85,7 +85,10 @@ class _TaskPicture:
         self.goal = task.graph.node_at(task.goal)
         self.policy = {key: _probabilities(of, self.graph.branching_factor) for key, of in policy.items()}
         self.values = {key: [float(value) for value in of] for key, of in values.items()}
-        counts = {node: count for (kind, node), count in visits.items() if kind == END and node != self.goal}
+        counts = {}
+        for (kind, node), count in visits.items():
+            if kind == END and node != self.goal:
+                counts[node] = count
         most_visited = sorted(counts, key=lambda node: -counts[node])[: MOST_PATHS - 1]
         self.layout = lay_out(self.graph, [self.goal, *most_visited])
         self.waits = self.layout.is_whole or self.graph.depth <= MOST_WAIT_LEVELS
@@ -137,9 +140,14 @@ class _TaskPicture:
 
     def _draw_edges(self) -> None:
         found = sorted(drawn.edges(self.task, self.layout, self.waits), key=self._is_strong)
-        lines = [[self.places[edge.start], self.places[edge.end]] for edge in found]
-        colours = ["0" if self._is_strong(edge) else GREY for edge in found]
-        draw_lines(self.axes, lines, colors=colours, linewidths=list(map(self._width, found)))
+        lines = []
+        colours = []
+        widths = []
+        for edge in found:
+            lines.append([self.places[edge.start], self.places[edge.end]])
+            colours.append("0" if self._is_strong(edge) else GREY)
+            widths.append(self._width(edge))
+        draw_lines(self.axes, lines, colors=colours, linewidths=widths)
         row = 1.0 if self.waits else 0.5
         nodes = {node: place for (kind, node), place in self.places.items() if kind == DECISION}
         draw_lines(self.axes, stub_lines(self.layout, nodes, 0.7 * row), colors=GREY, linewidths=0.8)

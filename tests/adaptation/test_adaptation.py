@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 import curricula
 from ctgraph_rl import Block, Evaluation, RunLog, learn_curriculum
 from ctgraph_rl.learn.collect import agent_specs
-from ctgraph_rl.learn.rules import check_adaptation
+from ctgraph_rl.learn.refusals import check_adaptation
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.runs.checkpoints import Checkpoints
 from ctgraph_rl.runs.read import read_run

@@ -10,10 +10,9 @@ from helpers.small_agents import ONE_HOT_TASK, Tiny, batches, learnt_from
 from torch import nn
 
 from baselines.parts.networks import Encoder
-from baselines.update.optimiser import make_optimiser
 from baselines.update.seeds import sampled
 from baselines.update.stack import Stack
-from baselines.update.update import update
+from baselines.update.update import make_optimiser, update
 from ctgraph_rl import CTGraphEnv
 from curricula.paper import ct_su_b1
 

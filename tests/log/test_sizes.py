@@ -19,7 +19,7 @@ import torch
 
 from ctgraph_rl import Block, Curriculum, Evaluation, RunLog, Task, metrics
 from ctgraph_rl.describe import describe
-from ctgraph_rl.learn.rules import check_rows
+from ctgraph_rl.learn.refusals import check_rows
 from ctgraph_rl.log.run_log import write_metrics
 from ctgraph_rl.log.scores import scores
 from ctgraph_rl.log.tables import write_tables

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -17,7 +17,7 @@ from baselines.methods.parts.heads import Heads
 from baselines.methods.parts.weights import Weights, flat
 from baselines.parts.learner import Learner
 from baselines.parts.networks import Data, Items, TensorsByName
-from ctgraph_rl.checks import NamedValues, at_least_one, one_of, positive, require
+from ctgraph_rl.checks import NamedValues, ReadOnlyValues, at_least_one, one_of, positive, require
 from ctgraph_rl.tasks.curriculum import Curriculum
 
 
@@ -155,7 +155,7 @@ class Samples:
         alike = groupby(self.minibatches, lambda minibatch: minibatch["action"].shape[1:])  # steps of a sequence
         return {"parts": [_joined(list(minibatches)) for _, minibatches in alike]}
 
-    def restore(self, state: Mapping[str, Any], device: torch.device) -> None:
+    def restore(self, state: ReadOnlyValues, device: torch.device) -> None:
         """Restore what `state` returned."""
         self.clear()
         for part in state.get("parts", [state]):  # a single one, as earlier versions saved it

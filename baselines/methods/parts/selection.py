@@ -14,9 +14,10 @@ from baselines.methods.parts.weights import Weights
 from baselines.parts.embedding import (
     linear_wasserstein,
     reference_points,
+    sampled_points,
     sliced_wasserstein,
-    transitions,
     unit_directions,
+    with_last,
 )
 from baselines.parts.learner import Learner
 from ctgraph_rl.checks import NamedValues, at_least_one, one_of, require
@@ -83,19 +84,14 @@ class TaskEmbeddings:
 
     def see(self, batch: TensorDictBase) -> None:
         """Keep the transitions of a batch, [num_envs, num_steps]."""
-        given = {"observation": batch["observation"], "action": batch["action"], "reward": batch["next", "reward"]}
-        for key, values in given.items():
-            new = values.flatten(0, 1).cpu()
-            self.recent[key] = torch.cat([self.recent.get(key, new[:0]), new])[-self.buffer_size :].clone()
+        self.recent = with_last(self.recent, batch, self.buffer_size)
 
     def update(self, slot: int, num_actions: int, generator: torch.Generator) -> None:
         """Update the embedding of the present task, if there are enough transitions."""
-        seen = len(self.recent["action"])
-        if seen < self.num_samples:
+        if len(self.recent["action"]) < self.num_samples:
             return
-        drawn = torch.randperm(seen, generator=generator, device="cpu")[: self.num_samples]
-        observation, action, reward = (value[drawn] for value in self.recent.values())
-        new = normalize(self._embed(transitions(observation, action, reward.squeeze(-1), num_actions)), dim=0)
+        points = sampled_points(self.recent, self.num_samples, num_actions, generator)
+        new = normalize(self._embed(points), dim=0)
         old = self.of_slot.get(slot, new)
         self.of_slot[slot] = normalize((old + new) / 2, dim=0)
 

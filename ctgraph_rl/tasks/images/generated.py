@@ -9,7 +9,17 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ctgraph_rl.checks import Rule, as_tuple, at_least_one, is_int, is_real, make_fields_plain, require, require_memory
+from ctgraph_rl.checks import (
+    Rule,
+    are_ints,
+    as_tuple,
+    at_least_one,
+    is_int,
+    is_real,
+    make_fields_plain,
+    require,
+    require_memory,
+)
 from ctgraph_rl.core.philox import STREAM_IMAGES, draw, randint
 from ctgraph_rl.core.rotation import rotate
 from ctgraph_rl.tasks.images.image_set import WHITE, SquareImages, resize
@@ -102,7 +112,7 @@ class GroupedImages(SquareImages):
         make_fields_plain(self)
         object.__setattr__(self, "groups", as_tuple(self.groups))
         groups = self.groups
-        groups_ok = isinstance(groups, tuple) and bool(groups) and all(is_int(size, 1) for size in groups)
+        groups_ok = bool(groups) and are_ints(groups, 1)
         cells = self.cells if is_int(self.cells, 1) else 1
         most = WHITE * cells**2 // 2  # half the images that differ from a blueprint in one cell
         wanted = len(groups) * max(groups) if groups_ok else 0
@@ -139,7 +149,10 @@ class GroupedImages(SquareImages):
     @property
     def group_of(self) -> tuple[int, ...]:
         """The group of each id, numbered from 0: what `distances` asks for."""
-        return tuple(group for group, size in enumerate(self.groups) for _ in range(size))
+        found: list[int] = []
+        for group, size in enumerate(self.groups):
+            found += [group] * size
+        return tuple(found)
 
     @property
     def images(self) -> Tensor:

@@ -14,7 +14,6 @@ from ctgraph_rl.checks import as_tuple, is_int, is_real, make_fields_plain, requ
 
 if TYPE_CHECKING:
     import gymnasium
-    import torch
 
 WITH_TABLE = ("gymnasium.envs.toy_text.frozen_lake", "gymnasium.envs.toy_text.cliffwalking")
 """Modules of environments that step only by their table of transitions ``P``."""
@@ -114,22 +113,12 @@ class GymTask:
         spec = None if module else gymnasium.registry.get(name)
         entry = spec.entry_point if spec is not None and isinstance(spec.entry_point, str) else ""
         found = (module, entry.partition(":")[0], *(each.partition(":")[0] for each in self.wrappers))
-        return tuple(dict.fromkeys(each for each in found if each))
+        return tuple(filter(None, dict.fromkeys(found)))
 
     @classmethod
-    def make_env(
-        cls,
-        tasks: Sequence[GymTask],
-        seed: int = 0,
-        *,
-        task_pool: Sequence[GymTask] | None = None,
-        device: torch.device | str = "cpu",
-        task_ids: Mapping[GymTask, int] | None = None,
-        num_task_ids: int | None = None,
-    ) -> Any:
+    def make_env(cls, tasks: Sequence[GymTask], seed: int = 0, **settings: Any) -> Any:
         """Return a `ctgraph_rl.batch.gym_env.GymEnv` with one row for each of ``tasks``; see `TaskLike`."""
-        env = import_module("ctgraph_rl.batch.gym_env").GymEnv
-        return env(tasks, seed, task_pool=task_pool, device=device, task_ids=task_ids, num_task_ids=num_task_ids)
+        return import_module("ctgraph_rl.batch.gym_env").GymEnv(tasks, seed, **settings)
 
     def make(self) -> gymnasium.Env[Any, Any]:
         """Return the environment, wrapped.
@@ -215,11 +204,14 @@ def _extreme_value(task: GymTask, gamma: float, choose: Callable[..., Any]) -> f
     known = type(table).__module__ in WITH_TABLE and not task.wrappers
     fix = "give return_range where you know it"
     require((known, f"the best mean return of {task.id} is not known, it has no table of transitions: {fix}"))
-    outcomes = [[table.P[s][a] for a in range(len(table.P[s]))] for s in range(len(table.P))]  # type: ignore[attr-defined]
-    width = max(len(each) for of_state in outcomes for each in of_state)
-    padded = [[each + [(0.0, 0, 0.0, True)] * (width - len(each)) for each in of_state] for of_state in outcomes]
-    probs, following, rewards, ends = np.moveaxis(np.array(padded, dtype=np.float64), -1, 0)
-    values = np.zeros(len(outcomes))
+    transitions = table.P  # type: ignore[attr-defined]
+    most = max(len(outcomes) for of_state in transitions.values() for outcomes in of_state.values())
+    padded = np.zeros((len(transitions), len(transitions[0]), most, 4))
+    for state, of_state in transitions.items():
+        for action, outcomes in of_state.items():
+            padded[state, action, : len(outcomes)] = outcomes
+    probs, following, rewards, ends = np.moveaxis(padded, -1, 0)
+    values = np.zeros(len(transitions))
     for _ in range(env.spec.max_episode_steps):  # type: ignore[union-attr,arg-type]
         after = rewards + gamma * (1 - ends) * values[following.astype(np.int64)]
         values = choose((probs * after).sum(-1), axis=1)

@@ -40,6 +40,7 @@ def segments(starts: Tensor) -> Segments:
     begins[:, 0] = True
     first = begins.flatten().nonzero().squeeze(-1)
     lengths, order = first.diff(append=first.new_tensor([starts.numel()])).sort(descending=True)
-    first, time = first[order], torch.arange(int(lengths[0]), device=first.device).unsqueeze(-1)
+    first = first[order]
+    time = torch.arange(int(lengths[0]), device=first.device).unsqueeze(-1)
     within = time < lengths
     return Segments((first + time)[within], within.sum(dim=1).cpu(), first // steps, first % steps == 0)

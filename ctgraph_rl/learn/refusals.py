@@ -29,9 +29,9 @@ def check_rows(curriculum: Curriculum, num_envs: int) -> None:
     alike: dict[int, list[str]] = {}
     for number, block in enumerate(curriculum.blocks, 1):
         block.rows(num_envs)
-        alike.setdefault(block.num_frames, []).append(str(number))
-    for block in {block.num_frames: block for block in curriculum.blocks}.values():
-        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(alike[block.num_frames])}")
+        numbers = alike.setdefault(block.num_frames, [])
+        numbers.append(str(number))
+        rules[block.num_frames] = block.frame_rule(num_envs, f"block {', '.join(numbers)}")
     require(*rules.values())
 
 
